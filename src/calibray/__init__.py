@@ -1,0 +1,1 @@
+"""Calibrate the radio materials of a ray-traced scene from measurements."""
