@@ -1,12 +1,24 @@
-"""Radio materials: the constants of a surface, and the ITU-R P.2040 laws that give them by name and frequency."""
+"""Radio materials: the constants of a surface, and the ITU-R P.2040 laws that give them by name.
+
+Of the revisions of ITU-R P.2040, -1 differs from the later ones below 100 GHz (concrete 5.31 became 5.24,
+glass 6.27 became 6.31); -2 and -3 print the same Table 3; -4 keeps those rows and adds rows above 100 GHz and
+new materials. Sionna RT 2.2 follows -4, so below 100 GHz the default "P.2040-3" gives its numbers.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, isfinite
-from typing import Final
+from math import inf, isfinite, pi
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import epsilon_0
 
 from calibray.errors import InputError
+from calibray.spelling import did_you_mean
 
 FIELDS: Final = (
     "relative_permittivity",
@@ -38,56 +50,56 @@ class Bound:
     open_below: bool = False
 
     def __contains__(self, value: float) -> bool:
-        return (
-            isfinite(value)
-            and (self.lower < value or value == self.lower and not self.open_below)
-            and value <= self.upper
-        )
+        above = value > self.lower if self.open_below else value >= self.lower
+        return isfinite(value) and above and value <= self.upper
 
     def __str__(self) -> str:
-        comparison = "greater than" if self.open_below else "at least"
         unit = "" if self.unit == "1" else f" {self.unit}"
         if self.upper == inf:
+            comparison = "greater than" if self.open_below else "not below"
             return f"a finite number {comparison} {self.lower:g}{unit}"
-        return f"in [{self.lower:g}, {self.upper:g}]{unit}"
+        return f"a number in [{self.lower:g}, {self.upper:g}]{unit}"
 
 
-BOUNDS: Final = {
-    "relative_permittivity": Bound(1.0, inf, "1"),
-    "conductivity": Bound(0.0, inf, "S/m"),
-    "thickness": Bound(0.0, inf, "m", open_below=True),
-    "scattering_coefficient": Bound(0.0, 1.0, "1"),
-    "xpd_coefficient": Bound(0.0, 1.0, "1"),
-    "alpha_r": Bound(1.0, inf, "1"),
-    "alpha_i": Bound(1.0, inf, "1"),
-    "lambda_": Bound(0.0, 1.0, "1"),
-}
-"""The physical bounds of each field; those that Sionna RT enforces, and a slab that is not empty."""
+BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
+    {
+        "relative_permittivity": Bound(1.0, inf, "1"),
+        "conductivity": Bound(0.0, inf, "S/m"),
+        "thickness": Bound(0.0, inf, "m", open_below=True),
+        "scattering_coefficient": Bound(0.0, 1.0, "1"),
+        "xpd_coefficient": Bound(0.0, 1.0, "1"),
+        "alpha_r": Bound(1.0, inf, "1"),
+        "alpha_i": Bound(1.0, inf, "1"),
+        "lambda_": Bound(0.0, 1.0, "1"),
+    }
+)
+"""The physical bounds of each field: those that Sionna RT enforces, and a slab that is not empty."""
 
-SCATTERING_PATTERNS: Final = {
-    "lambertian": (),
-    "directive": ("alpha_r",),
-    "backscattering": ("alpha_r", "alpha_i", "lambda_"),
-}
-"""The scattering patterns by name, each with the fields that shape it."""
+SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "lambertian": (),
+        "directive": ("alpha_r",),
+        "backscattering": ("alpha_r", "alpha_i", "lambda_"),
+    }
+)
+"""The scattering patterns, each with the fields that shape it."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """The radio constants of a surface, a slab of one homogeneous non-magnetic medium.
+    """The radio constants of a surface: a slab of one homogeneous, non-magnetic medium.
 
     Attributes:
         relative_permittivity: Real part of the relative permittivity [1], at least 1.
         conductivity: Conductivity [S/m], at least 0.
         thickness: Thickness of the slab [m], greater than 0.
-        scattering_coefficient: Scattering coefficient S [1]: the share of the reflected amplitude that leaves
+        scattering_coefficient: Scattering coefficient S [1], the share of the reflected amplitude that leaves
             diffusely, in [0, 1].
-        xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of the diffuse field, in [0, 1].
-        scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Transactions on
-            Antennas and Propagation, 2007).
-        alpha_r: Width exponent [1] of the lobe around the specular direction, at least 1; Sionna RT takes whole
-            numbers only.
-        alpha_i: Width exponent [1] of the lobe back towards the source, at least 1; whole numbers for Sionna RT.
+        xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
+        scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
+            Antennas and Propagation 55(1), 2007).
+        alpha_r: Exponent [1] of the lobe around the specular direction, at least 1; whole for Sionna RT.
+        alpha_i: Exponent [1] of the lobe back towards the source, at least 1; whole for Sionna RT.
         lambda_: Share [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
 
     Raises:
@@ -110,19 +122,221 @@ class Material:
 
     def __post_init__(self) -> None:
         for name in FIELDS:
-            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+            object.__setattr__(self, name, _within_bounds(name, getattr(self, name)))
         if self.scattering_pattern not in SCATTERING_PATTERNS:
-            raise InputError(
-                f"scattering_pattern = {self.scattering_pattern!r}: must be one of {', '.join(SCATTERING_PATTERNS)}"
-            )
+            remedy = did_you_mean(self.scattering_pattern, SCATTERING_PATTERNS)
+            raise InputError(f"scattering_pattern = {self.scattering_pattern!r}: unknown pattern, {remedy}")
 
 
-def _checked(name: str, value: object) -> float:
-    """The value of a field as a float, or an `InputError` that names field, value and bound."""
+def _within_bounds(name: str, value: Any) -> float:
+    """The value of a field as a float, or an `InputError` that names the field, the value and the bound."""
     try:
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)
     except (TypeError, ValueError):
-        raise InputError(f"{name} = {value!r}: must be {BOUNDS[name]}") from None
+        number = float("nan")
     if isinstance(value, bool | str) or number not in BOUNDS[name]:
         raise InputError(f"{name} = {value!r}: must be {BOUNDS[name]}")
     return number
+
+
+def constants(materials: Mapping[str, Material]) -> NDArray[np.float64]:
+    """The constants of materials as a matrix.
+
+    Args:
+        materials: Materials by name; their order is the order of the rows.
+
+    Returns:
+        The constants [materials, fields], columns in the order of `FIELDS`, in the fields' units.
+
+    Example:
+        >>> constants({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
+        [5.24, 0.14, 0.3]
+    """
+    rows = [[getattr(material, name) for name in FIELDS] for material in materials.values()]
+    return np.array(rows, dtype=np.float64).reshape(-1, len(FIELDS))
+
+
+def complex_relative_permittivity(material: Material, frequency: float) -> complex:
+    """Complex relative permittivity of a material, for the time convention e^{+jwt}.
+
+    Args:
+        material: The material.
+        frequency: Frequency [Hz], greater than 0.
+
+    Returns:
+        The complex relative permittivity [1]; its imaginary part is not positive.
+
+    Raises:
+        InputError: The frequency is not a positive finite number.
+
+    Example:
+        >>> complex_relative_permittivity(Material(4.0, 0.0, 0.1), frequency=1e9)
+        (4+0j)
+    """
+    _check_frequency(frequency)
+    # ITU-R P.2040-1 eq. 9b
+    loss = material.conductivity / (2 * pi * frequency * epsilon_0)
+    return complex(material.relative_permittivity, -loss) if loss else complex(material.relative_permittivity)
+
+
+class ItuLaw(NamedTuple):
+    """One row of ITU-R P.2040 Table 3: eps_r = a f^b, sigma = c f^d [S/m], with f in GHz.
+
+    Attributes:
+        lower: Lower end of the frequency range [GHz], included.
+        upper: Upper end of the frequency range [GHz], included.
+        a: Relative permittivity [1] at 1 GHz.
+        b: Exponent [1] of the relative permittivity.
+        c: Conductivity [S/m] at 1 GHz.
+        d: Exponent [1] of the conductivity.
+    """
+
+    lower: float
+    upper: float
+    a: float
+    b: float
+    c: float
+    d: float
+
+
+_Table = Mapping[str, tuple[ItuLaw, ...]]
+
+
+def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
+    return MappingProxyType({name: tuple(ItuLaw(*row) for row in laws) for name, laws in rows.items()})
+
+
+def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
+    """A table with rows added after those of `base`, so that where ranges overlap `base` rules."""
+    return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
+
+
+_P2040_1: Final = _table(
+    {
+        "vacuum": ((0.001, 100, 1.0, 0, 0.0, 0),),
+        "concrete": ((1, 100, 5.31, 0, 0.0326, 0.8095),),
+        "brick": ((1, 10, 3.75, 0, 0.038, 0),),
+        "plasterboard": ((1, 100, 2.94, 0, 0.0116, 0.7076),),
+        "wood": ((0.001, 100, 1.99, 0, 0.0047, 1.0718),),
+        "glass": ((0.1, 100, 6.27, 0, 0.0043, 1.1925),),
+        "ceiling_board": ((1, 100, 1.50, 0, 0.0005, 1.1634),),
+        "chipboard": ((1, 100, 2.58, 0, 0.0217, 0.7800),),
+        "floorboard": ((50, 100, 3.66, 0, 0.0044, 1.3515),),
+        "metal": ((1, 100, 1.0, 0, 1e7, 0),),
+        "very_dry_ground": ((1, 10, 3.0, 0, 0.00015, 2.52),),
+        "medium_dry_ground": ((1, 10, 15.0, -0.1, 0.035, 1.63),),
+        "wet_ground": ((1, 10, 30.0, -0.4, 0.15, 1.30),),
+    }
+)
+_P2040_2: Final = _table(
+    {
+        "vacuum": ((0.001, 100, 1.0, 0, 0.0, 0),),
+        "concrete": ((1, 100, 5.24, 0, 0.0462, 0.7822),),
+        "brick": ((1, 40, 3.91, 0, 0.0238, 0.16),),
+        "plasterboard": ((1, 100, 2.73, 0, 0.0085, 0.9395),),
+        "wood": ((0.001, 100, 1.99, 0, 0.0047, 1.0718),),
+        "glass": ((0.1, 100, 6.31, 0, 0.0036, 1.3394), (220, 450, 5.79, 0, 0.0004, 1.658)),
+        "ceiling_board": ((1, 100, 1.48, 0, 0.0011, 1.0750), (220, 450, 1.52, 0, 0.0029, 1.029)),
+        "chipboard": ((1, 100, 2.58, 0, 0.0217, 0.7800),),
+        "plywood": ((1, 40, 2.71, 0, 0.33, 0),),
+        "marble": ((1, 60, 7.074, 0, 0.0055, 0.9262),),
+        "floorboard": ((50, 100, 3.66, 0, 0.0044, 1.3515),),
+        "metal": ((1, 100, 1.0, 0, 1e7, 0),),
+        "very_dry_ground": ((1, 10, 3.0, 0, 0.00015, 2.52),),
+        "medium_dry_ground": ((1, 10, 15.0, -0.1, 0.035, 1.63),),
+        "wet_ground": ((1, 10, 30.0, -0.4, 0.15, 1.30),),
+    }
+)
+_P2040_4: Final = _extended(
+    _P2040_2,
+    {
+        "concrete": ((110, 330, 5.17, 0, 0.0145, 1.0900),),
+        "brick": ((110, 330, 4.15, 0, 0.0006, 1.5712),),
+        "plasterboard": ((110, 330, 2.56, 0, 0.0001, 1.7799), (100, 400, 2.65, 0, 0.0002, 1.598)),
+        "wood": ((110, 330, 1.82, 0, 0.0040, 1.0761), (100, 400, 2.1183, 0, 0.0055, 1.1113)),
+        "glass": ((100, 400, 6.5767, 0, 0.0012, 1.4697),),
+        "clear_acrylic": ((110, 330, 2.58, 0, 0.0001, 1.6524),),
+        "ceiling_board": ((100, 400, 1.2567, 0, 0.00013, 1.454),),
+        "chipboard": ((100, 200, 2.16, 0, 0.0023, 1.359),),
+        "plywood": ((110, 330, 1.94, 0, 0.0067, 0.9982), (100, 400, 2.17, 0, 0.0063, 1.045)),
+        "marble": ((110, 330, 7.94, 0, 0.0001, 1.7330), (100, 400, 8.62, 0, 0.0027, 1.15)),
+        "floorboard": (
+            (220, 300, 5.27, 0, 2.22e-17, 7.3413),
+            (300, 400, 5.27, 0, 0.0003, 2.0298),
+            (400, 450, 5.27, 0, 49.8726, 0),
+            (100, 400, 3.1575, 0, 0.001675, 1.32775),
+        ),
+        "vinyl_tile": ((1, 40, 3.62, 0, 0.0051, 0.8422),),
+        "carpet_tile": ((1, 40, 2.08, 0, 0.0009, 0.8200),),
+        "asphalt_concrete": ((1, 40, 4.83, 0, 0.0108, 1.3969),),
+    },
+)
+
+ITU_MATERIALS: Final[Mapping[str, _Table]] = MappingProxyType(
+    {"P.2040-1": _P2040_1, "P.2040-2": _P2040_2, "P.2040-3": _P2040_2, "P.2040-4": _P2040_4}
+)
+"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap the first rules, as in Sionna RT."""
+
+DEFAULT_REVISION: Final = "P.2040-3"
+
+
+def itu_material(
+    name: str,
+    frequency: float,
+    thickness: float = 0.1,
+    revision: str = DEFAULT_REVISION,
+    **scattering: Any,
+) -> Material:
+    """A material of ITU-R P.2040 Table 3 at one frequency.
+
+    Args:
+        name: Name as Sionna RT writes it, for instance "concrete" or "very_dry_ground".
+        frequency: Frequency [Hz], within the range of the material's law, ends included.
+        thickness: Thickness of the slab [m]; P.2040 gives none, 0.1 m is Sionna RT's default.
+        revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
+        **scattering: Further fields of the `Material`, for instance ``scattering_coefficient=0.3``.
+
+    Returns:
+        The material, with the law's permittivity [1] and conductivity [S/m].
+
+    Raises:
+        InputError: The revision or the name is unknown, the law does not cover the frequency, or a constant
+            is out of bounds.
+
+    Example:
+        >>> itu_material("concrete", frequency=4e9, revision="P.2040-1").relative_permittivity
+        5.31
+    """
+    law = _law(name, frequency, revision)
+    frequency_ghz = frequency / 1e9
+    return Material(
+        relative_permittivity=law.a * frequency_ghz**law.b,  # ITU-R P.2040-1 eq. 58
+        conductivity=law.c * frequency_ghz**law.d,  # ITU-R P.2040-1 eq. 59
+        thickness=thickness,
+        **scattering,
+    )
+
+
+def _law(name: str, frequency: float, revision: str) -> ItuLaw:
+    """The law of a material that covers a frequency [Hz]."""
+    if revision not in ITU_MATERIALS:
+        raise InputError(f"revision = {revision!r}: unknown, {did_you_mean(revision, ITU_MATERIALS)}")
+    _check_frequency(frequency)
+    table = ITU_MATERIALS[revision]
+    if name not in table:
+        elsewhere = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
+        remedy = f"it is in {', '.join(elsewhere)}" if elsewhere else did_you_mean(name, table)
+        raise InputError(f"{name!r} is no material of ITU-R {revision}: {remedy}")
+    for law in table[name]:
+        if law.lower <= frequency / 1e9 <= law.upper:
+            return law
+    ranges = " and ".join(f"{law.lower:g} to {law.upper:g} GHz" for law in table[name])
+    raise InputError(
+        f"ITU-R {revision} gives {name!r} for {ranges}, not for {frequency / 1e9:g} GHz: "
+        "give relative_permittivity and conductivity instead"
+    )
+
+
+def _check_frequency(frequency: float) -> None:
+    if not (isfinite(frequency) and frequency > 0):
+        raise InputError(f"frequency = {frequency!r}: must be a finite number greater than 0 Hz")
