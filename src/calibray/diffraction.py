@@ -1,0 +1,78 @@
+"""First-order diffraction at wedges: the uniform theory's part that does not depend on the materials.
+
+The Jones matrix of a diffracted ray is affine in the reflection coefficients of the wedge's two faces,
+J = C_0 + R_te(0) C_1 + R_tm(0) C_2 + R_te(n) C_3 + R_tm(n) C_4, with constant matrices C_k: the same form as a
+reflection, with four coefficients in place of two.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.constants import speed_of_light
+from scipy.special import modfresnelm
+
+from calibray.paths import Diffraction
+
+
+def affine_form(table: Diffraction, row: np.ndarray, frequency: float) -> np.ndarray:
+    """The matrices C_0 .. C_4 of diffractions, in the edge-fixed frames.
+
+    Args:
+        table: Geometry of the diffractions.
+        row: Rows of the table to evaluate [n].
+        frequency: Carrier frequency [Hz].
+
+    Returns:
+        Complex matrices [5, 2, 2, n].
+    """
+    exterior, phi_in, phi_out = table.exterior_angle[row], table.azimuth_in[row], table.azimuth_out[row]
+    wavenumber = 2 * np.pi * frequency / speed_of_light
+    n = exterior / np.pi
+    scale = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * wavenumber) * table.sin_edge[row])
+    size = wavenumber * table.distance[row]  # k L
+    difference, total = phi_out - phi_in, phi_out + phi_in
+
+    def term(sign: int, beta: np.ndarray) -> np.ndarray:
+        """One of the four terms D_i (Kouyoumjian and Pathak 1974, eq. 25; ITU-R P.526-15 eqs. 66-69)."""
+        turns = np.round((beta + sign * np.pi) / (2 * exterior))
+        a = 2 * np.cos(exterior * turns - beta / 2) ** 2
+        return scale * _cotangent_times_transition((np.pi + sign * beta) / (2 * n), size * a, n, size)
+
+    zero = term(1, difference) - term(-1, total)
+    other = term(-1, difference) - term(1, total)
+    in_0, out_0, in_n, out_n = (_matrix(table.rotations[row, k]) for k in range(4))
+    wide = exterior > np.pi + phi_in  # the n-face is not lit: R_n = -1
+    lit = np.where(wide, 0.0, other)
+    form = np.zeros((5, 2, 2, len(row)), dtype=complex)
+    form[0] = np.where(wide, -other, 0.0) * np.eye(2)[:, :, None]
+    for component in range(2):
+        form[1 + component] = zero * out_0[:, None, component] * in_0[None, component, :]
+        form[3 + component] = lit * out_n[:, None, component] * in_n[None, component, :]
+    return form
+
+
+def transition(x: np.ndarray) -> np.ndarray:
+    """Transition function F(x) = 2 j sqrt(x) e^{jx} int_{sqrt x}^inf e^{-j u^2} du (Kouyoumjian and Pathak, eq. 27).
+
+    Args:
+        x: Argument, at least 0 [...].
+
+    Returns:
+        Complex values [...].
+    """
+    root = np.sqrt(x)
+    return 2j * root * np.exp(1j * x) * modfresnelm(root)[0]
+
+
+def _cotangent_times_transition(psi: np.ndarray, x: np.ndarray, n: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """cot(psi) F(x), finite where the cotangent's pole meets F's zero, on shadow and reflection boundaries."""
+    sine = np.sin(psi)
+    pole = np.abs(sine) < 1e-9
+    limit = np.where(sine >= 0, 1.0, -1.0) * n * np.sqrt(2 * np.pi * size) * np.exp(0.25j * np.pi)
+    return np.where(pole, limit, np.cos(psi) / np.where(pole, 1.0, sine) * transition(np.maximum(x, 0.0)))
+
+
+def _matrix(rotation: np.ndarray) -> np.ndarray:
+    """(cos, sin) as the matrix that turns a Jones vector's frame [2, 2, n]."""
+    cos, sin = rotation.T
+    return np.array([[cos, sin], [-sin, cos]])

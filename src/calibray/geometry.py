@@ -1,0 +1,326 @@
+"""Geometry of traced paths: vertices and normals in, the constants of the path program out.
+
+The field of a path is a Jones vector in a frame that each interaction turns into its own: first axis
+s = k x n / |k x n| (transverse electric), second axis k x s. Sionna RT writes the same field in the basis
+(theta, phi) of the direction of travel; its conventions (reference near the poles, orientation of normals and
+wedges) are followed here, so that path gains agree in phase as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from calibray.paths import Diffraction, Diffuse, Kind
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Paths as a tracer gives them, padded to the largest depth D.
+
+    Attributes:
+        source: Start of every path [P, 3], [m].
+        target: End of every path [P, 3], [m].
+        vertex: Interaction points [P, D, 3], [m].
+        normal: Normals of the surfaces hit, either side [P, D, 3].
+        kind: Kinds of interaction, 0 beyond the last one [P, D].
+        material: Material of every interaction [P, D].
+        probability: Probability with which the tracer chose the kind of interaction [P, D].
+        samples: Rays sent out per source.
+        edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
+        normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    vertex: np.ndarray
+    normal: np.ndarray
+    kind: np.ndarray
+    material: np.ndarray
+    probability: np.ndarray
+    samples: int
+    edge: np.ndarray
+    normal_n: np.ndarray
+
+
+@dataclass(frozen=True)
+class Program:
+    """The geometric part of a path program; names and shapes as in `calibray.paths.Paths`.
+
+    Attributes:
+        delay: [P], [s].
+        spreading: [P], [1/m].
+        departure_direction: Unit vector of departure [P, 3].
+        arrival_direction: Unit vector of travel at the target [P, 3].
+        departure_rotation: (cos, sin) from the basis (theta, phi) of departure into the first frame [P, 2].
+        arrival_rotation: (cos, sin) from the last frame into the basis (theta, phi) of arrival [P, 2].
+        first: [P + 1].
+        kind: [I].
+        material: [I].
+        cos_incidence: [I].
+        rotation: [I, 2].
+        diffuse: Table of diffuse interactions.
+        diffraction: Table of diffractions.
+    """
+
+    delay: np.ndarray
+    spreading: np.ndarray
+    departure_direction: np.ndarray
+    arrival_direction: np.ndarray
+    departure_rotation: np.ndarray
+    arrival_rotation: np.ndarray
+    first: np.ndarray
+    kind: np.ndarray
+    material: np.ndarray
+    cos_incidence: np.ndarray
+    rotation: np.ndarray
+    diffuse: Diffuse
+    diffraction: Diffraction
+
+
+def compile_chains(chains: Chains) -> Program:
+    """Compute what the fields of traced paths depend on, apart from the materials.
+
+    Args:
+        chains: Traced paths.
+
+    Returns:
+        The geometric part of the path program, interactions in path order.
+    """
+    count, depth = chains.kind.shape
+    present = chains.kind != 0
+    length = present.sum(axis=1)
+    stop = np.concatenate([chains.vertex, np.zeros((count, 1, 3))], axis=1)
+    stop[np.arange(count), length] = chains.target  # the target follows the last interaction
+    ahead = np.concatenate([stop[:, :1] - chains.source[:, None], np.diff(stop, axis=1)], axis=1)
+    segment = np.linalg.norm(ahead, axis=2) * (np.arange(depth + 1) <= length[:, None])
+    total = segment.sum(axis=1)
+    direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
+
+    frame = spherical_basis(direction[:, 0])  # first axis of the frame the field is in
+    departure_rotation = np.tile([1.0, 0.0], (count, 1))
+    rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
+    tables: dict[int, list[tuple[np.ndarray, ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
+    solid_angle = np.full(count, 4 * np.pi / chains.samples)
+    tube_start = np.zeros(count)  # length already travelled when the present ray tube began
+    edge_at = np.zeros(count)
+    travelled = segment[:, 0].copy()
+    for step in range(depth):
+        row = np.flatnonzero(present[:, step])
+        incident, leaving = direction[row, step], direction[row, step + 1]
+        normal = chains.normal[row, step]
+        normal = normal * _sign(_dot(normal, -incident))[:, None]  # towards the incident wave
+        cosine[row, step] = np.abs(_dot(incident, normal))
+        solid_angle[row] *= _inverse(chains.probability[row, step])
+        kind = chains.kind[row, step]
+        entering = transverse_electric(incident, normal)
+        exiting = entering.copy()
+
+        diffuse = kind == Kind.DIFFUSE
+        if diffuse.any():
+            some, k_in, k_out = row[diffuse], incident[diffuse], leaving[diffuse]
+            tables[Kind.DIFFUSE].append(
+                (some, np.full(len(some), step), *_diffuse(k_in, k_out, normal[diffuse], entering[diffuse]), solid_angle[some])
+            )
+            exiting[diffuse] = spherical_basis(k_out, pole_reference=False)
+            solid_angle[some] = 2 * np.pi
+            tube_start[some] = travelled[some]
+
+        wedge = kind == Kind.DIFFRACTION
+        if wedge.any():
+            some, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
+            edge_at[some] = travelled[some]
+            edge = chains.edge[some]
+            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[some], edge, travelled[some], total[some])
+            tables[Kind.DIFFRACTION].append((some, np.full(len(some), step), *constants))
+            entering[wedge] = _unit(np.cross(k_in, edge))
+            exiting[wedge] = -_unit(np.cross(k_out, edge))
+
+        turn = rotate(incident, frame[row], entering)
+        if step == 0:
+            departure_rotation[row], turn = turn, np.tile([1.0, 0.0], (len(row), 1))
+        rotation[row, step] = turn
+        frame[row] = exiting
+        travelled[row] += segment[row, step + 1]
+
+    last = direction[np.arange(count), length]
+    spread = np.where(
+        edge_at > 0,
+        1 / np.sqrt(np.where(edge_at > 0, edge_at * (total - edge_at) * total, 1.0)),  # UTD, s s' (s + s')
+        1 / (total - tube_start),
+    )
+    flat = present.reshape(-1)
+    return Program(
+        delay=total / speed_of_light,
+        spreading=spread,
+        departure_direction=direction[:, 0],
+        arrival_direction=last,
+        departure_rotation=departure_rotation,
+        arrival_rotation=rotate(last, frame, spherical_basis(last)),
+        first=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        kind=chains.kind.reshape(-1)[flat].astype(np.uint8),
+        material=chains.material.reshape(-1)[flat].astype(np.int32),
+        cos_incidence=cosine.reshape(-1)[flat],
+        rotation=rotation.reshape(-1, 2)[flat],
+        diffuse=Diffuse(*_in_path_order(tables[Kind.DIFFUSE], Diffuse.empty())),
+        diffraction=Diffraction(*_in_path_order(tables[Kind.DIFFRACTION], Diffraction.empty())),
+    )
+
+
+def spherical_basis(direction: np.ndarray, pole_reference: bool = True) -> np.ndarray:
+    """Basis vector theta of directions of travel, the first axis of the basis (theta, phi).
+
+    Args:
+        direction: Unit vectors [..., 3].
+        pole_reference: Use Sionna's fixed reference -x next to the poles instead of the limit of theta.
+
+    Returns:
+        Unit vectors orthogonal to `direction` [..., 3].
+    """
+    x, y, z = np.moveaxis(direction, -1, 0)
+    rho = np.hypot(x, y)
+    pole = rho < 1e-6
+    cos_phi, sin_phi = np.where(pole, 1.0, x / np.where(pole, 1.0, rho)), np.where(pole, 0.0, y / np.where(pole, 1.0, rho))
+    theta = np.stack([z * cos_phi, z * sin_phi, -rho], axis=-1)
+    if not pole_reference:
+        return theta
+    reference = np.array([-1.0, 0.0, 0.0])
+    fallback = reference - _dot(direction, reference)[..., None] * direction
+    near = np.abs(np.float32(z)) > np.float32(1 - 5e-7)  # the bound is met in single precision, as Sionna computes it
+    return np.where(near[..., None], _unit(np.where(near[..., None], fallback, reference)), theta)
+
+
+def transverse_electric(direction: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """First axis of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
+
+    At normal incidence any transverse vector serves: there the transverse electric and magnetic coefficients describe
+    the same reflection.
+
+    Args:
+        direction: Directions of travel [..., 3].
+        normal: Surface normals [..., 3].
+
+    Returns:
+        Unit vectors [..., 3].
+    """
+    cross = np.cross(direction, normal)
+    degenerate = _dot(cross, cross) < 1e-12
+    reference = np.where((np.abs(direction[..., 0]) < 0.9)[..., None], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    fallback = reference - _dot(reference, direction)[..., None] * direction
+    return _unit(np.where(degenerate[..., None], fallback, cross))
+
+
+def rotate(direction: np.ndarray, current: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(cos, sin) of the rotation of a Jones vector's frame about its direction of travel.
+
+    The vector (a, b) becomes (cos a + sin b, -sin a + cos b).
+
+    Args:
+        direction: Directions of travel [..., 3].
+        current: First axis of the frame that the vector is in [..., 3].
+        target: First axis of the frame wanted [..., 3].
+
+    Returns:
+        Cosine and sine [..., 2].
+    """
+    return np.stack([_dot(current, target), _dot(direction, np.cross(current, target))], axis=-1)
+
+
+def zenith_azimuth(direction: np.ndarray) -> np.ndarray:
+    """Zenith and azimuth angles of unit vectors.
+
+    Args:
+        direction: Unit vectors [..., 3].
+
+    Returns:
+        Zenith in [0, pi] and azimuth in (-pi, pi] [..., 2], [rad].
+    """
+    x, y, z = np.moveaxis(direction, -1, 0)
+    return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=-1)
+
+
+def _diffuse(incident: np.ndarray, leaving: np.ndarray, normal: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, ...]:
+    mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
+    return (
+        rotate(incident, frame, spherical_basis(incident, pole_reference=False)),
+        np.abs(_dot(leaving, normal)),
+        _dot(mirrored, leaving),
+        -_dot(incident, leaving),
+    )
+
+
+def _wedge(
+    incident: np.ndarray,
+    leaving: np.ndarray,
+    normal_0: np.ndarray,
+    normal_n: np.ndarray,
+    edge: np.ndarray,
+    before: np.ndarray,
+    total: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Constants of a wedge diffraction (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5), as Sionna RT has them."""
+    exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
+    cos_edge = np.abs(_dot(incident, edge))
+    tangent = _unit(np.cross(normal_0, edge))
+    azimuth_in = _azimuth(-_unit(_reject(incident, edge)), tangent, normal_0)
+    azimuth_out = _azimuth(_unit(_reject(leaving, edge)), tangent, normal_0)
+    sin_edge = np.sqrt(np.maximum(1 - cos_edge**2, 0))
+    after = total - before
+    distance = before * after / total * sin_edge**2
+    phi_in = _unit(np.cross(incident, edge))
+    turns = []
+    for normal in (normal_0, normal_n):
+        mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal  # direction of the reflection boundary
+        face = transverse_electric(incident, normal)
+        boundary = -_unit(np.cross(mirrored, edge))
+        turns += [rotate(incident, phi_in, face), rotate(mirrored, face, boundary)]
+    return (
+        np.abs(_dot(incident, normal_n)),
+        exterior,
+        azimuth_in,
+        azimuth_out,
+        sin_edge,
+        distance,
+        np.stack(turns, axis=1),
+    )
+
+
+def _azimuth(away: np.ndarray, tangent: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Angle of a direction pointing away from the edge, counted from the 0-face [0, 2 pi)."""
+    angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
+    return np.pi - angle * _sign(_dot(away, normal))
+
+
+def _in_path_order(parts: list[tuple[np.ndarray, ...]], empty: Diffuse | Diffraction) -> list[np.ndarray]:
+    """Columns of a table gathered step by step, put into path order (the order of the flat interactions)."""
+    if not parts:
+        return list(vars(empty).values())
+    path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.lexsort((step, path))
+    columns = [column[order] for column in columns]
+    if isinstance(empty, Diffuse):  # the solid angle was gathered last, after the directions
+        rotation, scattered, specular, backward, solid_angle = columns
+        return [rotation, solid_angle, scattered, specular, backward]
+    return columns
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.sum(a * b, axis=-1)
+
+
+def _sign(value: np.ndarray) -> np.ndarray:
+    return np.where(value >= 0, 1.0, -1.0)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+def _reject(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    return vector - _dot(vector, axis)[:, None] * axis
+
+
+def _inverse(probability: np.ndarray) -> np.ndarray:
+    return np.where(probability > 0, 1 / np.where(probability > 0, probability, 1.0), 0.0)

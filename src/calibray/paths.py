@@ -1,0 +1,332 @@
+"""The path program: traced paths, compiled so that fields can be evaluated for any materials.
+
+A path is a transmit field, a chain of interactions, and a receive field. Each interaction keeps what its materials
+act through: which material, the cosine of the angle of incidence, the real rotation from the frame of the interaction
+before into its own (first axis k x n, transverse electric), and its kind. The first rotation is absorbed in the
+transmit field and the last one in the receive field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+
+from calibray.errors import InputError
+from calibray.materials import FIELDS, Material
+
+SCHEMA = "calibray/paths"
+SCHEMA_VERSION = 1
+
+
+class Kind(IntEnum):
+    """Kinds of interaction, with Sionna's codes."""
+
+    SPECULAR = 1
+    DIFFUSE = 2
+    REFRACTION = 4
+    DIFFRACTION = 8
+
+
+@dataclass(frozen=True)
+class Diffuse:
+    """What a diffuse reflection needs beyond the common arrays; one row per diffuse interaction, in their order.
+
+    Attributes:
+        rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
+            of the incident direction, in which the XPD matrix acts [D, 2].
+        solid_angle: Ray tube's solid angle over the sampling probability at trace time [D], [sr].
+        cos_scattered: Cosine between the scattered direction and the normal [D].
+        cos_specular: Cosine between the scattered and the specular direction [D].
+        cos_backward: Cosine between the scattered direction and the way back to the source [D].
+    """
+
+    rotation: np.ndarray
+    solid_angle: np.ndarray
+    cos_scattered: np.ndarray
+    cos_specular: np.ndarray
+    cos_backward: np.ndarray
+
+    @classmethod
+    def empty(cls) -> Diffuse:
+        """No diffuse interaction."""
+        return cls(np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)))
+
+
+@dataclass(frozen=True)
+class Diffraction:
+    """What a diffraction needs beyond the common arrays; one row per diffraction, in their order.
+
+    The 0-face's cosine of incidence is in `Paths.cos_incidence`.
+
+    Attributes:
+        cos_incidence_n: Cosine of the angle of incidence on the n-face [W].
+        exterior_angle: Exterior angle of the wedge [W], [rad].
+        azimuth_in: Azimuth phi' of the incident ray around the edge, from the 0-face [W], [rad].
+        azimuth_out: Azimuth phi of the diffracted ray [W], [rad].
+        sin_edge: Sine of the angle beta_0 between ray and edge [W].
+        distance: L = s s' sin^2(beta_0) / (s + s') [W], [m].
+        rotations: (cos, sin) of the four rotations between the edge-fixed frames and the transverse electric frames
+            of the faces: in 0, out 0, in n, out n [W, 4, 2].
+    """
+
+    cos_incidence_n: np.ndarray
+    exterior_angle: np.ndarray
+    azimuth_in: np.ndarray
+    azimuth_out: np.ndarray
+    sin_edge: np.ndarray
+    distance: np.ndarray
+    rotations: np.ndarray
+
+    @classmethod
+    def empty(cls) -> Diffraction:
+        """No diffraction."""
+        return cls(*(np.zeros(0) for _ in range(6)), np.zeros((0, 4, 2)))
+
+
+Table = TypeVar("Table", Diffuse, Diffraction)
+
+
+@dataclass(frozen=True)
+class Paths:
+    """A traced campaign as a path program.
+
+    P paths, I interactions, L links, R receive and T transmit ports (2 for dual polarization, else 1).
+
+    Attributes:
+        frequency: Carrier frequency [Hz].
+        materials: The materials by name, as traced; `material` indexes them in this order.
+        tx_position: Transmitter of every link [L, 3], [m].
+        rx_position: Receiver of every link [L, 3], [m].
+        link: Link of every path [P], non-decreasing.
+        delay: Propagation delay [P], [s].
+        spreading: Amplitude spreading [P], [1/m]: 1/r, or 1/sqrt(s s' (s + s')) with a diffraction.
+        departure: Zenith and azimuth of departure [P, 2], [rad].
+        arrival: Zenith and azimuth of the direction towards the source [P, 2], [rad].
+        tx_field: Transmit pattern in the frame of the first interaction [P, T, 2], complex.
+        rx_field: Receive pattern in the frame that the last interaction leaves [P, R, 2], complex.
+        first: Index of each path's first interaction [P + 1]; path p has interactions first[p] .. first[p + 1] - 1.
+        kind: `Kind` of every interaction [I].
+        material: Index of its material [I].
+        cos_incidence: Cosine of the angle of incidence [I].
+        rotation: (cos, sin) of the rotation from the frame before into the interaction's own [I, 2].
+        diffuse: Further constants of the diffuse interactions.
+        diffraction: Further constants of the diffractions.
+        settings: How the paths were traced, for the record.
+    """
+
+    frequency: float
+    materials: dict[str, Material]
+    tx_position: np.ndarray
+    rx_position: np.ndarray
+    link: np.ndarray
+    delay: np.ndarray
+    spreading: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+    tx_field: np.ndarray
+    rx_field: np.ndarray
+    first: np.ndarray
+    kind: np.ndarray
+    material: np.ndarray
+    cos_incidence: np.ndarray
+    rotation: np.ndarray
+    diffuse: Diffuse = field(default_factory=Diffuse.empty)
+    diffraction: Diffraction = field(default_factory=Diffraction.empty)
+    settings: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def num_paths(self) -> int:
+        """Number of paths P."""
+        return len(self.link)
+
+    @property
+    def num_interactions(self) -> int:
+        """Number of interactions I over all paths."""
+        return len(self.kind)
+
+    @property
+    def num_links(self) -> int:
+        """Number of links L."""
+        return len(self.tx_position)
+
+    @property
+    def links_without_path(self) -> np.ndarray:
+        """Indices of the links to which no path leads [links]."""
+        return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
+
+    def save(self, path: str | Path) -> None:
+        """Write an HDF5 file (schema in docs/path-file.md), readable by h5py and MATLAB.
+
+        Args:
+            path: File to write; replaced only once the new one is complete.
+
+        Raises:
+            InputError: The folder does not exist or cannot be written.
+        """
+        target = Path(path)
+        partial = target.with_name(target.name + ".part")
+        try:
+            with h5py.File(partial, "w") as file:
+                _write(self, file)
+            partial.replace(target)
+        except OSError as error:
+            raise InputError(f"{target}: cannot be written ({error}); name a file in a writable folder") from None
+
+    @classmethod
+    def load(cls, path: str | Path) -> Paths:
+        """Read a file that `save` wrote.
+
+        Args:
+            path: The HDF5 file.
+
+        Returns:
+            The path program, equal to the one saved.
+
+        Raises:
+            InputError: The file does not exist, is no path file, or is of another schema version.
+        """
+        source = Path(path)
+        if not source.is_file():
+            raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
+        try:
+            with h5py.File(source, "r") as file:
+                if file.attrs.get("schema") != SCHEMA:
+                    raise InputError(f"{source}: is no Calibray path file (schema {file.attrs.get('schema')!r})")
+                version = int(file.attrs["version"])
+                if version != SCHEMA_VERSION:
+                    raise InputError(f"{source}: has schema version {version}, need {SCHEMA_VERSION}; trace again")
+                return _read(file)
+        except (OSError, KeyError) as error:
+            raise InputError(f"{source}: is damaged or no path file ({error}); trace again") from None
+
+
+def concatenate(parts: list[Paths]) -> Paths:
+    """Join path programs of the same links (link indices already global) and sort their paths by link.
+
+    Args:
+        parts: At least one program; all share frequency, materials and link table.
+
+    Returns:
+        One program whose paths are ordered by link, and within a link as given.
+    """
+    head = parts[0]
+    offsets = np.cumsum([0, *(part.num_interactions for part in parts)])
+    joined = replace(
+        head,
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PATH_ARRAYS + _INTERACTION_ARRAYS},
+        first=np.concatenate(
+            [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)] + [offsets[-1:]]
+        ),
+        diffuse=_join([part.diffuse for part in parts]),
+        diffraction=_join([part.diffraction for part in parts]),
+    )
+    return take(joined, np.argsort(joined.link, kind="stable"))
+
+
+def take(paths: Paths, index: np.ndarray) -> Paths:
+    """The program with some of its paths, in a given order.
+
+    Args:
+        paths: A path program.
+        index: Paths to keep [n].
+
+    Returns:
+        The smaller program over the same links.
+    """
+    index = np.asarray(index, dtype=np.int64)
+    depth = np.diff(paths.first)[index]
+    first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
+    interaction = np.arange(first[-1]) - np.repeat(first[:-1], depth) + np.repeat(paths.first[index], depth)
+    return replace(
+        paths,
+        **{name: getattr(paths, name)[index] for name in _PATH_ARRAYS},
+        **{name: getattr(paths, name)[interaction] for name in _INTERACTION_ARRAYS},
+        first=first,
+        diffuse=_rows(paths.diffuse, _ordinal(paths.kind, Kind.DIFFUSE)[interaction]),
+        diffraction=_rows(paths.diffraction, _ordinal(paths.kind, Kind.DIFFRACTION)[interaction]),
+    )
+
+
+_PATH_ARRAYS = ("link", "delay", "spreading", "departure", "arrival", "tx_field", "rx_field")
+_INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation")
+
+
+def _ordinal(kind: np.ndarray, which: Kind) -> np.ndarray:
+    """Row of each interaction of one kind in that kind's table; -1 for the others [I]."""
+    chosen = kind == which
+    return np.where(chosen, np.cumsum(chosen) - 1, -1)
+
+
+def _rows(table: Table, row: np.ndarray) -> Table:
+    row = row[row >= 0]
+    return type(table)(*(getattr(table, entry.name)[row] for entry in fields(table)))
+
+
+def _join(tables: list[Table]) -> Table:
+    kind = type(tables[0])
+    return kind(*(np.concatenate([getattr(table, entry.name) for table in tables]) for entry in fields(kind)))
+
+
+def _write(paths: Paths, file: h5py.File) -> None:
+    file.attrs.update({"schema": SCHEMA, "version": SCHEMA_VERSION, "frequency_hz": paths.frequency})
+    for key, value in paths.settings.items():
+        file.attrs[f"setting_{key}"] = value
+    materials = file.create_group("materials")
+    materials["name"] = np.array(list(paths.materials), dtype=h5py.string_dtype())
+    materials["scattering_pattern"] = np.array(
+        [material.scattering_pattern for material in paths.materials.values()], dtype=h5py.string_dtype()
+    )
+    for name in FIELDS:
+        materials[name] = [getattr(material, name) for material in paths.materials.values()]
+    for group, names in _LAYOUT.items():
+        for name in names:
+            value = getattr(paths, name)
+            if np.iscomplexobj(value):  # MATLAB's h5read knows no complex type: real and imaginary part apart
+                file[f"{group}/{name}_real"], file[f"{group}/{name}_imag"] = value.real, value.imag
+            else:
+                file[f"{group}/{name}"] = value
+    for table in (paths.diffuse, paths.diffraction):
+        for entry in fields(table):
+            file[f"{type(table).__name__.lower()}/{entry.name}"] = getattr(table, entry.name)
+
+
+def _read(file: h5py.File) -> Paths:
+    materials = file["materials"]
+    names = [name.decode() for name in materials["name"][()]]
+    patterns = [name.decode() for name in materials["scattering_pattern"][()]]
+    columns = {name: materials[name][()] for name in FIELDS}
+    arrays = {}
+    for group, entries in _LAYOUT.items():
+        for name in entries:
+            if f"{group}/{name}_real" in file:
+                arrays[name] = file[f"{group}/{name}_real"][()] + 1j * file[f"{group}/{name}_imag"][()]
+            else:
+                arrays[name] = file[f"{group}/{name}"][()]
+    return Paths(
+        frequency=float(file.attrs["frequency_hz"]),
+        materials={
+            name: Material(**{key: float(columns[key][i]) for key in FIELDS}, scattering_pattern=patterns[i])
+            for i, name in enumerate(names)
+        },
+        **arrays,
+        diffuse=Diffuse(*(file[f"diffuse/{entry.name}"][()] for entry in fields(Diffuse))),
+        diffraction=Diffraction(*(file[f"diffraction/{entry.name}"][()] for entry in fields(Diffraction))),
+        settings={
+            key.removeprefix("setting_"): (value.item() if isinstance(value, np.generic) else value)
+            for key, value in file.attrs.items()
+            if key.startswith("setting_")
+        },
+    )
+
+
+_LAYOUT = {
+    "links": ("tx_position", "rx_position"),
+    "paths": (*_PATH_ARRAYS, "first"),
+    "interactions": _INTERACTION_ARRAYS,
+}

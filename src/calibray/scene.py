@@ -1,0 +1,254 @@
+"""Scenes: a Mitsuba XML file read into materials and objects, and written again in the form that the tracer takes.
+
+Every surface material becomes one of Sionna's plain `radio-material`s with constants and a name of our own choosing.
+That keeps the constants in one place (`Material`), lets a frequency lie outside an ITU table when the study gives the
+constants itself (NVlabs/sionna-rt#71, #72), and steps around Sionna's rules on names (an ITU name needs the prefix
+`itu_`, an object may not be called like a material).
+"""
+
+from __future__ import annotations
+
+import difflib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+from calibray.errors import InputError
+from calibray.materials import Material, itu_material
+
+BUNDLED_PREFIX: Final = "sionna:"
+DEFAULT_THICKNESS: Final = 0.1  # [m], Sionna's default for a material without one
+_MATERIAL_FIELDS: Final = frozenset(field.name for field in fields(Material))
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One mesh of a scene.
+
+    Attributes:
+        name: Its id without the prefix `mesh-`.
+        material: Name of its material.
+    """
+
+    name: str
+    material: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene as read from its file.
+
+    Attributes:
+        source: What the user named: a path or `sionna:NAME`.
+        path: The XML file [path].
+        materials: The materials that some object uses, by name, at the frequency the scene was read for.
+        objects: The meshes, in the file's order.
+        xml: The scene for the tracer; material k of `materials` is the BSDF `calibray-k`.
+    """
+
+    source: str
+    path: Path
+    materials: dict[str, Material]
+    objects: tuple[SceneObject, ...]
+    xml: str
+
+
+def read_scene(
+    source: str | Path,
+    frequency: float,
+    overrides: Mapping[str, Material | Mapping[str, object]] | None = None,
+) -> Scene:
+    """Read a Mitsuba XML scene and the constants of its materials.
+
+    Args:
+        source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
+        frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
+        overrides: Constants in place of the file's, by material name: a `Material`, or a mapping with any of its
+            fields, or with `itu` (and `revision`) naming an ITU-R P.2040 material.
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: The file does not exist or is no Mitsuba scene, a mesh is missing, a material has no radio
+            constants, an override names no material of the scene, or a frequency lies outside an ITU range.
+    """
+    overrides = dict(overrides or {})
+    path = _scene_path(str(source))
+    root = _parse(path, str(source))
+    definitions = _bsdf_definitions(root)
+    objects: list[SceneObject] = []
+    materials: dict[str, Material] = {}
+    for shape in root.findall("shape"):
+        _check_mesh(shape, path)
+        name = _shape_material(shape, definitions, path)
+        if name not in materials:
+            materials[name] = _material(name, definitions.get(name), overrides.get(name), frequency, path)
+        _refer(shape, list(materials).index(name))
+        objects.append(SceneObject((shape.get("id") or "").removeprefix("mesh-"), name))
+    if not objects:
+        raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
+    for name in overrides:
+        check_material_name(name, materials, f"[materials] {name}")
+    for bsdf in root.findall("bsdf"):
+        root.remove(bsdf)
+    for index, material in enumerate(materials.values()):
+        root.insert(index, _bsdf(index, material))
+    return Scene(str(source), path, materials, tuple(objects), ElementTree.tostring(root, encoding="unicode"))
+
+
+def check_material_name(name: str, materials: Mapping[str, object], place: str) -> None:
+    """Refuse a material that a scene lacks.
+
+    Args:
+        name: The name to look for.
+        materials: The scene's materials by name.
+        place: Where the name stands, for the message.
+
+    Raises:
+        InputError: There is no such material; the message offers the nearest name.
+    """
+    if name in materials:
+        return
+    near = difflib.get_close_matches(name, list(materials), 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise InputError(f"{place}: the scene has no material {name!r}; {hint}it has {', '.join(sorted(materials))}")
+
+
+def _scene_path(source: str) -> Path:
+    if source.startswith(BUNDLED_PREFIX):
+        name = source.removeprefix(BUNDLED_PREFIX)
+        spec = find_spec("sionna")
+        if spec is None or not spec.submodule_search_locations:
+            raise InputError(f"scene {source!r}: sionna-rt is not installed; pip install sionna-rt")
+        folder = Path(next(iter(spec.submodule_search_locations))) / "rt" / "scenes"
+        path = folder / name / f"{name}.xml"
+        if not path.is_file():
+            known = sorted(entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file())
+            raise InputError(f"scene {source!r}: Sionna RT bundles no such scene; it has {', '.join(known)}")
+        return path
+    path = Path(source)
+    if not path.is_file():
+        raise InputError(f"scene file {source}: does not exist; check the path (or name a bundled one, sionna:munich)")
+    return path
+
+
+def _parse(path: Path, source: str) -> ElementTree.Element:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise InputError(f"scene file {source}: is not well-formed XML ({error}); export it again") from None
+    if root.tag != "scene":
+        raise InputError(f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>")
+    return root
+
+
+def _bsdf_definitions(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
+    found = [*root.findall("bsdf"), *root.findall("shape/bsdf")]
+    return {_material_name(bsdf): bsdf for bsdf in found}
+
+
+def _material_name(bsdf: ElementTree.Element) -> str:
+    return (bsdf.get("id") or bsdf.get("name") or "").removeprefix("mat-")
+
+
+def _shape_material(shape: ElementTree.Element, definitions: dict[str, ElementTree.Element], path: Path) -> str:
+    name = shape.get("id") or "?"
+    nested = shape.find("bsdf")
+    if nested is not None:
+        return _material_name(nested)
+    references = [ref.get("id", "").removeprefix("mat-") for ref in shape.findall("ref")]
+    material = next((reference for reference in references if reference in definitions), None)
+    if material is None:
+        raise InputError(f"{path}: shape {name!r} refers to no <bsdf> of the scene; give it a material")
+    return material
+
+
+def _check_mesh(shape: ElementTree.Element, path: Path) -> None:
+    filename = shape.find("string[@name='filename']")
+    if filename is not None and not (path.parent / filename.get("value", "")).is_file():
+        raise InputError(
+            f"{path}: mesh {filename.get('value')!r} of shape {shape.get('id')!r} does not exist in {path.parent}; "
+            "copy the meshes folder beside the scene"
+        )
+
+
+def _material(
+    name: str,
+    bsdf: ElementTree.Element | None,
+    override: Material | Mapping[str, object] | None,
+    frequency: float,
+    path: Path,
+) -> Material:
+    """The constants of one material: the override's where it gives them, else the file's."""
+    if isinstance(override, Material):
+        return override
+    given = {key: value for key, value in (override or {}).items() if value is not None}
+    itu, revision = given.pop("itu", None), given.pop("revision", "P.2040-3")
+    unknown = set(given) - _MATERIAL_FIELDS
+    if unknown:
+        raise InputError(f"[materials] {name}: unknown key {sorted(unknown)[0]!r}; known: {sorted(_MATERIAL_FIELDS)}")
+    try:
+        if itu is not None:
+            thickness = given.get("thickness", _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
+            return replace(itu_material(str(itu), frequency, thickness, revision=str(revision)), **given)
+        if {"relative_permittivity", "conductivity"} <= set(given):
+            return Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **given})
+        return replace(_file_material(name, bsdf, frequency), **given)
+    except InputError as error:
+        raise InputError(f"{path}: material {name!r}: {error}") from None
+
+
+def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float) -> Material:
+    kind = bsdf.get("type") if bsdf is not None else None
+    itu_type = _itu_type(name, bsdf)
+    if itu_type is not None:
+        base = itu_material(itu_type, frequency, _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
+        return replace(base, **_slab(bsdf))
+    if kind == "radio-material":
+        return Material(
+            **{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": DEFAULT_THICKNESS, **_floats(bsdf)}
+        )
+    raise InputError(
+        f"its BSDF of type {kind!r} has no radio constants; give relative_permittivity and conductivity (or itu) "
+        f"in [materials], or name it mat-itu_..."
+    )
+
+
+def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
+    """The ITU name that Sionna reads from a BSDF: its `type` string, or its own name after `itu_`."""
+    declared = bsdf.find("string[@name='type']") if bsdf is not None else None
+    if declared is not None and (bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-"))):
+        return declared.get("value")
+    return name[4:] if name.startswith(("itu_", "itu-")) else None
+
+
+def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
+    if bsdf is None:
+        return {}
+    return {
+        element.get("name", ""): float(element.get("value", "nan"))
+        for element in bsdf.findall("float")
+        if element.get("name") in _MATERIAL_FIELDS
+    }
+
+
+def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
+    constants = _floats(bsdf)
+    return {key: constants[key] for key in constants if key not in ("relative_permittivity", "conductivity")}
+
+
+def _refer(shape: ElementTree.Element, index: int) -> None:
+    for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
+        shape.remove(child)
+    ElementTree.SubElement(shape, "ref", {"id": f"mat-calibray-{index}", "name": "bsdf"})
+
+
+def _bsdf(index: int, material: Material) -> ElementTree.Element:
+    bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": f"mat-calibray-{index}"})
+    for name in ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient", "xpd_coefficient"):
+        ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
+    return bsdf

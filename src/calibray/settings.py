@@ -1,0 +1,107 @@
+"""How a scene is traced: the tracer's switches and the antennas at both ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Final
+
+from calibray.errors import InputError
+
+PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
+POLARIZATIONS: Final = ("V", "H", "VH", "cross")
+
+
+@dataclass(frozen=True)
+class TraceSettings:
+    """Switches of the tracer, with Sionna RT's meaning.
+
+    Attributes:
+        max_depth: Largest number of interactions of a path, at least 0.
+        line_of_sight: Find the direct path.
+        specular_reflection: Follow specular reflections.
+        refraction: Follow transmission through surfaces.
+        diffraction: Follow first-order diffraction at wedges.
+        edge_diffraction: Let free edges diffract as well.
+        diffraction_lit_region: Keep diffraction where the edge's source or image is in sight.
+        diffuse_reflection: Follow diffuse reflections.
+        samples: Rays sent out per transmitter, at least 1.
+        seed: Seed of the tracer's random numbers, at least 0.
+
+    Raises:
+        InputError: A number lies outside its bound.
+    """
+
+    max_depth: int = 3
+    line_of_sight: bool = True
+    specular_reflection: bool = True
+    refraction: bool = False
+    diffraction: bool = False
+    edge_diffraction: bool = False
+    diffraction_lit_region: bool = True
+    diffuse_reflection: bool = False
+    samples: int = 1_000_000
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("max_depth", 0), ("samples", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise InputError(f"trace.{name} = {value!r}: must be a whole number of at least {least}")
+
+    def record(self) -> dict[str, int | bool]:
+        """The settings by name, for files and digests."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """An antenna as Sionna RT names them.
+
+    Attributes:
+        pattern: "iso", "dipole", "hw_dipole" or "tr38901".
+        polarization: "V", "H", or dual "VH" or "cross".
+        orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
+
+    Raises:
+        InputError: The pattern or polarization is unknown, or the orientation is not three numbers.
+    """
+
+    pattern: str = "iso"
+    polarization: str = "V"
+    orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS)):
+            if getattr(self, name) not in known:
+                raise InputError(f"antenna {name} = {getattr(self, name)!r}: must be one of {', '.join(known)}")
+        object.__setattr__(self, "orientation", tuple(float(angle) for angle in self.orientation))
+        if len(self.orientation) != 3:
+            raise InputError(f"antenna orientation = {self.orientation}: must be three angles [rad]: yaw, pitch, roll")
+
+    @property
+    def ports(self) -> int:
+        """Number of ports: 2 for a dual-polarized antenna, else 1."""
+        return 2 if self.polarization in ("VH", "cross") else 1
+
+
+def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
+    """An antenna from an antenna, a mapping of its attributes, or None for the default.
+
+    Args:
+        value: What the user gave.
+
+    Returns:
+        The antenna.
+
+    Raises:
+        InputError: A key or value is unknown.
+    """
+    if value is None:
+        return Antenna()
+    if isinstance(value, Antenna):
+        return value
+    unknown = set(value) - {field.name for field in fields(Antenna)}
+    if unknown:
+        raise InputError(f"antenna: unknown key {sorted(unknown)[0]!r}; known: pattern, polarization, orientation")
+    return Antenna(**value)  # type: ignore[arg-type]

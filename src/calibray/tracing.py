@@ -1,0 +1,455 @@
+"""Finding paths with Sionna RT; the only module that imports it.
+
+Sionna's solver is a chain of stages: candidates by shooting and bouncing, exact geometry by the image method, fields.
+The first two never depend on what is calibrated, so their result is kept (`Trace`) and compiled into a path program.
+The third stage remains at hand as the rival that replay is measured and tested against.
+
+Receivers are traced in chunks: Sionna's path buffer is shared by all receivers of a source, and its memory grows with
+samples x depth x receivers (NVlabs/sionna#1172). A buffer that filled up is traced again, larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+
+from calibray import llvm
+
+llvm.select()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import sionna.rt as rt  # noqa: E402
+from sionna.rt.antenna_pattern import antenna_pattern_registry, antenna_pattern_to_world_implicit  # noqa: E402
+from sionna.rt.path_solvers.field_calculator import FieldCalculator  # noqa: E402
+from sionna.rt.path_solvers.image_method import ImageMethod  # noqa: E402
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer  # noqa: E402
+from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator  # noqa: E402
+from sionna.rt.radio_materials import scattering_pattern_registry  # noqa: E402
+from sionna.rt.scene import load_scene_from_string  # noqa: E402
+from sionna.rt.utils import rotation_matrix  # noqa: E402
+
+from calibray.errors import EngineError, InputError  # noqa: E402
+from calibray.geometry import Chains, compile_chains, zenith_azimuth  # noqa: E402
+from calibray.materials import Material  # noqa: E402
+from calibray.paths import Paths, concatenate  # noqa: E402
+from calibray.scene import Scene, read_scene  # noqa: E402
+from calibray.settings import Antenna, TraceSettings, as_antenna  # noqa: E402
+
+LANES: Final = 20_000_000  # samples x depth x receivers of one chunk; about 45 bytes each
+BUFFER: Final = 1_000_000  # paths that the buffer of one chunk holds at first
+LARGEST_BUFFER: Final = 64_000_000
+FLOATS: Final = ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient", "xpd_coefficient")
+
+Progress = Callable[[int, int], None]
+
+
+class Links(Protocol):
+    """Anything with transmitter and receiver positions [L, 3], [m]; `Measurements` above all."""
+
+    @property
+    def tx(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def rx(self) -> np.ndarray: ...  # noqa: D102
+
+
+def trace(
+    scene: str | Path | Scene,
+    measurements: Links,
+    *,
+    frequency: float,
+    tx_antenna: Antenna | Mapping[str, object] | None = None,
+    rx_antenna: Antenna | Mapping[str, object] | None = None,
+    materials: Mapping[str, Material | Mapping[str, object]] | None = None,
+    progress: Progress | None = None,
+    **settings: int | bool,
+) -> Paths:
+    """Find the paths of every link and compile them.
+
+    Args:
+        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read.
+        measurements: The links; their values are not looked at.
+        frequency: Carrier frequency [Hz].
+        tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
+        rx_antenna: Receive antenna.
+        materials: Constants in place of the scene's, by material name.
+        progress: Called with (receivers traced, receivers in all) after every chunk.
+        **settings: The attributes of `TraceSettings`.
+
+    Returns:
+        The path program; `links_without_path` tells which links it cannot say anything about.
+
+    Raises:
+        InputError: The scene, an antenna, a setting or a position cannot be used.
+        EngineError: There are more paths than the largest buffer holds.
+    """
+    tracer = Tracer(
+        scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
+        frequency,
+        _settings(settings),
+        as_antenna(tx_antenna),
+        as_antenna(rx_antenna),
+    )
+    return tracer.trace(measurements, progress).paths()
+
+
+def _settings(settings: Mapping[str, int | bool]) -> TraceSettings:
+    unknown = set(settings) - set(TraceSettings().record())
+    if unknown:
+        raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(TraceSettings().record())}")
+    return TraceSettings(**settings)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Paths from one transmitter to some receivers, in Sionna's own buffer; `link` is the link of every path [P]."""
+
+    buffer: PathsBuffer
+    source: mi.Point3f
+    target: mi.Point3f
+    link: np.ndarray
+
+
+class Tracer:
+    """A scene loaded into Sionna RT, with antennas and settings, ready to trace links.
+
+    Args:
+        scene: The scene.
+        frequency: Carrier frequency [Hz].
+        settings: The tracer's switches.
+        tx_antenna: Transmit antenna.
+        rx_antenna: Receive antenna.
+
+    Raises:
+        InputError: Sionna cannot load the scene.
+    """
+
+    def __init__(
+        self, scene: Scene, frequency: float, settings: TraceSettings, tx_antenna: Antenna, rx_antenna: Antenna
+    ) -> None:
+        self.scene, self.frequency, self.settings = scene, float(frequency), settings
+        self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
+        self._scene = _load(scene)
+        self._scene.frequency = self.frequency
+        self._shape_material = _shape_materials(self._scene)
+        self._candidates, self._images = SBDeterministicCandidateGenerator(), ImageMethod()
+        self._fields = FieldCalculator()
+        self.set_materials(scene.materials)
+
+    def set_materials(self, materials: Mapping[str, Material]) -> None:
+        """Give Sionna's materials other constants.
+
+        Args:
+            materials: Constants by material name; materials not named keep theirs.
+        """
+        names = list(self.scene.materials)
+        for name, material in materials.items():
+            target = self._scene.radio_materials[f"calibray-{names.index(name)}"]
+            for constant in FLOATS:  # opaque: a literal would be compiled into the kernels
+                setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
+            target.scattering_pattern = _scattering_pattern(material)
+
+    def trace(self, links: Links, progress: Progress | None = None) -> Trace:
+        """Find the paths of every link with the present materials.
+
+        Args:
+            links: The links.
+            progress: Called with (receivers traced, receivers in all) after every chunk.
+
+        Returns:
+            The paths in Sionna's buffers.
+
+        Raises:
+            InputError: A position is not finite, or a link's ends coincide.
+            EngineError: There are more paths than the largest buffer holds.
+        """
+        tx, rx = _positions(links)
+        chunks, done = [], 0
+        for source, index in self._chunks(tx):
+            chunks.append(self._trace_chunk(source, rx[index], index))
+            done += len(index)
+            if progress is not None:
+                progress(done, len(rx))
+        return Trace(self, tx, rx, tuple(chunks))
+
+    def enclosed(self, points: np.ndarray) -> np.ndarray:
+        """Whether points lie inside closed bodies of the scene, such as buildings.
+
+        Rays that rise in several directions cross a closed body's surface an odd number of times; the majority
+        decides, as scenes have gaps. Rays rise because buildings often lack a floor. A room counts as a body too.
+
+        Args:
+            points: Positions [n, 3], [m].
+
+        Returns:
+            True where enclosed [n].
+        """
+        azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
+        rise = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+        rise = rise.reshape(3, -1)
+        origin = np.repeat(np.asarray(points, dtype=float), rise.shape[1], axis=0)
+        ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(rise, len(points))))
+        odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
+        for _ in range(64):
+            hit = self._scene.mi_scene.ray_intersect(ray, mi.Bool(active))
+            active &= np.array(hit.is_valid(), dtype=bool)
+            if not active.any():
+                break
+            odd ^= active
+            ray = hit.spawn_ray(ray.d)
+            dr.eval(ray)
+        return odd.reshape(len(points), -1).mean(axis=1) > 0.5
+
+    def _chunks(self, tx: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Transmitters with the links that start there, at most as many at once as memory allows."""
+        lanes = self.settings.samples * max(self.settings.max_depth, 1)
+        size = max(1, LANES // lanes)
+        positions, group = np.unique(tx, axis=0, return_inverse=True)
+        for k, position in enumerate(positions):
+            index = np.flatnonzero(group.reshape(-1) == k)
+            for part in np.array_split(index, -(-len(index) // size)):
+                yield position, part
+
+    def _trace_chunk(self, source: np.ndarray, targets: np.ndarray, index: np.ndarray) -> Chunk:
+        settings, size = self.settings, BUFFER
+        src, tgt = _points(source[None]), _points(targets)
+        while True:
+            buffer = self._candidates(
+                mi_scene=self._scene.mi_scene,
+                src_positions=src,
+                tgt_positions=tgt,
+                samples_per_src=settings.samples,
+                max_num_paths_per_src=size,
+                max_depth=settings.max_depth,
+                los=settings.line_of_sight,
+                specular_reflection=settings.specular_reflection,
+                diffuse_reflection=settings.diffuse_reflection,
+                refraction=settings.refraction,
+                diffraction=settings.diffraction,
+                edge_diffraction=settings.edge_diffraction,
+                seed=settings.seed,
+            )
+            buffer.schedule()
+            dr.eval()
+            if int(np.array(buffer.paths_counter).item()) < size - 1:
+                break
+            if size >= LARGEST_BUFFER:
+                raise EngineError(f"more than {size:,} paths to {len(index)} receivers; lower trace.samples or max_depth")
+            size *= 4
+        buffer.shrink()
+        buffer.detach_geometry()
+        if buffer.buffer_size:
+            buffer = self._images(
+                scene=self._scene.mi_scene,
+                paths=buffer,
+                src_positions=src,
+                tgt_positions=tgt,
+                diffraction=settings.diffraction,
+                diffraction_lit_region=settings.diffraction_lit_region,
+            )
+            buffer.discard_invalid()
+        return Chunk(buffer, src, tgt, index[np.array(buffer.target_indices, dtype=np.int64)])
+
+    def compile(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Paths:
+        """Compile one chunk into a path program.
+
+        Args:
+            chunk: Paths in Sionna's buffer.
+            tx: Transmitter of every link [L, 3], [m].
+            rx: Receiver of every link [L, 3], [m].
+
+        Returns:
+            The program, its paths in the buffer's order.
+        """
+        program = compile_chains(self._chains(chunk, tx, rx))
+        departure, arrival = program.departure_direction, program.arrival_direction
+        return Paths(
+            frequency=self.frequency,
+            materials=dict(self.scene.materials),
+            tx_position=tx,
+            rx_position=rx,
+            link=chunk.link.astype(np.int32),
+            delay=program.delay,
+            spreading=program.spreading,
+            departure=zenith_azimuth(departure),
+            arrival=zenith_azimuth(-arrival),
+            tx_field=_turn(_pattern(self.tx_antenna, departure, "out"), program.departure_rotation),
+            rx_field=_turn(_pattern(self.rx_antenna, -arrival, "in"), program.arrival_rotation * [1, -1]),
+            first=program.first,
+            kind=program.kind,
+            material=program.material,
+            cos_incidence=program.cos_incidence,
+            rotation=program.rotation,
+            diffuse=program.diffuse,
+            diffraction=program.diffraction,
+            settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
+        )
+
+    def _chains(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Chains:
+        buffer, count = chunk.buffer, len(chunk.link)
+        depth = buffer.depth_dim_size
+        shape = np.array(buffer.shapes, dtype=np.int64).reshape(count, depth)
+        normal = np.zeros((count, depth, 3))
+        wedge = np.zeros((0, 3)), np.zeros((0, 3))
+        kind = np.array(buffer.interaction_types, dtype=np.int64).reshape(count, depth)
+        if count and kind.any():
+            for step in range(depth):
+                active = mi.Bool(kind[:, step] != 0)
+                found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
+                normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
+            if self.settings.diffraction:
+                wedges = buffer.diffracting_wedges
+                wedge = np.array(wedges.e_hat, dtype=float).T, np.array(wedges.nn, dtype=float).T
+        vertices = [np.array(axis, dtype=float).reshape(count, depth) for axis in
+                    (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)]  # fmt: skip
+        return Chains(
+            source=tx[chunk.link],
+            target=rx[chunk.link],
+            vertex=np.stack(vertices, axis=-1),
+            normal=normal,
+            kind=kind,
+            material=np.vectorize(lambda key: self._shape_material.get(key, 0), otypes=[np.int64])(shape),
+            probability=np.array(buffer.probs, dtype=float).reshape(count, depth),
+            samples=self.settings.samples,
+            edge=wedge[0],
+            normal_n=wedge[1],
+        )
+
+    def field_stage(self, chunk: Chunk) -> np.ndarray:
+        """Sionna's own field stage on stored paths, with the present materials.
+
+        Args:
+            chunk: Paths in Sionna's buffer.
+
+        Returns:
+            Path gains [P, R, T], complex.
+        """
+        if not len(chunk.link):
+            return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
+        buffer = chunk.buffer
+        valid = mi.Bool(buffer.valid)
+        count = len(np.unique(chunk.link)) if False else dr.width(chunk.target)
+        found = self._fields(
+            wavelength=self._scene.wavelength,
+            paths=buffer,
+            samples_per_src=self.settings.samples,
+            diffraction=self.settings.diffraction,
+            src_positions=chunk.source,
+            tgt_positions=chunk.target,
+            src_orientations=_points(np.array([self.tx_antenna.orientation])),
+            tgt_orientations=_points(np.tile(self.rx_antenna.orientation, (dr.width(chunk.target), 1))),
+            src_antenna_patterns=_patterns(self.tx_antenna),
+            tgt_antenna_patterns=_patterns(self.rx_antenna),
+        )
+        buffer.valid = valid  # the field stage narrows it
+        return np.array([[_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A traced campaign in Sionna's buffers.
+
+    Attributes:
+        tracer: The tracer that found it.
+        tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+        chunks: The paths.
+    """
+
+    tracer: Tracer
+    tx: np.ndarray
+    rx: np.ndarray
+    chunks: tuple[Chunk, ...]
+
+    def paths(self) -> Paths:
+        """Compile the paths, ordered by link."""
+        return concatenate([self.tracer.compile(chunk, self.tx, self.rx) for chunk in self.chunks])
+
+    def path_gains(self) -> np.ndarray:
+        """Sionna's path gains with the tracer's present materials.
+
+        Returns:
+            Gains in the order of `paths()` [P, R, T], complex.
+        """
+        order = np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
+        return np.concatenate([self.tracer.field_stage(chunk) for chunk in self.chunks])[order]
+
+
+def _load(scene: Scene) -> rt.Scene:
+    resolver = mi.file_resolver()
+    try:
+        search = mi.FileResolver(resolver)
+        search.append(str(scene.path.parent.resolve()))
+        mi.set_file_resolver(search)
+        return load_scene_from_string(scene.xml)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{scene.path}: Sionna RT cannot load the scene: {str(error).strip()}") from None
+    finally:
+        mi.set_file_resolver(resolver)
+
+
+def _shape_materials(scene: rt.Scene) -> dict[int, int]:
+    """Material index by the id under which Dr.Jit knows a shape."""
+    return {
+        int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): int(shape.bsdf().name.split("-")[-1])
+        for shape in scene.mi_scene.shapes()
+    }
+
+
+def _scattering_pattern(material: Material) -> rt.ScatteringPattern:
+    constants = {
+        "lambertian": {},
+        "directive": {"alpha_r": round(material.alpha_r)},
+        "backscattering": {
+            "alpha_r": round(material.alpha_r),
+            "alpha_i": round(material.alpha_i),
+            "lambda_": material.lambda_,
+        },
+    }[material.scattering_pattern]
+    return scattering_pattern_registry.get(material.scattering_pattern)(**constants)
+
+
+def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
+    tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
+    for name, position in (("tx", tx), ("rx", rx)):
+        bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
+        if len(bad):
+            raise InputError(f"link {bad[0]}: {name} position {position[bad[0]]} is not finite; give metres")
+    same = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < 1e-3)
+    if len(same):
+        raise InputError(f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns")
+    return tx, rx
+
+
+def _points(position: np.ndarray) -> mi.Point3f:
+    points = mi.Point3f(*np.asarray(position, dtype=np.float32).T)
+    dr.make_opaque(points)
+    return points
+
+
+def _patterns(antenna: Antenna) -> list:
+    return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
+
+
+def _pattern(antenna: Antenna, direction: np.ndarray, way: str) -> np.ndarray:
+    """Jones vectors of an antenna in the basis (theta, phi) of the wave, by port [P, ports, 2]."""
+    if not len(direction):
+        return np.zeros((0, antenna.ports, 2), dtype=complex)
+    to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
+    look = mi.Vector3f(*direction.T.astype(np.float32))
+    fields = [antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in _patterns(antenna)]
+    parts = np.array([np.array(field, dtype=float) for field in fields])  # [ports, (re, re, im, im), P]
+    return np.moveaxis(parts[:, :2] + 1j * parts[:, 2:], 2, 0)
+
+
+def _turn(field: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    cos, sin = rotation[:, None, 0], rotation[:, None, 1]
+    return np.stack([cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1)
+
+
+def _complex(value: mi.Complex2f) -> np.ndarray:
+    return np.array(value.real, dtype=float) + 1j * np.array(value.imag, dtype=float)
