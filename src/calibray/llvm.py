@@ -199,10 +199,9 @@ def select() -> Llvm:
     if requested:
         library = inspect(requested)
         if not library.usable:
-            raise InputError(
-                f"{PATH_VARIABLE}={requested}: {library.problem}. Unset it, or point it to a libLLVM of "
-                f"version {OLDEST_MAJOR} or newer; to install one: {remedy()}"
-            )
+            best = next((each.path for each in candidates() if each.usable), None)
+            way_out = f"use {best}" if best else f"have one searched for, after installing it: {remedy()}"
+            raise InputError(f"{PATH_VARIABLE}={requested}: {library.problem}. Unset it to {way_out}")
     else:
         found = candidates()
         if not found or not found[0].usable:
