@@ -1,0 +1,38 @@
+# Everything happens in .venv; `make demo` and `make test` set it up first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+
+.PHONY: setup demo test lint bench docs
+
+setup: $(VENV)/.installed
+	tools/ensure_llvm.sh $(BIN)/python
+
+demo: setup
+	$(BIN)/calibray demo
+
+test: setup
+	$(BIN)/python -m pytest --doctest-modules src tests
+
+lint: $(VENV)/.lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+bench: setup
+	$(BIN)/python benchmarks/replay.py
+
+docs: setup
+	$(BIN)/python tools/check_docs.py
+
+# The stamps keep a second run from installing again unless the packages asked for have changed.
+$(VENV)/.installed: pyproject.toml requirements.lock
+	tools/make_venv.sh $(PYTHON) $(VENV)
+	@echo "Installing Calibray and its packages into $(VENV), some minutes the first time"
+	$(PIP_INSTALL) --editable '.[test]'
+	@touch $@
+
+$(VENV)/.lint: $(VENV)/.installed
+	$(PIP_INSTALL) --editable '.[lint]'
+	@touch $@

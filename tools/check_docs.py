@@ -1,0 +1,92 @@
+"""Checks that what the documentation points to is there: linked files, headings, make targets, commands.
+
+Usage: `python tools/check_docs.py`, which lists what is missing and then exits with 1.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import typer
+
+from calibray.cli import app
+
+ROOT = Path(__file__).resolve().parents[1]
+
+_FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+_HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+# At the start of a line of code; settings such as PYTHON=python3.12 may stand between.
+_COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([a-z][\w-]*)", re.MULTILINE)
+
+
+def missing_links(document: Path, text: str) -> Iterator[str]:
+    """Finds links to files or headings that do not exist.
+
+    Args:
+        document: The Markdown file.
+        text: Its content.
+
+    Yields:
+        The target of each such link. Addresses on the web are not looked up.
+    """
+    for target in _LINK.findall(_FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, heading = target.partition("#")
+        file = (document.parent / name).resolve() if name else document
+        if not file.exists() or (heading and heading not in anchors(file.read_text())):
+            yield target
+
+
+def anchors(text: str) -> set[str]:
+    """The names under which the headings of a Markdown text can be linked to.
+
+    Args:
+        text: The Markdown text.
+
+    Returns:
+        The headings in lower case without punctuation, with hyphens for spaces.
+    """
+    headings = _HEADING.findall(_FENCE.sub("", text))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def missing_commands(text: str, known: dict[str, set[str]]) -> Iterator[str]:
+    """Finds commands that do not exist, in blocks of code and in inline code.
+
+    Args:
+        text: The Markdown text.
+        known: The targets of `make` and the commands of `calibray`.
+
+    Yields:
+        Each such command.
+    """
+    code = _FENCE.findall(text) + re.findall(r"`([^`\n]+)`", _FENCE.sub("", text))
+    for snippet in code:
+        for program, command in _COMMAND.findall(snippet):
+            if command not in known[program]:
+                yield f"{program} {command}"
+
+
+if __name__ == "__main__":
+    targets = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    commands = {
+        "make": set(targets[1].split()) if targets else set(),
+        "calibray": set(typer.main.get_command(app).commands),
+    }
+    folders = [folder for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
+    documents = sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in folder.rglob("*.md"))])
+    faults = [
+        f"{document.relative_to(ROOT)}: {fault} does not exist"
+        for document in documents
+        for fault in [
+            *missing_links(document, document.read_text()),
+            *missing_commands(document.read_text(), commands),
+        ]
+    ]
+    sys.stdout.write("\n".join([*faults, f"{len(documents)} documents, {len(faults)} faults"]) + "\n")
+    sys.exit(bool(faults))

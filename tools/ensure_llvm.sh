@@ -1,0 +1,17 @@
+#!/bin/sh
+# Sees to a libLLVM that the ray tracer can use: installs one where that is allowed, else says how and fails.
+# usage: ensure_llvm.sh PYTHON
+set -eu
+python=$1
+
+# Prints the choice, or what is wrong and the command that puts it right.
+"$python" -m calibray.llvm && exit 0
+
+# A library that the user asked for is the user's to correct.
+if [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    echo "Installing libllvm19" >&2
+    apt-get update
+    apt-get install --yes libllvm19
+    exec "$python" -m calibray.llvm
+fi
+exit 1
