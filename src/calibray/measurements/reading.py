@@ -1,0 +1,220 @@
+"""From tables to links: positions, values and weights, with every fault named by its file, row and column."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.measurements.links import Measurements
+from calibray.measurements.tables import Table, read_table
+from calibray.spelling import did_you_mean
+
+Quantity = Literal["path_loss", "path_gain", "received_power"]
+Coordinates = Sequence[float | str]
+
+PLAUSIBLE_PATH_LOSS_DB: Final = (20.0, 250.0)
+"""The range [dB] outside which a path loss is taken for a mistake of sign, unit or column."""
+
+LINK_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
+"""The columns [m] of a table of links without measured values."""
+
+_DEGREES = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
+
+
+def read_measurements(
+    path: str | Path,
+    tx: Coordinates,
+    rx: Coordinates,
+    value: str,
+    quantity: Quantity = "path_loss",
+    where: str | None = None,
+    group: str | None = None,
+    weight: str | None = None,
+    std: str | float | None = None,
+    tx_power_dbm: str | float | None = None,
+) -> Measurements:
+    """Read measured links from a CSV or Parquet file.
+
+    A link may be measured more than once; each of its values then counts. A row that repeats an earlier one
+    in link, group and value is a copy and refused.
+
+    Args:
+        path: The table, .csv or .parquet.
+        tx: Transmitter position (x, y, z) [m] in the scene's frame, each a number or the name of a column.
+        rx: Receiver position, likewise.
+        value: Column of the measured values.
+        quantity: What they are: "path_loss" [dB], "path_gain" [dB], or "received_power" [dBm].
+        where: Filter over the columns (a pandas query); rows that do not pass are left out before any check.
+        group: Column of group labels.
+        weight: Column of relative weights [1], greater than 0.
+        std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
+        tx_power_dbm: Transmitted power [dBm], a number or a column, for "received_power" only: path loss is
+            this power less the received one, antenna gains and cable losses included.
+
+    Returns:
+        The links that pass, in the order of the file.
+
+    Raises:
+        InputError: The file or a column is missing or malformed, a value is missing, not a number, or
+            implausible, a row is a copy, or no row passes.
+    """
+    table = read_table(path)
+    if where is not None:
+        mask = table.where(where)
+        if not mask.any():
+            raise InputError(
+                f"{path}: where = {where!r} lets none of {len(table)} rows pass; change the filter"
+            )
+        table = table.select(mask)
+    measurements = Measurements(
+        tx=_positions(table, "tx", tx),
+        rx=_positions(table, "rx", rx),
+        path_loss_db=_path_loss_db(table, value, quantity, tx_power_dbm),
+        weight=_weights(table, weight, std),
+        group=None if group is None else table.labels(group),
+        table=table,
+    )
+    _refuse_copies(measurements)
+    return measurements
+
+
+def links_from_frame(frame: pd.DataFrame, group: str | None = None) -> Measurements:
+    """Links without measured values, to predict at.
+
+    Args:
+        frame: Table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
+        group: Column of group labels.
+
+    Returns:
+        The links, their path losses NaN.
+
+    Raises:
+        InputError: A column is missing, or a position is not finite.
+    """
+    return _unmeasured(Table(frame.reset_index(drop=True), source="links"), group)
+
+
+def read_links(path: str | Path, group: str | None = None) -> Measurements:
+    """Links without measured values from a CSV or Parquet file with the columns of `links_from_frame`.
+
+    Args:
+        path: The table, .csv or .parquet.
+        group: Column of group labels.
+
+    Returns:
+        The links, their path losses NaN.
+
+    Raises:
+        InputError: The file or a column is missing or malformed, or a position is not finite.
+    """
+    return _unmeasured(read_table(path), group)
+
+
+def _unmeasured(table: Table, group: str | None) -> Measurements:
+    if len(table) == 0:
+        raise InputError(f"{table.source}: holds no rows; give at least one link")
+    return Measurements(
+        tx=_positions(table, "tx", LINK_COLUMNS[:3]),
+        rx=_positions(table, "rx", LINK_COLUMNS[3:]),
+        path_loss_db=np.full(len(table), np.nan),
+        group=None if group is None else table.labels(group),
+        table=table,
+    )
+
+
+def _positions(table: Table, name: str, coordinates: Coordinates) -> NDArray[np.float64]:
+    """Positions [rows, 3] [m] from three numbers or columns."""
+    if isinstance(coordinates, str) or len(coordinates) != 3:
+        raise InputError(f"{name} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
+    columns = []
+    for coordinate in coordinates:
+        if isinstance(coordinate, str):
+            if _DEGREES & set(re.split(r"[^a-z]+", coordinate.lower())):
+                raise InputError(
+                    f"{table.source}: column {coordinate!r} of {name} looks like degrees on the globe; "
+                    "give metres in the scene's frame"
+                )
+            columns.append(table.numbers(coordinate))
+        elif isinstance(coordinate, bool) or not np.isfinite(coordinate):
+            raise InputError(
+                f"{name} = {coordinates!r}: {coordinate!r} must be a finite number [m] or a column"
+            )
+        else:
+            columns.append(np.full(len(table), float(coordinate)))
+    return np.stack(columns, axis=1)
+
+
+def _path_loss_db(
+    table: Table, value: str, quantity: str, tx_power_dbm: str | float | None
+) -> NDArray[np.float64]:
+    """Path losses [rows] [dB] from the measured column, refused where no radio link can have them."""
+    if quantity not in get_args(Quantity):
+        raise InputError(f"quantity = {quantity!r}: unknown, {did_you_mean(quantity, get_args(Quantity))}")
+    if (quantity == "received_power") != (tx_power_dbm is not None):
+        remedy = "needs tx_power_dbm [dBm]" if tx_power_dbm is None else "takes no tx_power_dbm; leave it out"
+        raise InputError(f"{table.source}: quantity = {quantity!r} {remedy}")
+    measured = table.numbers(value)
+    match quantity:
+        case "path_loss":
+            loss, remedy = measured, "say quantity = 'path_gain' or 'received_power' if it is one"
+        case "path_gain":
+            loss, remedy = -measured, "say quantity = 'path_loss' if it is one"
+        case _:
+            loss, remedy = (
+                _number_or_column(table, tx_power_dbm) - measured,
+                "check tx_power_dbm and the unit, dBm",
+            )
+    lowest, highest = PLAUSIBLE_PATH_LOSS_DB
+    if (strange := (loss < lowest) | (loss > highest)).any():
+        first = int(np.flatnonzero(strange)[0])
+        raise InputError(
+            f"{table.place(first, value)}: {measured[first]:g} means a path loss of {loss[first]:g} dB, must "
+            f"be {lowest:g} to {highest:g} dB ({strange.sum()} of {len(table)} rows); {remedy}"
+        )
+    return loss
+
+
+def _weights(table: Table, weight: str | None, std: str | float | None) -> NDArray[np.float64] | None:
+    """Relative weights [rows], from weights or from standard deviations."""
+    if weight is not None and std is not None:
+        raise InputError(f"weight = {weight!r} and std = {std!r}: give one of them")
+    if weight is None and std is None:
+        return None
+    name = std if weight is None else weight
+    values = _number_or_column(table, name)
+    if (wrong := values <= 0).any():
+        first = int(np.flatnonzero(wrong)[0])
+        place = table.place(first, name) if isinstance(name, str) else "std"
+        raise InputError(
+            f"{place}: {values[first]:g} must be greater than 0; leave the row out with a where filter"
+        )
+    return values if std is None else 1 / values**2
+
+
+def _number_or_column(table: Table, source: str | float | None) -> NDArray[np.float64]:
+    if isinstance(source, str):
+        return table.numbers(source)
+    if isinstance(source, bool) or not np.isfinite(source):  # type: ignore[arg-type]
+        raise InputError(f"{table.source}: {source!r} must be a finite number or a column")
+    return np.full(len(table), float(source))  # type: ignore[arg-type]
+
+
+def _refuse_copies(links: Measurements) -> None:
+    """Refuse a row that repeats an earlier one in link, group and value."""
+    keys = pd.DataFrame(np.column_stack([links.tx, links.rx, links.path_loss_db]))
+    keys["group"] = links.group_index
+    copies = np.flatnonzero(keys.duplicated())
+    if len(copies):
+        copy = int(copies[0])
+        first = int(np.flatnonzero((keys == keys.iloc[copy]).all(axis=1))[0])
+        raise InputError(
+            f"{links.source}, row {links.row[copy]}: duplicate link, same positions and value as row "
+            f"{links.row[first]} ({len(copies)} in all); remove one"
+        )
