@@ -1,0 +1,173 @@
+from dataclasses import astuple, replace
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibray.errors import InputError
+from calibray.materials import FIELDS, Material, constants
+from calibray.parameters import Parameter, Parameters, make_parameter, split_name
+
+BASE = {
+    "ground": Material(3.0, 0.01, 0.5),
+    "walls": Material(5.24, 0.14, 0.3, scattering_coefficient=0.2),
+    "tower.7": Material(
+        6.0, 0.02, 0.01, scattering_pattern="backscattering", alpha_r=4, alpha_i=2, lambda_=0.6
+    ),
+}
+PARAMETERS = Parameters(
+    (
+        Parameter("walls.relative_permittivity", 1.5, 12.0, 5.0),
+        Parameter("tower.7.lambda_", 0.0, 1.0, 0.6),
+        Parameter("ground.conductivity", 1e-4, 1.0, 0.01, scale="log"),
+        Parameter("walls.thickness", 0.05, 0.6, 0.3),
+    )
+)
+unit_vectors = st.lists(st.floats(0, 1), min_size=4, max_size=4)
+
+
+def test_arrays_follow_the_order_of_the_parameters():
+    assert PARAMETERS.names[1] == "tower.7.lambda_"
+    np.testing.assert_array_equal(PARAMETERS.lower, [1.5, 0, 1e-4, 0.05])
+    np.testing.assert_array_equal(PARAMETERS.upper, [12, 1, 1, 0.6])
+    np.testing.assert_array_equal(PARAMETERS.start, [5, 0.6, 0.01, 0.3])
+    assert PARAMETERS.logarithmic.tolist() == [False, False, True, False]
+    assert (len(PARAMETERS), [parameter.material for parameter in PARAMETERS]) == (
+        4,
+        ["walls", "tower.7", "ground", "walls"],
+    )
+
+
+def test_a_candidate_changes_its_fields_and_nothing_else():
+    materials = PARAMETERS.materials([7.0, 0.25, 0.5, 0.1], BASE)
+    assert list(materials) == list(BASE)
+    assert materials["walls"] == replace(BASE["walls"], relative_permittivity=7.0, thickness=0.1)
+    assert materials["tower.7"] == replace(BASE["tower.7"], lambda_=0.25)
+    assert materials["ground"] == replace(BASE["ground"], conductivity=0.5)
+
+
+@given(st.lists(unit_vectors, min_size=1, max_size=4))
+def test_the_batch_of_constants_equals_the_materials_one_by_one(units):
+    candidates = PARAMETERS.from_unit(units)
+    batch = PARAMETERS.constants(candidates, BASE)
+    assert batch.shape == (len(units), len(BASE), len(FIELDS))
+    for candidate, matrix in zip(candidates, batch, strict=True):
+        np.testing.assert_array_equal(matrix, constants(PARAMETERS.materials(candidate, BASE)))
+
+
+def test_indices_point_at_the_cells_that_a_candidate_sets():
+    rows, columns = PARAMETERS.indices(["walls", "ground", "tower.7"])
+    assert rows.tolist() == [0, 2, 1, 0]
+    assert [FIELDS[column] for column in columns] == [
+        "relative_permittivity",
+        "lambda_",
+        "conductivity",
+        "thickness",
+    ]
+
+
+@given(unit_vectors)
+def test_unit_scaling_round_trips_within_the_bounds(unit):
+    candidate = PARAMETERS.from_unit(unit)
+    assert np.all((PARAMETERS.lower <= candidate) & (candidate <= PARAMETERS.upper))
+    np.testing.assert_allclose(PARAMETERS.to_unit(candidate), unit, atol=1e-12)
+
+
+def test_unit_scaling_maps_bounds_and_the_geometric_middle():
+    np.testing.assert_allclose(PARAMETERS.from_unit([0, 0, 0, 0]), PARAMETERS.lower, rtol=1e-14)
+    np.testing.assert_allclose(PARAMETERS.from_unit([1, 1, 1, 1]), PARAMETERS.upper, rtol=1e-14)
+    np.testing.assert_allclose(PARAMETERS.from_unit([0.5] * 4), [6.75, 0.5, 1e-2, 0.325])
+    np.testing.assert_array_equal(
+        PARAMETERS.to_unit([PARAMETERS.lower, PARAMETERS.upper]), [[0] * 4, [1] * 4]
+    )
+
+
+@given(st.text(min_size=1), st.sampled_from(FIELDS))
+def test_names_part_at_the_last_dot(material, field):
+    assert split_name(f"{material}.{field}") == (material, field)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("walls.permitivity", 1, 2, 1), "no field 'permitivity'"),
+        (("walls.relative_permitivity", 1, 2, 1), "did you mean 'relative_permittivity'"),
+        (("relative_permittivity", 1, 2, 1), "must be a material and a field"),
+        (("walls.relative_permittivity", 12, 1.5, 5), r"bounds = \[12, 1.5\] are reversed"),
+        (("walls.relative_permittivity", 5, 5, 5), "are equal.*under \\[materials\\]"),
+        (("walls.relative_permittivity", 0.5, 5, 2), "0.5 must be a finite number not below 1"),
+        (("walls.relative_permittivity", nan, 5, 2), "nan must be a finite number"),
+        (("walls.relative_permittivity", 1, inf, 2), "inf must be a finite number"),
+        (("walls.conductivity", -0.1, 1, 0.5), "-0.1 must be a finite number not below 0 S/m"),
+        (("walls.thickness", 0, 1, 0.5), "0 must be a finite number greater than 0 m"),
+        (("walls.scattering_coefficient", 0, 1.5, 0.5), r"1.5 must be a number in \[0, 1\]"),
+        (("walls.relative_permittivity", 2, 5, 1.5), "start = 1.5 lies outside bounds"),
+        (("walls.relative_permittivity", 2, 5, nan), "start = nan lies outside bounds"),
+        (("walls.relative_permittivity", 2, 5, 3, "logarithmic"), "must be one of linear, log"),
+        (("walls.conductivity", 0, 5, 3, "log"), "the lower bound must be greater than 0"),
+    ],
+)
+def test_impossible_parameters_are_refused(arguments, message):
+    with pytest.raises(InputError, match=rf"{message}"):
+        Parameter(*arguments)
+
+
+def test_impossible_sets_and_candidates_are_refused():
+    with pytest.raises(InputError, match="none given"):
+        Parameters(())
+    with pytest.raises(InputError, match=r"'walls\.thickness' stands twice"):
+        Parameters((*PARAMETERS.items, Parameter("walls.thickness", 0.1, 0.2, 0.1)))
+    for method in (PARAMETERS.to_unit, PARAMETERS.from_unit):
+        with pytest.raises(InputError, match=r"shape \(3,\), must end in 4"):
+            method([1, 2, 3])
+    with pytest.raises(InputError, match=r"shape \(1, 4\), must be \(4,\)"):
+        PARAMETERS.materials([[1, 2, 3, 4]], BASE)
+    with pytest.raises(InputError, match="relative_permittivity = nan"):
+        PARAMETERS.materials([nan, 0.5, 0.1, 0.1], BASE)
+    with pytest.raises(InputError, match="no material 'walls'; did you mean 'wall'"):
+        PARAMETERS.materials(PARAMETERS.start, {"wall": BASE["walls"]})
+    with pytest.raises(InputError, match=r"no material 'tower\.7'"):
+        PARAMETERS.indices(["walls", "ground"])
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "value"),
+    [
+        ("walls.relative_permittivity", None, 5.24),
+        ("walls.relative_permittivity", 4, 4.0),
+        ("walls.relative_permittivity", "itu:concrete@P.2040-1", 5.31),
+        ("walls.relative_permittivity", "itu:concrete", 5.24),
+        ("walls.conductivity", "itu:glass@P.2040-1", 0.0043 * 4**1.1925),
+    ],
+)
+def test_starts_resolve_to_numbers(name, start, value):
+    bounds = (1.0, 12.0) if "permittivity" in name else (0.0, 1.0)
+    parameter = make_parameter(name, bounds, BASE, 4e9, start)
+    assert astuple(parameter) == (name, *bounds, pytest.approx(value, rel=1e-15), "linear")
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "message"),
+    [
+        ("wals.relative_permittivity", 2, "the scene has no material 'wals'; did you mean 'walls'"),
+        ("walls.relative_permittivity", "itu:concret", "start = 'itu:concret': .*did you mean 'concrete'"),
+        ("walls.relative_permittivity", "itu:wet_ground", "not for 28.5 GHz"),
+        ("walls.relative_permittivity", "itu:concrete@P.2040-0", "revision = 'P.2040-0'"),
+        ("walls.relative_permittivity", "concrete", "must be a number or 'itu:NAME'"),
+        ("walls.relative_permittivity", nan, "start = nan: must be a finite number"),
+        ("walls.relative_permittivity", True, "start = True: must be a finite number"),
+        ("walls.thickness", "itu:concrete", "gives no thickness"),
+        ("walls.alpha_r", None, "has no effect: the scattering pattern of 'walls' is 'lambertian'"),
+        ("walls.relative_permittivity", "itu:metal", "start = 1 lies outside bounds"),
+        ("ground.relative_permittivity", None, None),
+    ],
+)
+def test_starts_that_cannot_be_are_refused(name, start, message):
+    arguments = (name, (2.0, 12.0), BASE, 28.5e9, start)
+    if message is None:  # the negative control
+        assert make_parameter(*arguments).start == 3.0
+    else:
+        with pytest.raises(InputError, match=message):
+            make_parameter(*arguments)
