@@ -1,9 +1,10 @@
 """Geometry of traced paths: vertices and normals in, the constants of the path program out.
 
 The field of a path is a Jones vector in a frame that each interaction turns into its own: first axis
-s = k x n / |k x n| (transverse electric), second axis k x s. Sionna RT writes the same field in the basis
-(theta, phi) of the direction of travel; its conventions (reference near the poles, orientation of normals and
-wedges) are followed here, so that path gains agree in phase as well.
+s = k x n / |k x n| (transverse electric), second axis k x s. Sionna RT writes the field between interactions in the
+basis (theta, phi) of the direction of travel; the two rotations, out of one frame and into the next, are merged here
+into one. Its conventions (reference near the poles, orientation of normals and wedges, the mirrored direction in
+place of the traced one after a reflection) are followed, so that path gains agree in phase as well.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class Chains:
         samples: Rays sent out per source.
         edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
         normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
+        edge_lengths: Lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
     """
 
     source: np.ndarray
@@ -43,6 +45,7 @@ class Chains:
     samples: int
     edge: np.ndarray
     normal_n: np.ndarray
+    edge_lengths: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -99,13 +102,13 @@ def compile_chains(chains: Chains) -> Program:
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
 
-    frame = spherical_basis(direction[:, 0])  # first axis of the frame the field is in
+    out_of = np.tile([1.0, 0.0], (count, 1))  # rotation from the last interaction's frame into the basis (theta, phi)
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[np.ndarray, ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     tube_start = np.zeros(count)  # length already travelled when the present ray tube began
-    edge_at = np.zeros(count)
+    spread = np.zeros(count)  # set where an edge diffracts
     travelled = segment[:, 0].copy()
     for step in range(depth):
         row = np.flatnonzero(present[:, step])
@@ -116,6 +119,8 @@ def compile_chains(chains: Chains) -> Program:
         solid_angle[row] *= _inverse(chains.probability[row, step])
         kind = chains.kind[row, step]
         entering = transverse_electric(incident, normal)
+        mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
+        onward = np.where((kind == Kind.SPECULAR)[:, None], mirrored, incident)
         exiting = entering.copy()
 
         diffuse = kind == Kind.DIFFUSE
@@ -124,33 +129,30 @@ def compile_chains(chains: Chains) -> Program:
             tables[Kind.DIFFUSE].append(
                 (some, np.full(len(some), step), *_diffuse(k_in, k_out, normal[diffuse], entering[diffuse]), solid_angle[some])
             )
-            exiting[diffuse] = spherical_basis(k_out, pole_reference=False)
+            exiting[diffuse], onward[diffuse] = spherical_basis(k_out, pole_reference=False), k_out
             solid_angle[some] = 2 * np.pi
             tube_start[some] = travelled[some]
 
         wedge = kind == Kind.DIFFRACTION
         if wedge.any():
             some, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
-            edge_at[some] = travelled[some]
-            edge = chains.edge[some]
-            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[some], edge, travelled[some], total[some])
+            edge, (before, after) = chains.edge[some], chains.edge_lengths[some].T
+            spread[some] = 1 / np.sqrt(before * after * (before + after))
+            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[some], edge, before, after)
             tables[Kind.DIFFRACTION].append((some, np.full(len(some), step), *constants))
             entering[wedge] = _unit(np.cross(k_in, edge))
-            exiting[wedge] = -_unit(np.cross(k_out, edge))
+            exiting[wedge], onward[wedge] = -_unit(np.cross(k_out, edge)), k_out
 
-        turn = rotate(incident, frame[row], entering)
+        into = rotate(incident, spherical_basis(incident), entering)
         if step == 0:
-            departure_rotation[row], turn = turn, np.tile([1.0, 0.0], (len(row), 1))
-        rotation[row, step] = turn
-        frame[row] = exiting
+            departure_rotation[row], rotation[row, 0] = into, [1.0, 0.0]
+        else:
+            rotation[row, step] = _compose(out_of[row], into)
+        out_of[row] = rotate(onward, exiting, spherical_basis(onward))
         travelled[row] += segment[row, step + 1]
 
     last = direction[np.arange(count), length]
-    spread = np.where(
-        edge_at > 0,
-        1 / np.sqrt(np.where(edge_at > 0, edge_at * (total - edge_at) * total, 1.0)),  # UTD, s s' (s + s')
-        1 / (total - tube_start),
-    )
+    spread = np.where(spread > 0, spread, 1 / (total - tube_start))
     flat = present.reshape(-1)
     return Program(
         delay=total / speed_of_light,
@@ -158,7 +160,7 @@ def compile_chains(chains: Chains) -> Program:
         departure_direction=direction[:, 0],
         arrival_direction=last,
         departure_rotation=departure_rotation,
-        arrival_rotation=rotate(last, frame, spherical_basis(last)),
+        arrival_rotation=out_of,
         first=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
         kind=chains.kind.reshape(-1)[flat].astype(np.uint8),
         material=chains.material.reshape(-1)[flat].astype(np.int32),
@@ -258,7 +260,7 @@ def _wedge(
     normal_n: np.ndarray,
     edge: np.ndarray,
     before: np.ndarray,
-    total: np.ndarray,
+    after: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Constants of a wedge diffraction (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5), as Sionna RT has them."""
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
@@ -267,8 +269,7 @@ def _wedge(
     azimuth_in = _azimuth(-_unit(_reject(incident, edge)), tangent, normal_0)
     azimuth_out = _azimuth(_unit(_reject(leaving, edge)), tangent, normal_0)
     sin_edge = np.sqrt(np.maximum(1 - cos_edge**2, 0))
-    after = total - before
-    distance = before * after / total * sin_edge**2
+    distance = before * after / (before + after) * sin_edge**2
     phi_in = _unit(np.cross(incident, edge))
     turns = []
     for normal in (normal_0, normal_n):
@@ -291,6 +292,12 @@ def _azimuth(away: np.ndarray, tangent: np.ndarray, normal: np.ndarray) -> np.nd
     """Angle of a direction pointing away from the edge, counted from the 0-face [0, 2 pi)."""
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
+
+
+def _compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(cos, sin) of two rotations, one after the other."""
+    (cos_1, sin_1), (cos_2, sin_2) = first.T, second.T
+    return np.stack([cos_1 * cos_2 - sin_1 * sin_2, sin_1 * cos_2 + cos_1 * sin_2], axis=-1)
 
 
 def _in_path_order(parts: list[tuple[np.ndarray, ...]], empty: Diffuse | Diffraction) -> list[np.ndarray]:

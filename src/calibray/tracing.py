@@ -294,7 +294,7 @@ class Tracer:
         depth = buffer.depth_dim_size
         shape = np.array(buffer.shapes, dtype=np.int64).reshape(count, depth)
         normal = np.zeros((count, depth, 3))
-        wedge = np.zeros((0, 3)), np.zeros((0, 3))
+        wedge = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
         kind = np.array(buffer.interaction_types, dtype=np.int64).reshape(count, depth)
         if count and kind.any():
             for step in range(depth):
@@ -302,8 +302,14 @@ class Tracer:
                 found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
                 normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
             if self.settings.diffraction:
-                wedges = buffer.diffracting_wedges
-                wedge = np.array(wedges.e_hat, dtype=float).T, np.array(wedges.nn, dtype=float).T
+                wedges, ends = buffer.diffracting_wedges, (_gather(chunk.source, buffer.source_indices),
+                                                           _gather(chunk.target, buffer.target_indices))  # fmt: skip
+                after, before = self._fields._diffraction_compute_s_s_prime(buffer, *ends)
+                wedge = (
+                    np.array(wedges.e_hat, dtype=float).T,
+                    np.array(wedges.nn, dtype=float).T,
+                    np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1),
+                )
         vertices = [np.array(axis, dtype=float).reshape(count, depth) for axis in
                     (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)]  # fmt: skip
         return Chains(
@@ -317,6 +323,7 @@ class Tracer:
             samples=self.settings.samples,
             edge=wedge[0],
             normal_n=wedge[1],
+            edge_lengths=wedge[2],
         )
 
     def field_stage(self, chunk: Chunk) -> np.ndarray:
@@ -429,6 +436,10 @@ def _points(position: np.ndarray) -> mi.Point3f:
     points = mi.Point3f(*np.asarray(position, dtype=np.float32).T)
     dr.make_opaque(points)
     return points
+
+
+def _gather(points: mi.Point3f, index: mi.UInt) -> mi.Point3f:
+    return dr.gather(mi.Point3f, points, index)
 
 
 def _patterns(antenna: Antenna) -> list:
