@@ -325,7 +325,7 @@ def make_parameter(
     if start is None:
         value = float(getattr(base[material], field))
     elif isinstance(start, str):
-        value = _itu_start(name, start, frequency)
+        value = itu_start(name, start, frequency)
     elif isinstance(start, bool) or not isfinite(start):
         raise InputError(f"{name}: start = {start!r}: must be a finite number or 'itu:NAME'")
     else:
@@ -333,8 +333,20 @@ def make_parameter(
     return Parameter(name=name, lower=float(bounds[0]), upper=float(bounds[1]), start=value, scale=scale)
 
 
-def _itu_start(name: str, start: str, frequency: float) -> float:
-    """The value that ITU-R P.2040 gives for a start like "itu:concrete@P.2040-1"."""
+def itu_start(name: str, start: str, frequency: float) -> float:
+    """The value that ITU-R P.2040 gives for a start like "itu:concrete@P.2040-1".
+
+    Args:
+        name: The parameter, of the field relative_permittivity or conductivity.
+        start: "itu:" and the ITU-R material, then "@" and the revision unless it is the default one.
+        frequency: Frequency [Hz].
+
+    Returns:
+        The value, in the field's unit.
+
+    Raises:
+        InputError: The text has another form, the field has no ITU-R law, or what `itu_material` refuses.
+    """
     field = split_name(name)[1]
     if not start.startswith(_ITU_PREFIX):
         raise InputError(

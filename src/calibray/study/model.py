@@ -1,0 +1,320 @@
+"""The study: one calibration problem, read from its file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, Self
+
+from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
+
+from calibray.errors import InputError
+from calibray.materials import DEFAULT_REVISION, Material, itu_material
+from calibray.measurements import Measurements, read_measurements
+from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
+from calibray.study.faults import dotted, explain
+from calibray.study.sections import (
+    AntennasSection,
+    EngineSection,
+    HoldoutSection,
+    LinksSection,
+    MaterialSection,
+    MethodSection,
+    ObjectiveSection,
+    OffsetSection,
+    ParameterSection,
+    SceneSection,
+    Section,
+    TraceSection,
+)
+
+VERSION: Final = 1
+"""The version of the study file that this module reads."""
+
+BUNDLED: Final = "sionna:"
+"""What the name of a scene bundled with Sionna RT begins with."""
+
+
+class Study(Section):
+    """One calibration problem, as its study file states it; see ``docs/study-file.md``.
+
+    Attributes:
+        version: Version of the file's format.
+        scene: The scene and the carrier.
+        materials: Constants in place of the scene's, by material name.
+        links: The measured links.
+        antennas: The antennas.
+        trace: The tracer's switches.
+        objective: How paths become a path loss.
+        parameters: The free parameters by name, in the order of a candidate's components.
+        offset: The nuisance offset, or None.
+        holdout: The links held out, or None.
+        method: The optimizer.
+        engine: The engine.
+    """
+
+    version: int
+    scene: SceneSection
+    materials: dict[str, MaterialSection] = Field(default_factory=dict)
+    links: LinksSection
+    antennas: AntennasSection = Field(default_factory=AntennasSection)
+    trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
+    objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
+    parameters: dict[str, ParameterSection]
+    offset: OffsetSection | None = None
+    holdout: HoldoutSection | None = None
+    method: MethodSection = Field(default_factory=MethodSection)
+    engine: EngineSection = Field(default_factory=EngineSection)
+
+    _path: Path = PrivateAttr(default=Path("study.toml"))
+
+    @field_validator("version")
+    @classmethod
+    def _known_version(cls, value: int) -> int:
+        if value != VERSION:
+            raise InputError(
+                f"this Calibray reads version {VERSION}; convert the file, or install a Calibray that fits"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.objective.combining == "band" and self.scene.bandwidth is None:
+            raise InputError("objective.combining = 'band' needs scene.bandwidth [Hz]")
+        frequency = self.scene.frequency
+        for name, material in self.materials.items():
+            if material.itu is not None:
+                try:
+                    itu_material(material.itu, frequency, revision=material.revision or DEFAULT_REVISION)
+                except InputError as error:
+                    raise InputError(f"{dotted(('materials', name))}: {error}") from None
+        # What the scene alone could tell is checked by `parameter_set`; all else before anything is traced.
+        names = []
+        for name, entry in self.parameters.items():
+            start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
+            lower, upper = entry.bounds
+            names.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
+        Parameters(tuple(names))
+        return self
+
+    @classmethod
+    def load(cls, path: str | Path) -> Study:
+        """Read a study file.
+
+        Args:
+            path: The TOML file.
+
+        Returns:
+            The study.
+
+        Raises:
+            InputError: The file does not exist, is no TOML, has an unknown key or an impossible value, or
+                names a scene or links that do not exist; one line for each fault.
+        """
+        path = Path(path)
+        try:
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such study file") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{path}: not valid TOML: {error}") from None
+        study = cls.from_content(content, path)
+        study._check_files()
+        return study
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Study:
+        """A study from the content of a study file; that its files exist is not checked.
+
+        Args:
+            content: Sections by name, as TOML gives them.
+            path: Where the study file stands or would stand; other files are relative to its folder.
+
+        Returns:
+            The study.
+
+        Raises:
+            InputError: A key is unknown or a value impossible; one line for each fault.
+        """
+        _refuse_unquoted_names(content.get("parameters"), path)
+        try:
+            # By way of JSON, where lists pass for tuples and yet nothing is converted: "4" is no number.
+            study = cls.model_validate_json(json.dumps(content, default=str))
+        except ValidationError as error:
+            raise explain(error, cls, content, str(path)) from None
+        study._path = Path(path)
+        return study
+
+    @property
+    def path(self) -> Path:
+        """The study file."""
+        return self._path
+
+    @property
+    def scene_source(self) -> str:
+        """The scene: the path of its file, or "sionna:NAME"."""
+        return (
+            self.scene.file
+            if self.scene.file.startswith(BUNDLED)
+            else str(self._resolve("scene", self.scene.file))
+        )
+
+    @property
+    def links_path(self) -> Path:
+        """The table of links."""
+        return self._resolve("links", self.links.file)
+
+    @property
+    def overrides(self) -> dict[str, dict[str, Any]]:
+        """The constants of ``[materials]`` by material name; only those that are given."""
+        return {name: material.model_dump(exclude_none=True) for name, material in self.materials.items()}
+
+    def measurements(self) -> Measurements:
+        """Read the links, grouped as the offset is.
+
+        Returns:
+            All links of the study, those held out included.
+
+        Raises:
+            InputError: What `read_measurements` refuses.
+        """
+        links = self.links.model_dump(exclude={"file"})
+        return read_measurements(self.links_path, group=self.offset.per if self.offset else None, **links)
+
+    def split(self, measurements: Measurements) -> tuple[Measurements, Measurements | None]:
+        """Part links into those to calibrate on and those held out, None without ``[holdout]``.
+
+        Args:
+            measurements: Links with the columns that the hold-out's filter names.
+
+        Returns:
+            The links to calibrate on, and those held out.
+
+        Raises:
+            InputError: The filter is not valid, or one of the parts would be empty.
+        """
+        return (measurements, None) if self.holdout is None else measurements.split(self.holdout.where)
+
+    def parameter_set(self, base: Mapping[str, Material]) -> Parameters:
+        """The free parameters of a scene, their starts resolved.
+
+        Args:
+            base: The scene's materials by name, those of ``[materials]`` replaced.
+
+        Returns:
+            The parameters, in the order of the file.
+
+        Raises:
+            InputError: The scene lacks a parameter's material, or a start lies outside its bounds.
+        """
+        frequency = self.scene.frequency
+        try:
+            return Parameters(
+                tuple(
+                    make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale)
+                    for name, entry in self.parameters.items()
+                )
+            )
+        except InputError as error:
+            raise InputError(f"{self._path}: {error}") from None
+
+    def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Study:
+        """The study with another method, seed or engine; the options of a method that is replaced go with it.
+
+        Args:
+            method: Name of the method, or None to keep it.
+            seed: Seed, or None to keep it.
+            engine: Name of the engine, or None to keep it.
+
+        Returns:
+            The changed study.
+
+        Raises:
+            InputError: A value is impossible.
+        """
+        content = self.content()
+        if method is not None and method != self.method.name:
+            content["method"] = {"name": method, "seed": self.method.seed}
+        if seed is not None:
+            content["method"]["seed"] = seed
+        if engine is not None:
+            content["engine"]["name"] = engine
+        return Study.from_content(content, self._path)
+
+    def content(self) -> dict[str, Any]:
+        """The study as plain values, every default written out; `from_content` takes it back."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+    def digest(self) -> str:
+        """A fingerprint of the study: SHA-256 of its content, the same however the file is laid out.
+
+        The order of the parameters counts, since it orders a candidate's components; the files named do not.
+        """
+        content = self.content() | {"parameters": list(self.content()["parameters"].items())}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def _resolve(self, section: str, file: str) -> Path:
+        try:
+            return self._path.parent / expand(file, os.environ)
+        except InputError as error:
+            raise InputError(f"{self._path}: {section}.file = {file!r}: {error}") from None
+
+    def _check_files(self) -> None:
+        files = {"scene": self.scene_source, "links": self.links_path}
+        for section, file in files.items():
+            if not str(file).startswith(BUNDLED) and not Path(file).is_file():
+                written = getattr(self, section).file
+                raise InputError(
+                    f"{self._path}: {section}.file = {written!r}: no such file, {Path(file).resolve()}"
+                )
+
+
+def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
+    """Refuse ``walls.thickness = ...``, which TOML reads as a table "walls" with a key "thickness"."""
+    for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
+        fields = entry if isinstance(entry, Mapping) else {}
+        if field := next((key for key, value in fields.items() if isinstance(value, Mapping)), None):
+            raise InputError(
+                f'{path}: parameters.{name}.{field}: quote the name, "{name}.{field}" = {{ ... }}'
+            )
+
+
+def expand(text: str, environment: Mapping[str, str]) -> str:
+    """Put in environment variables: ``${NAME}``, or ``${NAME:-default}`` where one may be unset or empty.
+
+    Args:
+        text: The text.
+        environment: The variables.
+
+    Returns:
+        The text with every variable replaced.
+
+    Raises:
+        InputError: A variable without default is not set, or a ``${`` is malformed.
+
+    Example:
+        >>> expand("${HERE:-there}/links.csv", {})
+        'there/links.csv'
+    """
+
+    def value(match: re.Match[str]) -> str:
+        name, default = match.groups()
+        if found := environment.get(name):
+            return found
+        if default is None:
+            raise InputError(f"environment variable {name} is not set; set it, or write ${{{name}:-DEFAULT}}")
+        return default
+
+    expanded, count = re.subn(r"\$\{([A-Za-z_]\w*)(?::-([^{}]*))?\}", value, text)
+    if text.count("${") != count:
+        raise InputError("malformed ${...}; write ${NAME} or ${NAME:-DEFAULT}")
+    return expanded

@@ -1,0 +1,225 @@
+"""The sections of a study file, each a closed model: what has no meaning is refused, not ignored."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic.dataclasses import dataclass as checked
+
+from calibray.errors import InputError
+from calibray.materials import Material
+from calibray.measurements import Quantity
+from calibray.parameters import Scale
+from calibray.settings import Antenna, TraceSettings
+
+FREQUENCIES: Final = (1e6, 1e12)
+"""The carrier frequencies [Hz] taken as meant; one outside was probably given in another unit."""
+
+_CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+_Antenna = checked(Antenna, config=_CLOSED, frozen=True)
+TraceSection = checked(TraceSettings, config=_CLOSED, frozen=True)
+
+Text = Annotated[str, Field(min_length=1)]
+Coordinate = float | str
+
+
+class Section(BaseModel):
+    """What all sections share: no unknown keys, no conversions, no change."""
+
+    model_config = ConfigDict(**_CLOSED, frozen=True)
+
+
+class SceneSection(Section):
+    """``[scene]``: the scene and the carrier.
+
+    Attributes:
+        file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
+        frequency: Carrier frequency [Hz].
+        bandwidth: Bandwidth [Hz], for combining over the band.
+    """
+
+    file: Text
+    frequency: float
+    bandwidth: Annotated[float, Field(gt=0)] | None = None
+
+    @field_validator("frequency")
+    @classmethod
+    def _in_hertz(cls, value: float) -> float:
+        lowest, highest = FREQUENCIES
+        if not lowest <= value <= highest:
+            raise InputError(f"must lie in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9")
+        return value
+
+
+class MaterialSection(Section):
+    """``[materials]``, one entry: constants in place of the scene's.
+
+    Attributes:
+        itu: ITU-R P.2040 material that gives permittivity and conductivity.
+        revision: Revision of ITU-R P.2040, with `itu` only.
+        relative_permittivity: Real part of the relative permittivity [1].
+        conductivity: Conductivity [S/m].
+        thickness: Thickness [m].
+        scattering_coefficient: Scattering coefficient [1].
+        xpd_coefficient: Cross-polarization discrimination coefficient [1].
+        scattering_pattern: "lambertian", "directive" or "backscattering".
+        alpha_r: Exponent [1] of the lobe around the specular direction.
+        alpha_i: Exponent [1] of the lobe back towards the source.
+        lambda_: Share [1] of the diffuse energy in the lobe around the specular direction.
+    """
+
+    itu: Text | None = None
+    revision: Text | None = None
+    relative_permittivity: float | None = None
+    conductivity: float | None = None
+    thickness: float | None = None
+    scattering_coefficient: float | None = None
+    xpd_coefficient: float | None = None
+    scattering_pattern: Text | None = None
+    alpha_r: float | None = None
+    alpha_i: float | None = None
+    lambda_: float | None = None
+
+    @model_validator(mode="after")
+    def _physical(self) -> Self:
+        if self.revision is not None and self.itu is None:
+            raise InputError(
+                f"revision = {self.revision!r} without itu; name the ITU-R material, or leave it out"
+            )
+        given = self.model_dump(exclude_none=True, exclude={"itu", "revision"})
+        Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **given})
+        return self
+
+
+class LinksSection(Section):
+    """``[links]``: the table of measured links, with the arguments of `read_measurements`.
+
+    Attributes:
+        file: CSV or Parquet file, relative to the study file's folder.
+        tx: Transmitter position (x, y, z) [m], each a number or a column.
+        rx: Receiver position, likewise.
+        value: Column of the measured values.
+        quantity: "path_loss" [dB], "path_gain" [dB] or "received_power" [dBm].
+        where: Row filter.
+        weight: Column of relative weights [1].
+        std: Standard deviation [dB] of the values, a number or a column.
+        tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
+    """
+
+    file: Text
+    tx: tuple[Coordinate, Coordinate, Coordinate]
+    rx: tuple[Coordinate, Coordinate, Coordinate]
+    value: Text
+    quantity: Quantity = "path_loss"
+    where: Text | None = None
+    weight: Text | None = None
+    std: Coordinate | None = None
+    tx_power_dbm: Coordinate | None = None
+
+
+class AntennasSection(Section):
+    """``[antennas]``: the antennas at both ends.
+
+    Attributes:
+        tx: The transmit antenna.
+        rx: The receive antenna.
+    """
+
+    tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
+    rx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
+
+
+class ObjectiveSection(Section):
+    """``[objective]``: how paths become a path loss, and what a link without a path counts.
+
+    Attributes:
+        combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
+            over the bandwidth).
+        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it as lost at
+            `ceiling_db`.
+        ceiling_db: Path loss [dB] beyond which a link counts as lost, with "censor" only.
+    """
+
+    combining: Literal["power", "coherent", "band"] = "power"
+    no_path: Literal["exclude", "censor"] = "exclude"
+    ceiling_db: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _ceiling_where_censored(self) -> Self:
+        if self.no_path == "censor" and self.ceiling_db is None:
+            raise InputError(
+                "no_path = 'censor' needs ceiling_db [dB], the largest loss that could be measured"
+            )
+        if self.no_path == "exclude" and self.ceiling_db is not None:
+            raise InputError(
+                f"ceiling_db = {self.ceiling_db:g} has no effect; say no_path = 'censor' or leave it out"
+            )
+        return self
+
+
+class ParameterSection(Section):
+    """``[parameters]``, one entry: the bounds, start and scale of one parameter.
+
+    Attributes:
+        bounds: Lower and upper bound, in the field's unit.
+        start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
+        scale: "linear" or "log".
+    """
+
+    bounds: tuple[float, float]
+    start: float | str | None = None
+    scale: Scale = "linear"
+
+
+class OffsetSection(Section):
+    """``[offset]``: a nuisance term, one offset [dB] for all links or one per group.
+
+    Attributes:
+        per: Column of group labels; one offset for all links if absent.
+        bounds: Lower and upper bound [dB]; unbounded if absent.
+    """
+
+    per: Text | None = None
+    bounds: tuple[float, float] | None = None
+
+    @field_validator("bounds")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and value[0] >= value[1]:
+            raise InputError("the lower bound must be less than the upper")
+        return value
+
+
+class HoldoutSection(Section):
+    """``[holdout]``: the links kept from calibration to judge it by.
+
+    Attributes:
+        where: Row filter; the links that pass are held out.
+    """
+
+    where: Text
+
+
+class MethodSection(Section):
+    """``[method]``: the optimizer.
+
+    Attributes:
+        name: "auto", "sgwo-im", "gwo" or another registered method.
+        seed: Seed of its random numbers.
+        options: Settings of the named method.
+    """
+
+    name: Text = "auto"
+    seed: Annotated[int, Field(ge=0)] = 0
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+class EngineSection(Section):
+    """``[engine]``: what turns candidates into path loss.
+
+    Attributes:
+        name: "replay", "retrace" or "command".
+    """
+
+    name: Literal["replay", "retrace", "command"] = "replay"
