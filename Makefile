@@ -8,7 +8,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 .PHONY: setup demo test lint bench docs
 
 setup: $(VENV)/.installed
-	tools/ensure_llvm.sh $(BIN)/python
+	tools/ensure_runtime.sh $(BIN)/python
 
 demo: setup
 	$(BIN)/calibray demo

@@ -63,6 +63,10 @@ def test_an_absent_package_has_its_install_command(monkeypatch):
             "SIGABRT: LLVM",
         ),
         ("raise RuntimeError('the LLVM backend is inactive')", "RuntimeError: the LLVM backend is inactive"),
+        (
+            "try: import no_such\nexcept ImportError: no_name",
+            "ModuleNotFoundError: No module named 'no_such'; Name",
+        ),
         ("import sys; sys.exit('6 paths in a closed box, not 7')", "6 paths in a closed box, not 7"),
         ("import os; os._exit(3)", "ended with 3"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -155,6 +156,18 @@ def test_without_a_usable_one_the_command_is_given(machine, monkeypatch, version
     assert os.environ[llvm.PATH_VARIABLE] == ""
 
 
+@pytest.mark.parametrize("call", [llvm.select, llvm.prepare])
+def test_without_libatomic_the_command_is_given(machine, monkeypatch, call):
+    def missing(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    machine(llvm.judge(ELSEWHERE, (19, 1, 7)))
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(ctypes, "CDLL", missing)
+    with pytest.raises(InputError, match=r"libatomic\.so\.1.*To install it"):
+        call()
+
+
 def test_a_gpu_needs_no_llvm(machine, monkeypatch):
     machine()
     monkeypatch.setattr(llvm, "cuda_device_count", lambda: 1)
@@ -190,8 +203,8 @@ def test_a_drjit_that_already_has_an_unusable_one_is_refused(machine, monkeypatc
     ("platform", "tools", "command"),
     [
         ("darwin", {"apt-get"}, "brew install llvm"),
-        ("linux", {"apt-get", "dnf"}, "apt-get install libllvm19"),
-        ("linux", {"dnf"}, "dnf install llvm-libs"),
+        ("linux", {"apt-get", "dnf"}, "apt-get install libllvm19 libatomic1"),
+        ("linux", {"dnf"}, "dnf install llvm-libs libatomic"),
         ("linux", set(), "set DRJIT_LIBLLVM_PATH"),
     ],
 )

@@ -163,9 +163,11 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
         return Check(name, True, run.stdout.strip() or "works", remedy)
     lines = run.stderr.strip().splitlines() or [f"ended with {run.returncode}, without a word"]
     if run.returncode < 0:
-        # LLVM names its reason first and dumps its stack after it; a Python exception stands last.
+        # LLVM names its reason first and dumps its stack after it.
         return Check(name, False, f"ended by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
-    return Check(name, False, lines[-1], remedy)
+    # Of chained exceptions the first is the cause; an exit message stands alone.
+    reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
+    return Check(name, False, "; ".join(reasons), remedy)
 
 
 def versions() -> tuple[tuple[str, str], ...]:

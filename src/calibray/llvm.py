@@ -9,6 +9,7 @@ candidate is opened in a process of its own, and `DRJIT_LIBLLVM_PATH` is set to 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -192,9 +193,10 @@ def select() -> Llvm:
         The library in use.
 
     Raises:
-        InputError: If no library is usable, if `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, or
-            if Dr.Jit was imported earlier without a usable one.
+        InputError: If no library is usable, if `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, if
+            Dr.Jit was imported earlier without a usable one, or if libatomic is missing.
     """
+    require_libatomic()
     requested = os.environ.get(PATH_VARIABLE)
     if requested:
         library = inspect(requested)
@@ -242,16 +244,30 @@ def prepare() -> str:
         The Mitsuba variant to set before `sionna.rt` is imported.
 
     Raises:
-        InputError: As `select` does, on a machine without a usable GPU.
+        InputError: As `select` does on a machine without a usable GPU, and if libatomic is missing on any.
     """
+    require_libatomic()
     variant = mitsuba_variant()
     if variant.startswith("llvm"):
         select()
     return variant
 
 
+def require_libatomic() -> None:
+    """Refuses a Linux without libatomic, which Dr.Jit links to and a bare Debian does not bring.
+
+    Raises:
+        InputError: If the library cannot be opened.
+    """
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL("libatomic.so.1")
+        except OSError as error:
+            raise InputError(f"Dr.Jit needs libatomic ({error}). To install it: {remedy()}") from error
+
+
 def remedy() -> str:
-    """The command that installs a usable libLLVM on this machine.
+    """The command that installs what the ray tracer needs beside Python packages on this machine.
 
     Returns:
         One line to paste into a shell, or advice where the package manager is not known.
@@ -260,9 +276,9 @@ def remedy() -> str:
     if sys.platform == "darwin":
         return "brew install llvm"
     if shutil.which("apt-get"):
-        return f"{sudo}apt-get update && {sudo}apt-get install libllvm19"
+        return f"{sudo}apt-get update && {sudo}apt-get install libllvm19 libatomic1"
     if shutil.which("dnf"):
-        return f"{sudo}dnf install llvm-libs"
+        return f"{sudo}dnf install llvm-libs libatomic"
     return f"install LLVM {max(TRIED_MAJORS)} and set {PATH_VARIABLE} to its libLLVM"
 
 

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Sees to a libLLVM that the ray tracer can use: installs one where that is allowed, else says how and fails.
-# usage: ensure_llvm.sh PYTHON
+# Sees to the libraries that the ray tracer needs beside its Python packages, a libLLVM above all: installs them
+# where that is allowed, else says how and fails.
+# usage: ensure_runtime.sh PYTHON
 set -eu
 python=$1
 
@@ -9,9 +10,8 @@ python=$1
 
 # A library that the user asked for is the user's to correct.
 if [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    echo "Installing libllvm19" >&2
     apt-get update
-    apt-get install --yes libllvm19
+    apt-get install --yes libllvm19 libatomic1
     exec "$python" -m calibray.llvm
 fi
 exit 1
