@@ -143,6 +143,13 @@ def test_parquet_reads_like_csv(tmp_path):
         read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
 
 
+def test_a_row_for_which_a_filter_has_no_answer_does_not_pass(tmp_path):
+    frame = pd.read_csv(table_file(tmp_path, TABLE)).assign(mode=pd.array([4, None, 4, 1], dtype="Int64"))
+    frame.to_parquet(tmp_path / "links.parquet")
+    arguments = (tmp_path / "links.parquet", [0, 0, 10.0], ["x", "y", "z"], "loss")
+    assert read_measurements(*arguments, where="mode == 4").row.tolist() == [1, 3]
+
+
 def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
     path = tmp_path / "links.parquet"
     path.write_bytes(b"")

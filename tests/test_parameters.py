@@ -84,6 +84,13 @@ def test_unit_scaling_maps_bounds_and_the_geometric_middle():
     )
 
 
+def test_rounding_of_logarithms_never_leaves_the_bounds():
+    rng = np.random.default_rng(0)
+    for lower in 10 ** rng.uniform(-6, 0, 200):
+        parameter = Parameters((Parameter("walls.conductivity", lower, 3 * lower, 2 * lower, scale="log"),))
+        assert lower <= parameter.from_unit([0.0])[0] <= parameter.from_unit([1.0])[0] <= 3 * lower
+
+
 @given(st.text(min_size=1), st.sampled_from(FIELDS))
 def test_names_part_at_the_last_dot(material, field):
     assert split_name(f"{material}.{field}") == (material, field)

@@ -62,12 +62,9 @@ class Table:
             InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
         """
         place = f"{self.source}: where = {expression!r}"
-        if unsafe := [
-            name for name in re.findall(r"\.\s*(\w+)\s*\(", expression) if name not in FILTER_METHODS
-        ]:
-            raise InputError(
-                f"{place}: {unsafe[0]}() is not allowed; {did_you_mean(unsafe[0], FILTER_METHODS)}"
-            )
+        called = re.findall(r"\.\s*(\w+)\s*\(", expression)
+        if unsafe := next((name for name in called if name not in FILTER_METHODS), ""):
+            raise InputError(f"{place}: {unsafe}() is not allowed; {did_you_mean(unsafe, FILTER_METHODS)}")
         try:
             # Empty scopes: a filter sees the columns and nothing of the program.
             result = self.frame.eval(expression, engine="python", local_dict={}, global_dict={})
@@ -134,9 +131,8 @@ class Table:
                 f"{self.place(first, name)}: the label is missing ({gaps.sum()} in all); give one"
             )
         if pd.api.types.is_float_dtype(column) and (column % 1 == 0).all():
-            column = column.astype(
-                np.int64
-            )  # a gap in a row left out makes whole numbers floats: 5 stays "5"
+            # A gap in a row that was left out makes whole numbers floats: label 5 must not become "5.0".
+            column = column.astype(np.int64)
         return column.astype(str).to_numpy(dtype=np.str_)
 
     def place(self, index: int, column: str) -> str:
