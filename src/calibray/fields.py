@@ -25,6 +25,7 @@ from scipy.constants import epsilon_0, speed_of_light
 from calibray.diffraction import affine_form
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material
+from calibray.materials import constants as constants_matrix
 from calibray.paths import Kind, Paths
 from calibray.scattering import pattern_value
 
@@ -186,15 +187,14 @@ def constants(paths: Paths, materials: Mapping[str, Material] | None = None) -> 
     unknown = set(materials) - set(paths.materials)
     if unknown:
         raise InputError(f"no material {sorted(unknown)[0]!r} in the traced scene; it has {', '.join(paths.materials)}")
-    chosen = {**paths.materials, **materials}
-    for name, material in chosen.items():
+    for name, material in materials.items():
         traced = paths.materials[name].scattering_pattern
         if material.scattering_pattern != traced:
             raise InputError(
                 f"material {name!r}: scattering_pattern {material.scattering_pattern!r} differs from the traced "
                 f"{traced!r}; trace again with it in [materials]"
             )
-    return np.array([[getattr(chosen[name], field) for field in FIELDS] for name in paths.materials]).reshape(-1, 8)
+    return constants_matrix({**paths.materials, **materials})
 
 
 def slab_coefficients(
@@ -318,9 +318,7 @@ def program_gains(program: Program, table: jax.Array) -> jax.Array:
 def program_path_loss(
     program: Program, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
 ) -> jax.Array:
-    """Path loss of every link.
-
-    With several ports the power is summed over receive ports and averaged over transmit ports.
+    """Path loss of every link of a program.
 
     Args:
         program: The grouped program.
@@ -332,30 +330,58 @@ def program_path_loss(
         Path loss [L], [dB]; +inf where a link has no path.
     """
     gain = program_gains(program, table)
-    flat = gain.reshape(gain.shape[0], -1)
-    total = partial(jax.ops.segment_sum, segment_ids=program.link, num_segments=program.num_links)
+    frequency = speed_of_light / program.wavelength
+    return combine(gain, program.link, program.delay, program.num_links, frequency, combining, offsets)
+
+
+def combine(
+    gain: jax.Array,
+    link: jax.Array,
+    delay: jax.Array,
+    num_links: int,
+    frequency: jax.Array | float,
+    combining: str = "power",
+    offsets: jax.Array | None = None,
+) -> jax.Array:
+    """Path loss of every link from its path gains.
+
+    With several ports the power is summed over receive ports and averaged over transmit ports.
+
+    Args:
+        gain: Path gains [P, R, T].
+        link: Link of every path [P].
+        delay: Delay of every path [P], [s].
+        num_links: Number of links L.
+        frequency: Carrier frequency [Hz].
+        combining: "power": -10 log10 sum |a|^2; "coherent": -10 log10 |sum a e^{-j 2 pi f tau}|^2; "band": the
+            average of the coherent power over a band.
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Path loss [L], [dB]; +inf where a link has no path.
+    """
+    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     if combining == "power":
-        power = total(_square(flat)).sum(axis=1)
+        power = total(_square(gain).sum(axis=(1, 2)))
     else:
-        if offsets is None:
-            offsets = jnp.array([[0.0], [1.0]])
-        frequency = speed_of_light / program.wavelength + offsets[0]
-        turns = -2j * jnp.pi * program.delay[:, None] * frequency
-        field = total(flat[:, :, None] * jnp.exp(turns)[:, None, :].astype(flat.dtype))
-        power = (_square(field).sum(axis=1) * offsets[1]).sum(axis=1)
-    power = power / (gain.shape[2] if gain.ndim == 3 else 1)
+        nodes = jnp.array([[0.0], [1.0]]) if offsets is None else offsets
+        phase = jnp.exp(-2j * jnp.pi * delay[:, None] * (frequency + nodes[0])).astype(gain.dtype)  # [P, q]
+        field = total(gain[..., None] * phase[:, None, None, :])  # [L, R, T, q]
+        power = (_square(field) * nodes[1]).sum(axis=(1, 2, 3))
+    power = power / gain.shape[2]
     reached = power > 0
     return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
 
 
-def band_quadrature(paths: Paths, bandwidth: float) -> np.ndarray:
+def band_quadrature(link: np.ndarray, delay: np.ndarray, bandwidth: float | None) -> np.ndarray:
     """Gauss-Legendre nodes over a band, enough for the largest spread of delays within a link.
 
     The average of |H|^2 over the band holds oscillations e^{j 2 pi f (tau_i - tau_j)}; a rule with n nodes integrates
     them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
 
     Args:
-        paths: The path program.
+        link: Link of every path, non-decreasing [P].
+        delay: Delay of every path [P], [s].
         bandwidth: Bandwidth [Hz].
 
     Returns:
@@ -364,14 +390,12 @@ def band_quadrature(paths: Paths, bandwidth: float) -> np.ndarray:
     Raises:
         InputError: The bandwidth is not positive.
     """
-    if not (np.isfinite(bandwidth) and bandwidth > 0):
-        raise InputError(f"bandwidth = {bandwidth}: must be a positive number of Hz")
+    if bandwidth is None or not (np.isfinite(bandwidth) and bandwidth > 0):
+        raise InputError(f'combining = "band": bandwidth = {bandwidth}: must be a positive number of Hz')
     spread = 0.0
-    if paths.num_paths:
-        edges = np.flatnonzero(np.diff(paths.link, prepend=-1))
-        spread = float(
-            np.max(np.maximum.reduceat(paths.delay, edges) - np.minimum.reduceat(paths.delay, edges), initial=0.0)
-        )
+    if len(link):
+        start = np.flatnonzero(np.diff(link, prepend=-1))
+        spread = float(np.max(np.maximum.reduceat(delay, start) - np.minimum.reduceat(delay, start)))
     nodes, weights = np.polynomial.legendre.leggauss(int(np.pi * bandwidth * spread) + 12)
     return np.stack([nodes * bandwidth / 2, weights / 2])
 
@@ -440,11 +464,7 @@ def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np
     """
     if combining not in COMBINING:
         raise InputError(f"combining = {combining!r}: must be one of {', '.join(COMBINING)}")
-    if combining != "band":
-        return None
-    if bandwidth is None:
-        raise InputError('combining = "band": needs the bandwidth [Hz]; give scene.bandwidth')
-    return band_quadrature(paths, bandwidth)
+    return band_quadrature(paths.link, paths.delay, bandwidth) if combining == "band" else None
 
 
 _compiled_gains = jax.jit(program_gains)

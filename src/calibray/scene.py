@@ -8,7 +8,7 @@ constants itself (NVlabs/sionna-rt#71, #72), and steps around Sionna's rules on 
 
 from __future__ import annotations
 
-import difflib
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.materials import Material, itu_material
+from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS, Material, itu_material
+from calibray.spelling import did_you_mean
 
 BUNDLED_PREFIX: Final = "sionna:"
 DEFAULT_THICKNESS: Final = 0.1  # [m], Sionna's default for a material without one
@@ -96,7 +97,7 @@ def read_scene(
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
     for index, material in enumerate(materials.values()):
-        root.insert(index, _bsdf(index, material))
+        root.insert(index, _bsdf(f"mat-calibray-{index}", material))
     return Scene(str(source), path, materials, tuple(objects), ElementTree.tostring(root, encoding="unicode"))
 
 
@@ -113,9 +114,7 @@ def check_material_name(name: str, materials: Mapping[str, object], place: str) 
     """
     if name in materials:
         return
-    near = difflib.get_close_matches(name, list(materials), 1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise InputError(f"{place}: the scene has no material {name!r}; {hint}it has {', '.join(sorted(materials))}")
+    raise InputError(f"{place}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
 
 
 def _scene_path(source: str) -> Path:
@@ -187,7 +186,7 @@ def _material(
     if isinstance(override, Material):
         return override
     given = {key: value for key, value in (override or {}).items() if value is not None}
-    itu, revision = given.pop("itu", None), given.pop("revision", "P.2040-3")
+    itu, revision = given.pop("itu", None), given.pop("revision", DEFAULT_REVISION)
     unknown = set(given) - _MATERIAL_FIELDS
     if unknown:
         raise InputError(f"[materials] {name}: unknown key {sorted(unknown)[0]!r}; known: {sorted(_MATERIAL_FIELDS)}")
@@ -247,8 +246,49 @@ def _refer(shape: ElementTree.Element, index: int) -> None:
     ElementTree.SubElement(shape, "ref", {"id": f"mat-calibray-{index}", "name": "bsdf"})
 
 
-def _bsdf(index: int, material: Material) -> ElementTree.Element:
-    bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": f"mat-calibray-{index}"})
+def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
+    bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
     for name in ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient", "xpd_coefficient"):
         ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
     return bsdf
+
+
+def export_scene(source: str | Path, materials: Mapping[str, Material], target: Path) -> None:
+    """Write a scene file with other constants; it refers to the meshes of the original.
+
+    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `NAME-calibrated`.
+
+    Args:
+        source: The original: a path, or `sionna:NAME`.
+        materials: Constants by material name.
+        target: File to write.
+
+    Raises:
+        InputError: The original cannot be read.
+    """
+    path = _scene_path(str(source))
+    root = _parse(path, str(source))
+    definitions = _bsdf_definitions(root)
+    names = {name: f"mat-{name}-calibrated" if _is_itu_name(name) else f"mat-{name}" for name in materials}
+    for shape in root.findall("shape"):
+        name = _shape_material(shape, definitions, path)
+        for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
+            shape.remove(child)
+        ElementTree.SubElement(shape, "ref", {"id": names[name], "name": "bsdf"})
+        filename = shape.find("string[@name='filename']")
+        if filename is not None:
+            mesh = (path.parent / filename.get("value", "")).resolve()
+            filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
+    for bsdf in root.findall("bsdf"):
+        root.remove(bsdf)
+    for index, (name, material) in enumerate(materials.items()):
+        root.insert(index, _bsdf(names[name], material))
+    ElementTree.indent(root)
+    partial = target.with_name(target.name + ".part")
+    partial.write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    partial.replace(target)
+
+
+def _is_itu_name(name: str) -> bool:
+    names = {known for table in ITU_MATERIALS.values() for known in table}
+    return name in names or name.startswith(("itu_", "itu-"))

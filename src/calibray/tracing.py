@@ -376,14 +376,25 @@ class Trace:
         """Compile the paths, ordered by link."""
         return concatenate([self.tracer.compile(chunk, self.tx, self.rx) for chunk in self.chunks])
 
+    def link(self) -> np.ndarray:
+        """Link of every path, non-decreasing [P]."""
+        return np.sort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
+
+    def delay(self) -> np.ndarray:
+        """Sionna's propagation delays in the order of `link` [P], [s]; known once `path_gains` has run."""
+        found = [np.array(chunk.buffer.tau, dtype=float) if len(chunk.link) else np.zeros(0) for chunk in self.chunks]
+        return np.concatenate(found)[self._order()]
+
     def path_gains(self) -> np.ndarray:
         """Sionna's path gains with the tracer's present materials.
 
         Returns:
             Gains in the order of `paths()` [P, R, T], complex.
         """
-        order = np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
-        return np.concatenate([self.tracer.field_stage(chunk) for chunk in self.chunks])[order]
+        return np.concatenate([self.tracer.field_stage(chunk) for chunk in self.chunks])[self._order()]
+
+    def _order(self) -> np.ndarray:
+        return np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
 
 
 def _load(scene: Scene) -> rt.Scene:

@@ -1,0 +1,329 @@
+"""The one loop (paper Fig. 1): ask for candidates, run the engine, compare with the measurements, tell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from calibray import engines
+from calibray.engines import Engine, Replay
+from calibray.errors import InputError
+from calibray.likelihood import Interval, LogDistance, Objective, intervals, make_objective
+from calibray.measurements import Measurements
+from calibray.optimizers import METHODS, Optimizer
+from calibray.parameters import Parameters
+from calibray.result import Result, by_group, writable_folder
+from calibray.spelling import did_you_mean
+from calibray.study import Study
+
+AUTO: Final = "auto"
+
+Progress = Callable[[str, int, int | None], None]
+"""Called with what is done, how much of it, and out of how much (None if unknown)."""
+
+
+def calibrate(
+    study: Study,
+    method: str | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    *,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Calibrate a scene's materials against measurements.
+
+    Args:
+        study: The study.
+        method: Method in place of the study's: "auto", "sgwo-im", "gwo", ...
+        seed: Seed in place of the study's.
+        out: Folder to save the result in; checked before anything is computed.
+        engine: Engine to run on, over all links of the study; made from the study if None.
+        progress: Called as the work goes on.
+
+    Returns:
+        The result.
+
+    Raises:
+        InputError: Something in the study, the method or the folder cannot be used.
+        EngineError: The engine failed.
+    """
+    study = study.replace(method=method, seed=seed)
+    check_method(study.method.name)
+    if out is not None:
+        writable_folder(out)
+    started = time.perf_counter()
+    links = study.measurements()
+    if engine is None:
+        engine = engines.make(study, progress=_stage(progress, "tracing"))
+    problem = Problem.of(study, links, engine)
+    traced = time.perf_counter()
+    run = search(problem, _optimizer(problem), progress)
+    result = _result(problem, run, time.perf_counter() - traced, traced - started)
+    if out is not None:
+        result.save(out)
+    return result
+
+
+def check_method(name: str) -> None:
+    """Refuse a method that does not exist.
+
+    Args:
+        name: The method.
+
+    Raises:
+        InputError: There is no such method.
+    """
+    known = (AUTO, *METHODS)
+    if name not in known:
+        raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, known)}")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A study ready to be solved.
+
+    Attributes:
+        study: The study.
+        links: All its links.
+        engine: The engine over all links.
+        objective: What is minimized.
+        held_out: Which links are held out [L].
+        before: Path loss with the materials before calibration [L], [dB].
+    """
+
+    study: Study
+    links: Measurements
+    engine: Engine
+    objective: Objective
+    held_out: np.ndarray
+    before: np.ndarray
+
+    @classmethod
+    def of(cls, study: Study, links: Measurements, engine: Engine) -> Problem:
+        """Set up a study's problem; runs the engine once, on the values before calibration.
+
+        Args:
+            study: The study.
+            links: All its links.
+            engine: The engine over all links.
+
+        Returns:
+            The problem.
+
+        Raises:
+            InputError: No link is left to calibrate on.
+        """
+        held_out = links.where(study.holdout.where) if study.holdout else np.zeros(len(links), dtype=bool)
+        before = engine.path_loss(engine.parameters.start[None])[0]
+        objective = make_objective(
+            links,
+            np.isfinite(before),
+            ~held_out,
+            offset=study.offset is not None,
+            bounds=study.offset.bounds if study.offset else None,
+            ceiling_db=study.objective.ceiling_db,
+        )
+        return cls(study, links, engine, objective, held_out, before)
+
+
+@dataclass
+class Run:
+    """What a search has seen: every RT call in order, and the path loss at the best candidate."""
+
+    candidates: list[np.ndarray] = field(default_factory=list)
+    rmse_db: list[float] = field(default_factory=list)
+    iteration: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    best: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    best_loss: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    best_rmse_db: float = np.inf
+
+    def add(self, candidates: np.ndarray, loss: np.ndarray, rmse_db: np.ndarray, iteration: int, now: float) -> None:
+        """Record one batch of RT calls."""
+        self.candidates += list(candidates)
+        self.rmse_db += rmse_db.tolist()
+        self.iteration += [iteration] * len(rmse_db)
+        self.seconds += [now] * len(rmse_db)
+        leader = int(np.argmin(rmse_db))
+        if rmse_db[leader] < self.best_rmse_db:
+            self.best, self.best_loss = candidates[leader], loss[leader]
+            self.best_rmse_db = float(rmse_db[leader])
+
+    def history(self) -> pd.DataFrame:
+        """One row per RT call."""
+        return pd.DataFrame(
+            {
+                "call": np.arange(1, len(self.rmse_db) + 1),
+                "iteration": self.iteration,
+                "rmse_db": self.rmse_db,
+                "best_db": np.minimum.accumulate(self.rmse_db),
+                "seconds": self.seconds,
+            }
+        )
+
+
+def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = None) -> Run:
+    """Run an optimizer on a problem until it is done.
+
+    Args:
+        problem: The problem.
+        optimizer: The optimizer, over the search space of `problem`'s parameters (`to_search`).
+        progress: Called after every batch.
+
+    Returns:
+        What it saw.
+
+    Raises:
+        InputError: No candidate could be evaluated.
+    """
+    engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
+    derivatives = "jacobian" in optimizer.uses and isinstance(engine, Replay)
+    started, iteration = time.perf_counter(), 0
+    while not optimizer.done:
+        points = optimizer.ask()
+        candidates = from_search(parameters, points)
+        iteration += 1
+        if derivatives:
+            loss, slope = engine.path_loss_and_jacobian(candidates)
+            jacobian = objective.jacobian(loss, slope * search_slope(parameters, candidates)[:, None, :])
+        else:
+            loss, jacobian = engine.path_loss(candidates), None
+        residuals = objective.residuals(loss)
+        rmse = objective.rmse(loss)
+        optimizer.tell(points, rmse, residuals=residuals, jacobian=jacobian)
+        run.add(candidates, loss, rmse, iteration, time.perf_counter() - started)
+        if progress is not None:
+            progress("calibrating", len(run.rmse_db), optimizer.budget)
+    if not np.isfinite(run.best_rmse_db):
+        raise InputError("every candidate lost the path of some link; exclude those links or use no_path = 'censor'")
+    return run
+
+
+def to_search(parameters: Parameters, values: np.ndarray) -> np.ndarray:
+    """Candidates [..., d] as the optimizers see them: the logarithm of what is searched on a logarithmic scale.
+
+    Others keep their physical unit, as in the paper.
+    """
+    return np.where(parameters.logarithmic, np.log(np.where(parameters.logarithmic, values, 1.0)), values)
+
+
+def from_search(parameters: Parameters, points: np.ndarray) -> np.ndarray:
+    """Candidates [..., d] in the fields' units from points of the search space, never beyond the bounds."""
+    values = np.where(parameters.logarithmic, np.exp(np.where(parameters.logarithmic, points, 0.0)), points)
+    return np.clip(values, parameters.lower, parameters.upper)
+
+
+def search_slope(parameters: Parameters, candidates: np.ndarray) -> np.ndarray:
+    """Derivative of the fields' units by the search coordinate [..., d]."""
+    return np.where(parameters.logarithmic, candidates, 1.0)
+
+
+def make_optimizer(name: str, parameters: Parameters, seed: int, **options: object) -> Optimizer:
+    """An optimizer over the search space of some parameters.
+
+    Args:
+        name: A method of `METHODS`.
+        parameters: The parameters.
+        seed: Seed.
+        **options: Settings of the method.
+
+    Returns:
+        The optimizer.
+
+    Raises:
+        InputError: The method has no such setting, or refuses a value.
+    """
+    kind = METHODS[name]
+    lower, upper = to_search(parameters, parameters.lower), to_search(parameters, parameters.upper)
+    try:
+        return kind(lower, upper, seed=seed, **options)
+    except TypeError as error:
+        raise InputError(f"method.options of {name!r}: {error}") from None
+
+
+def _optimizer(problem: Problem) -> Optimizer:
+    section, parameters = problem.study.method, problem.engine.parameters
+    name, options = section.name, dict(section.options)
+    if name == AUTO:
+        name = "least-squares" if isinstance(problem.engine, Replay) else "sgwo-im"
+    if name == "least-squares":
+        if not isinstance(problem.engine, Replay):
+            raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
+        options.setdefault("x0", to_search(parameters, parameters.start))
+    return make_optimizer(name, parameters, section.seed, **options)
+
+
+def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) -> Result:
+    study, links, engine, objective = problem.study, problem.links, problem.engine, problem.objective
+    names = engine.parameters.names
+    calls = len(run.rmse_db)
+    offsets = objective.offsets(run.best_loss[None])[0] if objective.num_groups else np.zeros(0)
+    after = run.best_loss + (offsets[objective.group] if objective.num_groups else 0.0)
+    weight, counted = links.weight, objective.weight > 0
+    rival = LogDistance.fit(links.distance, links.path_loss_db, objective.weight).path_loss(links.distance)
+    judged = problem.held_out & np.isfinite(problem.before)
+
+    def rmse(model: np.ndarray, mask: np.ndarray) -> float | None:
+        if not mask.any():
+            return None
+        model = model if objective.ceiling_db is None else np.minimum(model, objective.ceiling_db)
+        return float(np.sqrt(np.average((model - links.path_loss_db)[mask] ** 2, weights=weight[mask])))
+
+    table = pd.DataFrame(
+        {
+            "row": links.row,
+            "measured_db": links.path_loss_db,
+            "before_db": problem.before,
+            "after_db": after,
+            "log_distance_db": rival,
+            "has_path": np.isfinite(problem.before),
+            "held_out": problem.held_out,
+        }
+    )
+    return Result(
+        study=study,
+        parameters=by_group(names, run.best),
+        initial_parameters=by_group(names, engine.parameters.start),
+        intervals=_intervals(problem, run.best),
+        materials=engine.parameters.materials(run.best, engine.materials),
+        offsets_db=dict(by_group(links.group_names, offsets)) if objective.num_groups else {},
+        rmse_db=run.best_rmse_db,
+        initial_rmse_db=rmse(problem.before, counted),
+        offset_only_rmse_db=float(objective.rmse(problem.before[None])[0]) if objective.num_groups else None,
+        holdout_rmse_db=rmse(after, judged),
+        initial_holdout_rmse_db=rmse(problem.before, judged),
+        log_distance_rmse_db=rmse(rival, counted),
+        log_distance_holdout_rmse_db=rmse(rival, judged),
+        rt_calls=calls,
+        seconds=seconds,
+        trace_seconds=trace_seconds,
+        links=table,
+        history=run.history(),
+    )
+
+
+def _intervals(problem: Problem, best: np.ndarray) -> dict[str, Interval]:
+    if not isinstance(problem.engine, Replay):
+        return {}
+    parameters, objective = problem.engine.parameters, problem.objective
+    loss, slope = problem.engine.path_loss_and_jacobian(best[None])
+    found = intervals(
+        best,
+        objective.residuals(loss)[0],
+        objective.jacobian(loss, slope)[0],
+        parameters.lower,
+        parameters.upper,
+        objective.num_groups,
+    )
+    return dict(zip(parameters.names, found, strict=True))
+
+
+def _stage(progress: Progress | None, name: str) -> engines.Progress | None:
+    return None if progress is None else lambda done, total: progress(name, done, total)

@@ -1,0 +1,204 @@
+"""What a calibration found: the record, its files, and path loss at links that were never measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from calibray import fields
+from calibray.engines import make_tracer
+from calibray.errors import InputError
+from calibray.likelihood import Interval
+from calibray.materials import Material
+from calibray.measurements import Measurements, links_from_frame
+from calibray.scene import export_scene
+from calibray.study import Study
+from calibray.tracing import Progress
+
+VERSION: Final = 1
+RESULT_FILE: Final = "result.json"
+SCENE_FILE: Final = "scene.xml"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished calibration.
+
+    Attributes:
+        study: The study, with the method, seed and engine that ran.
+        parameters: Calibrated values by name, in the fields' units.
+        initial_parameters: Values before calibration.
+        intervals: 95 % intervals and verdicts by parameter; empty where the engine gives no derivatives.
+        materials: All materials of the scene, the calibrated values in place.
+        offsets_db: Offsets by group, [dB]; the nameless group stands for all links; empty without `[offset]`.
+        rmse_db: RMSE over the links calibrated on (paper eq. 1), [dB].
+        initial_rmse_db: The same before anything was fitted, offsets included.
+        offset_only_rmse_db: The same with only the offsets fitted; None without `[offset]`.
+        holdout_rmse_db: RMSE over the links held out; None without `[holdout]`.
+        initial_holdout_rmse_db: The same before anything was fitted.
+        log_distance_rmse_db: RMSE of a log-distance model fitted to the links calibrated on.
+        log_distance_holdout_rmse_db: Its RMSE over the links held out.
+        rt_calls: RT calls that the method spent.
+        seconds: Time that the method took, tracing not included.
+        trace_seconds: Time that tracing and loading took before.
+        links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
+            whether a path leads there, whether it was held out.
+        history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
+    """
+
+    study: Study
+    parameters: dict[str, float]
+    initial_parameters: dict[str, float]
+    intervals: dict[str, Interval]
+    materials: dict[str, Material]
+    offsets_db: dict[str, float]
+    rmse_db: float
+    initial_rmse_db: float
+    offset_only_rmse_db: float | None
+    holdout_rmse_db: float | None
+    initial_holdout_rmse_db: float | None
+    log_distance_rmse_db: float
+    log_distance_holdout_rmse_db: float | None
+    rt_calls: int
+    seconds: float
+    trace_seconds: float
+    links: pd.DataFrame
+    history: pd.DataFrame
+
+    def save(self, folder: str | Path) -> None:
+        """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.
+
+        Each file is written beside its place and then moved there, so that none is ever half-written.
+
+        Args:
+            folder: Folder to write into; made if absent.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        target = writable_folder(folder)
+        export_scene(self.study.scene_source, self.materials, target / SCENE_FILE)
+        _replace(target / "links.csv", self.links.to_csv(index=False, float_format="%.6g"))
+        _replace(target / "history.csv", self.history.to_csv(index=False, float_format="%.9g"))
+        _replace(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
+
+    def content(self) -> dict[str, Any]:
+        """The result as plain values, but for the tables of links and calls."""
+        return {
+            "version": VERSION,
+            "study_file": str(self.study.path.resolve()),
+            "study": self.study.content(),
+            "rmse_db": self.rmse_db,
+            "initial_rmse_db": self.initial_rmse_db,
+            "offset_only_rmse_db": self.offset_only_rmse_db,
+            "holdout_rmse_db": self.holdout_rmse_db,
+            "initial_holdout_rmse_db": self.initial_holdout_rmse_db,
+            "log_distance_rmse_db": self.log_distance_rmse_db,
+            "log_distance_holdout_rmse_db": self.log_distance_holdout_rmse_db,
+            "rt_calls": self.rt_calls,
+            "seconds": self.seconds,
+            "trace_seconds": self.trace_seconds,
+            "parameters": self.parameters,
+            "initial_parameters": self.initial_parameters,
+            "intervals": {name: asdict(interval) for name, interval in self.intervals.items()},
+            "offsets_db": self.offsets_db,
+            "materials": {name: asdict(material) for name, material in self.materials.items()},
+        }
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Result:
+        """Read a folder that `save` wrote.
+
+        Args:
+            folder: The folder.
+
+        Returns:
+            The result.
+
+        Raises:
+            InputError: The folder holds no result, or one of another version.
+        """
+        source = Path(folder) / RESULT_FILE
+        try:
+            content = json.loads(source.read_text(encoding="utf-8"))
+            links, history = (pd.read_csv(source.with_name(name)) for name in ("links.csv", "history.csv"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{source}: is no result of `calibray run` ({error}); name its --out folder") from None
+        if content.get("version") != VERSION:
+            raise InputError(f"{source}: has version {content.get('version')}, need {VERSION}; run the study again")
+        study = Study.from_content(content.pop("study"), content.pop("study_file"))
+        del content["version"]
+        content["intervals"] = {name: Interval(**entry) for name, entry in content["intervals"].items()}
+        content["materials"] = {name: Material(**entry) for name, entry in content["materials"].items()}
+        return cls(study=study, links=links, history=history, **content)
+
+    def predict(self, links: Measurements | pd.DataFrame, progress: Progress | None = None) -> np.ndarray:
+        """Path loss at links that were never measured, with the calibrated scene.
+
+        Args:
+            links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] and the study's group
+                column, if it has one.
+            progress: Called with (receivers traced, receivers in all) after every chunk.
+
+        Returns:
+            Path loss, offsets included [n], [dB]; +inf where no path leads.
+
+        Raises:
+            InputError: A column is missing, a position cannot be used, or a group has no calibrated offset.
+        """
+        per = self.study.offset.per if self.study.offset else None
+        wanted = links if isinstance(links, Measurements) else links_from_frame(links, group=per)
+        offset = self._offset(wanted)
+        paths = make_tracer(self.study, self.materials).trace(wanted, progress).paths()
+        objective = self.study.objective
+        return fields.path_loss(paths, None, objective.combining, self.study.scene.bandwidth) + offset
+
+    def _offset(self, links: Measurements) -> np.ndarray:
+        if not self.offsets_db:
+            return np.zeros(len(links))
+        unknown = [name for name in links.group_names if name not in self.offsets_db]
+        if unknown:
+            raise InputError(
+                f"{links.source}: group {unknown[0]!r} has no calibrated offset; known: {', '.join(self.offsets_db)}"
+            )
+        return np.array([self.offsets_db[name] for name in links.group_names])[links.group_index]
+
+
+def writable_folder(folder: str | Path) -> Path:
+    """A folder that files can be written into, made if absent.
+
+    Args:
+        folder: The folder.
+
+    Returns:
+        Its path.
+
+    Raises:
+        InputError: It is a file, or cannot be made or written.
+    """
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        probe = target / ".calibray-probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"output folder {target}: cannot be written ({error.strerror}); name another") from None
+    return target
+
+
+def by_group(names: tuple[str, ...], values: np.ndarray) -> Mapping[str, float]:
+    """Values by group name."""
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
