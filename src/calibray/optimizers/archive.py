@@ -1,0 +1,250 @@
+"""The real evaluations of a run: the only source of leaders, memories, surrogates and results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibray.errors import InputError
+from calibray.optimizers.box import Box
+
+OBJECTIVE_TOLERANCE = 1e-4
+"""Largest relative difference of an objective from the root mean square of its residuals (float32
+engines)."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best real evaluation so far.
+
+    Attributes:
+        x: The point [d].
+        y: Its objective; +inf when every evaluation failed.
+    """
+
+    x: NDArray[np.float64]
+    y: float
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Real evaluations; build them with `checked_evaluations`, which validates and copies.
+
+    Attributes:
+        x: Points [n, d].
+        y: Objective [n], +inf where an evaluation failed.
+        residuals: Weighted residuals [n, m], so that y = sqrt(mean(residuals**2)), or None.
+        jacobian: Derivatives of the residuals by the parameters [n, m, d], or None.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    residuals: NDArray[np.float64] | None = None
+    jacobian: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return self.y.size
+
+    def rows(self, rows: NDArray[np.intp]) -> Evaluations:
+        """Choose evaluations.
+
+        Args:
+            rows: Their indices [k].
+
+        Returns:
+            The k evaluations, in that order.
+        """
+        parts = (self.x, self.y, self.residuals, self.jacobian)
+        return Evaluations(*(None if part is None else part[rows] for part in parts))
+
+    @staticmethod
+    def joined(parts: list[Evaluations]) -> Evaluations:
+        """Put evaluations one after the other.
+
+        Args:
+            parts: At least one set of evaluations, all with the same information.
+
+        Returns:
+            All of them.
+        """
+
+        def stack(name: str) -> NDArray[np.float64] | None:
+            arrays = [getattr(part, name) for part in parts]
+            return None if arrays[0] is None else np.concatenate(arrays)
+
+        return Evaluations(*(stack(name) for name in ("x", "y", "residuals", "jacobian")))
+
+
+class Archive:
+    """Every evaluation that was told, in order, asked or not."""
+
+    def __init__(self, box: Box) -> None:
+        self.box = box
+        self._parts: list[Evaluations] = []
+        self._best: Best | None = None
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self._parts)
+
+    def add(self, told: Evaluations) -> None:
+        """Append evaluations.
+
+        Args:
+            told: Checked evaluations. Their Jacobians are not kept.
+        """
+        self._parts.append(Evaluations(told.x, told.y, told.residuals))
+        first = int(np.argmin(told.y))
+        if self._best is None or told.y[first] < self._best.y:
+            self._best = Best(read_only(told.x[first].copy()), float(told.y[first]))
+
+    @property
+    def best(self) -> Best:
+        """The first evaluation with the lowest objective.
+
+        Raises:
+            InputError: Nothing has been told yet.
+        """
+        if self._best is None:
+            raise InputError("no best point: 0 evaluations told, at least 1 is needed; call tell() first")
+        return self._best
+
+    def all(self) -> Evaluations:
+        """Every evaluation so far, without Jacobians.
+
+        Returns:
+            The evaluations, in the order told.
+
+        Raises:
+            InputError: Nothing has been told yet.
+        """
+        if not self._parts:
+            raise InputError("the archive is empty; at least 1 evaluation is needed: call tell() first")
+        self._parts = [Evaluations.joined(self._parts)]
+        return self._parts[0]
+
+    def leaders(self, count: int) -> NDArray[np.float64]:
+        """The best distinct points over the whole run.
+
+        Args:
+            count: How many.
+
+        Returns:
+            Points [count, d], best first, ties by the order told; the last one is repeated when there are
+            fewer.
+        """
+        told = self.all()
+        chosen: list[NDArray[np.float64]] = []
+        for row in np.argsort(told.y, kind="stable"):
+            if not any(np.array_equal(told.x[row], point) for point in chosen):
+                chosen.append(told.x[row])
+                if len(chosen) == count:
+                    break
+        return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
+
+
+def checked_evaluations(
+    box: Box,
+    x: ArrayLike,
+    y: ArrayLike,
+    residuals: ArrayLike | None,
+    jacobian: ArrayLike | None,
+    uses: frozenset[str],
+) -> Evaluations:
+    """Validate and copy what was told.
+
+    Args:
+        box: The box searched.
+        x: Points [n, d].
+        y: Objective [n]; +inf is a failed evaluation, whose residuals and derivatives may be anything.
+        residuals: Weighted residuals [n, m], or None.
+        jacobian: Derivatives of the residuals [n, m, d], or None.
+        uses: What the optimizer uses; the rest is checked and left out.
+
+    Returns:
+        The evaluations with exactly the information used.
+
+    Raises:
+        InputError: A shape is wrong, a number is not finite, a point lies outside the box, something that the
+            optimizer uses is missing, or an objective is not the root mean square of its residuals.
+    """
+    points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
+    if len(points) != len(values) or len(values) == 0:
+        raise InputError(
+            f"x has {len(points)} rows, y {len(values)}; tell one objective for each of n >= 1 points"
+        )
+    _finite("x", points)
+    for row, column in np.argwhere((points < box.lower) | (points > box.upper)):
+        raise InputError(
+            f"x[{row}, {column}] = {points[row, column]:g} lies outside its bounds "
+            f"[{box.lower[column]:g}, {box.upper[column]:g}]; leave the point out or widen the bounds"
+        )
+    for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
+        raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
+    given = {"residuals": residuals, "jacobian": jacobian}
+    for name in sorted(uses & given.keys()):
+        if given[name] is None:
+            raise InputError(f"{name} = None; this optimizer uses them: call tell(x, y, residuals=..., ...)")
+    good = np.isfinite(values)
+    errors = None if residuals is None else _array("residuals", residuals, (len(values), None))
+    slopes = None
+    if errors is not None:
+        _finite("residuals", errors, good)
+        _check_objective(values, errors, good)
+    if jacobian is not None:
+        links = None if errors is None else errors.shape[1]
+        slopes = _array("jacobian", jacobian, (len(values), links, box.dimension))
+        _finite("jacobian", slopes, good)
+    return Evaluations(
+        points, values, errors if "residuals" in uses else None, slopes if "jacobian" in uses else None
+    )
+
+
+def read_only(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Protect an array that is handed out.
+
+    Args:
+        array: The array, changed in place.
+
+    Returns:
+        The same array, no longer writeable.
+    """
+    array.setflags(write=False)
+    return array
+
+
+def _array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    array = np.array(value, dtype=float)
+    fits = len(shape) == array.ndim and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+    if not fits:
+        wanted = ", ".join(
+            letter if want is None else str(want)
+            for letter, want in zip("nmd"[: len(shape)], shape, strict=True)
+        )
+        raise InputError(f"{name} has shape {array.shape}; it must be [{wanted}]: reshape it")
+    return array
+
+
+def _finite(name: str, array: NDArray[np.float64], rows: NDArray[np.bool_] | None = None) -> None:
+    bad = ~np.isfinite(array)
+    if rows is not None:
+        bad &= rows.reshape(-1, *[1] * (array.ndim - 1))
+    for place in np.argwhere(bad):
+        raise InputError(
+            f"{name}[{', '.join(map(str, place))}] = {array[tuple(place)]}; it must be finite: "
+            "tell y = +inf for an evaluation that failed"
+        )
+
+
+def _check_objective(
+    values: NDArray[np.float64], residuals: NDArray[np.float64], good: NDArray[np.bool_]
+) -> None:
+    if residuals.shape[1] == 0:
+        raise InputError("residuals has 0 columns; at least 1 link is needed")
+    formed = np.sqrt(np.mean(np.where(good[:, None], residuals, 0.0) ** 2, axis=1))
+    for row in np.flatnonzero(good & (np.abs(values - formed) > OBJECTIVE_TOLERANCE * formed + 1e-9)):
+        raise InputError(
+            f"y[{row}] = {values[row]:g}, but sqrt(mean(residuals[{row}]**2)) = {formed[row]:g}; they must "
+            f"agree within {OBJECTIVE_TOLERANCE:g}: put the weights into the residuals"
+        )

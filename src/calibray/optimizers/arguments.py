@@ -1,0 +1,76 @@
+"""Checks of the numbers that optimizers are constructed with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import inf, isfinite
+from operator import index
+
+from calibray.errors import InputError
+
+
+def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
+    """Check a whole number.
+
+    Args:
+        name: The argument's name, for the message.
+        value: What was given.
+        at_least: Smallest allowed value.
+        at_most: Largest allowed value.
+
+    Returns:
+        The value as an int.
+
+    Raises:
+        InputError: It is no whole number, or outside its range.
+    """
+    try:
+        number = index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or not at_least <= number <= at_most:
+        bound = f">= {at_least}" if at_most == inf else f"from {at_least} to {at_most:g}"
+        raise InputError(f"{name} = {value!r}; it must be a whole number {bound}: correct it")
+    return number
+
+
+def real(name: str, value: float, at_least: float, at_most: float = inf) -> float:
+    """Check a real number.
+
+    Args:
+        name: The argument's name, for the message.
+        value: What was given.
+        at_least: Smallest allowed value.
+        at_most: Largest allowed value.
+
+    Returns:
+        The value as a float.
+
+    Raises:
+        InputError: It is no finite number, or outside its range.
+    """
+    number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    if number is None or not isfinite(number) or not at_least <= number <= at_most:
+        bound = f">= {at_least:g}" if at_most == inf else f"from {at_least:g} to {at_most:g}"
+        raise InputError(f"{name} = {value!r}; it must be a finite number {bound}: correct it")
+    return number
+
+
+def choice(name: str, value: str, known: Iterable[str]) -> str:
+    """Check a name against those known.
+
+    Args:
+        name: The argument's name, for the message.
+        value: What was given.
+        known: The allowed names.
+
+    Returns:
+        The value.
+
+    Raises:
+        InputError: It is none of the known names.
+    """
+    names = sorted(known)
+    if value not in names:
+        raise InputError(f"{name} = {value!r}; choose one of {', '.join(names)}")
+    return value

@@ -1,0 +1,105 @@
+"""The box that is searched, and its map to and from the unit cube."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibray.errors import InputError
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box lower <= x <= upper; build it with `Box.between`, which checks the bounds.
+
+    Attributes:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d], each above its lower bound.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    @staticmethod
+    def between(lower: ArrayLike, upper: ArrayLike) -> Box:
+        """Build a box from its bounds, which are copied.
+
+        Args:
+            lower: Lower bounds [d].
+            upper: Upper bounds [d].
+
+        Returns:
+            The box.
+
+        Raises:
+            InputError: The bounds are not two finite vectors of one length >= 1 with lower below upper.
+
+        Example:
+            >>> Box.between([1.0, 0.0], [9.0, 1.0]).to_unit([[5.0, 0.25]])
+            array([[0.5 , 0.25]])
+        """
+        low, high = np.array(lower, dtype=float), np.array(upper, dtype=float)
+        if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+            raise InputError(
+                f"lower has shape {low.shape} and upper {high.shape}; "
+                "both must be vectors [d] with one entry for each of d >= 1 parameters"
+            )
+        for index, (a, b) in enumerate(zip(low, high, strict=True)):
+            if not (np.isfinite(a) and np.isfinite(b) and a < b):
+                raise InputError(
+                    f"lower[{index}] = {a:g} and upper[{index}] = {b:g}; the bounds must be finite with "
+                    "lower below upper: swap them, or leave a fixed parameter out of the search"
+                )
+        low.setflags(write=False)
+        high.setflags(write=False)
+        return Box(low, high)
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters d."""
+        return self.lower.size
+
+    @property
+    def width(self) -> NDArray[np.float64]:
+        """Upper minus lower bounds [d]."""
+        return self.upper - self.lower
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """The middle of the box [d]."""
+        return 0.5 * (self.lower + self.upper)
+
+    def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points outside of the box to its nearest face.
+
+        Args:
+            x: Points [..., d].
+
+        Returns:
+            Points inside the box [..., d].
+        """
+        return np.clip(x, self.lower, self.upper)
+
+    def to_unit(self, x: ArrayLike) -> NDArray[np.float64]:
+        """Map the box onto the unit cube.
+
+        Args:
+            x: Points [..., d].
+
+        Returns:
+            The points in coordinates that run from 0 at `lower` to 1 at `upper` [..., d].
+        """
+        return (np.asarray(x, dtype=float) - self.lower) / self.width
+
+    def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map the unit cube onto the box, never past its faces by rounding.
+
+        Args:
+            unit: Points of the unit cube [..., d].
+
+        Returns:
+            Points of the box [..., d].
+        """
+        return self.clip(self.lower + unit * self.width)
