@@ -1,0 +1,137 @@
+"""The canonical Grey Wolf Optimizer, the paper's baseline.
+
+S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engineering Software 69, 2014.
+
+Choices where descriptions and common implementations differ:
+
+- Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T).
+  The move after the last evaluation would never be evaluated, so a run takes exactly N T evaluations.
+- alpha, beta and delta are the three best *distinct* points evaluated so far over the whole run (not of
+  the last generation), ties broken by the order of evaluation. A wolf that stands on a leader is a leader
+  once.
+- Wolves are always replaced, never kept because the new place is worse.
+- Places outside of the bounds are clipped to them before evaluation.
+- A failed evaluation (+inf) ranks last and changes nothing else.
+- C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the
+  pack is biased to the origin. That is the algorithm as published and the default; `centred=True` measures
+  positions from the middle of the box instead, and no longer depends on where the origin lies.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibray.optimizers.archive import Archive
+from calibray.optimizers.arguments import whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.session import Search, Session
+
+LEADERS = 3  # alpha, beta, delta
+
+
+def linear_decay(iteration: int, iterations: int) -> float:
+    """The standard convergence factor.
+
+    Args:
+        iteration: t, from 1.
+        iterations: T.
+
+    Returns:
+        a(t) = 2 (1 - t / T).
+    """
+    return 2.0 * (1.0 - iteration / iterations)
+
+
+def encircle(
+    positions: NDArray[np.float64],
+    leaders: NDArray[np.float64],
+    a: float,
+    r1: NDArray[np.float64],
+    r2: NDArray[np.float64],
+    origin: NDArray[np.float64] | float = 0.0,
+) -> NDArray[np.float64]:
+    """Move a pack by the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
+
+    Args:
+        positions: X [n, d].
+        leaders: Positions of alpha, beta and delta [3, d].
+        a: Convergence factor.
+        r1: Uniform random numbers in [0, 1) [n, 3, d], per wolf, leader and dimension.
+        r2: The same, independent of r1 [n, 3, d].
+        origin: The point that positions are measured from [d].
+
+    Returns:
+        X_GWO, the mean of the three guided places [n, d], not yet clipped.
+    """
+    guide = leaders - origin
+    a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3
+    c_coefficient = 2.0 * r2  # C, eq. 3.4
+    distance = np.abs(c_coefficient * guide - (positions - origin)[:, None, :])  # D, eq. 3.5
+    return (guide - a_coefficient * distance).mean(axis=1) + origin  # eqs. 3.6, 3.7
+
+
+@final
+class GWO(Optimizer):
+    """Grey Wolf Optimizer. Uses the value alone; 600 evaluations at the paper's settings.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the one random generator.
+        population: N, number of wolves.
+        iterations: T.
+        centred: Measure positions from the middle of the box instead of the origin.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> opt = GWO([-5.0, -5.0], [5.0, 5.0], seed=1)
+        >>> while not opt.done:
+        ...     x = opt.ask()
+        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
+        >>> opt.evaluations, bool(opt.best.y < 0.01)
+        (600, True)
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        population: int = 30,
+        iterations: int = 20,
+        centred: bool = False,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self.population = whole("population", population, at_least=LEADERS)
+        self.iterations = whole("iterations", iterations, at_least=1)
+        self.origin = self.box.centre if centred else np.zeros(self.box.dimension)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Number of evaluations it will ask for."""
+        return self.population * self.iterations
+
+    @property
+    def leaders(self) -> NDArray[np.float64]:
+        """Positions of alpha, beta and delta [3, d]."""
+        return self._session.archive.leaders(LEADERS)
+
+    def _search(self, archive: Archive) -> Search:
+        positions = self.box.from_unit(self._rng.random((self.population, self.box.dimension)))
+        for iteration in range(1, self.iterations + 1):
+            yield positions
+            r1, r2 = self._rng.random((2, self.population, LEADERS, self.box.dimension))
+            a = linear_decay(iteration, self.iterations)
+            positions = self.box.clip(encircle(positions, archive.leaders(LEADERS), a, r1, r2, self.origin))
