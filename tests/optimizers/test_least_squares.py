@@ -1,0 +1,160 @@
+"""Multi-start Levenberg-Marquardt against SciPy, brute force and known minima."""
+
+import numpy as np
+import pytest
+from landscapes import district, rosenbrock, tones, within
+from scipy.optimize import least_squares
+
+from calibray.errors import InputError
+from calibray.optimizers import LeastSquares
+
+
+def scipy_search(landscape, start):
+    return least_squares(
+        lambda x: landscape.model(x[None])[0][0],
+        start,
+        jac=lambda x: landscape.model(x[None])[1][0],
+        bounds=(landscape.lower, landscape.upper),
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-13,
+    )
+
+
+@pytest.mark.parametrize(
+    "landscape", [rosenbrock(), tones(), district(), district(8, 60)], ids=lambda it: it.name
+)
+def test_the_landscapes_derivatives_are_exact(landscape):
+    x = np.random.default_rng(0).uniform(landscape.lower, landscape.upper, (4, len(landscape.lower)))
+    jacobian = landscape.model(x)[1]
+    for column, step in enumerate(1e-6 * np.eye(x.shape[1])):
+        difference = (landscape.model(x + step)[0] - landscape.model(x - step)[0]) / 2e-6
+        assert jacobian[:, :, column] == pytest.approx(difference, rel=1e-5, abs=1e-5)
+
+
+def test_rosenbrock_from_one_start():
+    landscape = rosenbrock()
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=1, x0=[-1.2, 1.0]))
+    assert optimizer.best.x == pytest.approx(np.ones(2), abs=1e-6)
+    assert optimizer.best.y < 1e-8
+
+
+@pytest.mark.parametrize("landscape", [tones(), district()], ids=lambda it: it.name)
+def test_each_start_ends_where_scipys_does_or_lower(landscape):
+    """From the same start, one search at a time; a different basin is allowed, a worse end in most is not."""
+    starts = np.random.default_rng(5).uniform(landscape.lower, landscape.upper, (12, 3))
+    differences = []
+    for start in starts:
+        reference = np.sqrt(
+            2.0 * scipy_search(landscape, start).cost / landscape.model(start[None])[0].shape[1]
+        )
+        optimizer = LeastSquares(landscape.lower, landscape.upper, starts=1, x0=start, iterations=300)
+        optimizer.tell(start[None], *landscape.evaluate(start[None]))
+        mine = landscape.run(optimizer).best.y
+        differences.append(mine - reference)
+    assert np.median(differences) < 1e-8
+
+
+@pytest.mark.parametrize("landscape", [tones(), district()], ids=lambda it: it.name)
+def test_the_end_is_a_minimum_by_scipys_judgement(landscape):
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=16))
+    polished = scipy_search(landscape, optimizer.best.x)
+    assert optimizer.best.y == pytest.approx(landscape.value(polished.x[None])[0], abs=1e-9)
+    assert optimizer.best.x == pytest.approx(polished.x, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_finds_the_global_minimum_of_a_multimodal_problem(seed):
+    landscape = tones()
+    axes = [
+        np.linspace(a, b, n) for a, b, n in zip(landscape.lower, landscape.upper, (81, 81, 25), strict=True)
+    ]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    values = np.concatenate([landscape.value(part) for part in np.array_split(grid, 60)])
+    exhaustive = min(scipy_search(landscape, x).cost for x in grid[np.argsort(values)[:10]])
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=seed))
+    assert optimizer.best.y == pytest.approx(np.sqrt(2.0 * exhaustive / 30), abs=1e-9)
+
+
+def test_one_start_would_not_find_it():
+    """The negative control of the test above."""
+    landscape = tones()
+    found = [
+        landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=1, seed=s)).best.y
+        for s in range(9)
+    ]
+    assert np.median(found) > landscape.minimum() + 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finds_the_global_minimum_of_the_district(seed):
+    landscape = district()
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=seed))
+    assert optimizer.best.y == pytest.approx(
+        3.107574, abs=1e-4
+    )  # the lowest of 1,024 searches, see Landscape.minimum
+    assert optimizer.evaluations < 12_000
+
+
+def test_active_bounds():
+    """The minimum (1, 1) lies outside; the constrained one is on the face x0 = 0.5 at x1 = 0.25."""
+    landscape = within(rosenbrock(), [-2.0, -2.0], [0.5, 2.0])
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=8))
+    assert optimizer.best.x == pytest.approx(np.array([0.5, 0.25]), abs=1e-7)
+    corner = within(rosenbrock(), [1.2, -2.0], [2.0, 1.1])
+    optimizer = corner.run(LeastSquares(corner.lower, corner.upper, starts=8))
+    assert optimizer.best.x == pytest.approx(np.array([1.2, 1.1]), abs=1e-9)
+
+
+def test_a_parameter_without_influence_does_no_harm():
+    def residuals(x):
+        jacobian = np.zeros((len(x), 1, 2))
+        jacobian[:, :, 0] = 2.0
+        return 2.0 * x[:, :1] - 1.0, jacobian
+
+    optimizer = LeastSquares([0.0, 0.0], [1.0, 1.0], starts=4)
+    while not optimizer.done:
+        x = optimizer.ask()
+        r, jacobian = residuals(x)
+        optimizer.tell(x, np.abs(r[:, 0]), r, jacobian)
+    assert optimizer.best.x[0] == pytest.approx(0.5, abs=1e-9)
+
+
+def test_starts_are_asked_together_and_drop_out():
+    landscape = tones()
+    optimizer = LeastSquares(
+        landscape.lower, landscape.upper, starts=32, x0=[[5.0, 2.0, 1.0], [6.0, 2.0, 1.0]]
+    )
+    optimizer.tell([[5.0, 2.0, 0.5]], *landscape.evaluate(np.array([[5.0, 2.0, 0.5]])))
+    sizes = []
+    while not optimizer.done:
+        x = optimizer.ask()
+        sizes.append(len(x))
+        if len(sizes) == 1:
+            assert x[:3] == pytest.approx(np.array([[5.0, 2.0, 1.0], [6.0, 2.0, 1.0], [5.0, 2.0, 0.5]]))
+        optimizer.tell(x, *landscape.evaluate(x))
+    assert sizes[0] == 35
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 5
+
+
+def test_duplicate_starts_are_merged():
+    landscape = tones()
+    optimizer = LeastSquares(landscape.lower, landscape.upper, starts=1, x0=[[5.0, 2.0, 1.0]] * 6)
+    x = optimizer.ask()
+    assert len(x) == 7
+    optimizer.tell(x, *landscape.evaluate(x))
+    assert len(optimizer.ask()) <= 2
+
+
+@pytest.mark.parametrize(
+    ("x0", "message"),
+    [
+        ([1.0], r"x0 has shape \(1,\); it must be \[2\] or \[k, 2\]"),
+        ([[0.0, 3.0]], r"x0\[0, 1\] = 3 lies outside its bounds \[-2, 2\]; move the start or widen"),
+        ([0.0, np.nan], r"x0\[0, 1\] = nan"),
+    ],
+)
+def test_impossible_starts_are_refused(x0, message):
+    with pytest.raises(InputError, match=message):
+        LeastSquares([-2.0, -2.0], [2.0, 2.0], x0=x0)
