@@ -1,0 +1,133 @@
+"""Designs of points in a box, and the searches that evaluate one and stop: the negative controls.
+
+An optimizer that does not beat these at an equal budget has learned nothing from its evaluations.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import qmc
+
+from calibray.optimizers.archive import Archive
+from calibray.optimizers.arguments import whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.session import Search, Session
+
+
+def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw points of the unit cube.
+
+    Args:
+        kind: "random" (independent and uniform), "latin-hypercube" (one point in each of n slices of every
+            dimension) or "sobol" (scrambled; the first n of the next power of two).
+        count: Number of points n.
+        dimension: Number of dimensions d.
+        rng: Where the randomness comes from.
+
+    Returns:
+        Points [n, d].
+    """
+    if kind == "random":
+        return rng.random((count, dimension))
+    if kind == "latin-hypercube":
+        return qmc.LatinHypercube(dimension, rng=rng).random(count)
+    # Sobol points are balanced in blocks of a power of two only, and SciPy warns about other counts.
+    return qmc.Sobol(dimension, rng=rng).random_base2((count - 1).bit_length())[:count]
+
+
+def maximin_design(
+    count: int, dimension: int, rng: np.random.Generator, tries: int = 50
+) -> NDArray[np.float64]:
+    """Draw a Latin hypercube whose closest points are far apart.
+
+    Args:
+        count: Number of points n >= 2.
+        dimension: Number of dimensions d.
+        rng: Where the randomness comes from.
+        tries: Latin hypercubes to choose from.
+
+    Returns:
+        The one with the largest smallest distance [n, d].
+    """
+    drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
+    spacing = [_smallest_distance(points) for points in drawn]
+    return drawn[int(np.argmax(spacing))]
+
+
+def _smallest_distance(points: NDArray[np.float64]) -> float:
+    square = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
+    return float(np.sqrt(square[~np.eye(len(points), dtype=bool)].min()))
+
+
+class Sampling(Optimizer):
+    """Evaluates a design and learns nothing; abstract in the kind of design.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the design.
+        budget: Number of points, all asked for at once.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Attributes:
+        kind: Name of the design.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    kind: ClassVar[str]
+
+    def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Number of evaluations it will ask for."""
+        return self._budget
+
+    def _search(self, archive: Archive) -> Search:
+        yield self.box.from_unit(design(self.kind, self._budget, self.box.dimension, self._rng))
+
+
+@final
+class RandomSearch(Sampling):
+    """Independent uniform points. Uses the value alone; budget as given.
+
+    Example:
+        >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
+        (10, 2)
+    """
+
+    kind: ClassVar[str] = "random"
+
+
+@final
+class LatinHypercube(Sampling):
+    """One point in each slice of every dimension. Uses the value alone; budget as given.
+
+    Example:
+        >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
+        [0, 1, 2, 3]
+    """
+
+    kind: ClassVar[str] = "latin-hypercube"
+
+
+@final
+class Sobol(Sampling):
+    """A scrambled Sobol sequence. Uses the value alone; budget as given.
+
+    Example:
+        >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
+        (10, 2)
+    """
+
+    kind: ClassVar[str] = "sobol"
