@@ -82,19 +82,22 @@ class Replay:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         self._dtype = dtype
         rows, columns = parameters.indices(list(paths.materials))
+        fields_used, place = np.unique(columns, return_inverse=True)
         offsets = fields.check_combining(paths, combining, bandwidth)
-        program = fields.layout(paths, dtype)
+        program = fields.layout(paths, dtype).program
         base = jnp.asarray(fields.constants(paths).astype(dtype))
 
-        def one(program: fields.Program, candidate: jax.Array) -> jax.Array:
+        def value(program: fields.Program, candidate: jax.Array) -> jax.Array:
             table = base.at[rows, columns].set(candidate)
             return fields.program_path_loss(program, table, combining, offsets)
 
         def with_jacobian(program: fields.Program, candidate: jax.Array) -> tuple[jax.Array, jax.Array]:
-            value, push = jax.linearize(partial(one, program), candidate)
-            return value, jax.vmap(push, out_axes=1)(jnp.eye(len(parameters), dtype=dtype))
+            table = base.at[rows, columns].set(candidate)
+            used = tuple(int(column) for column in fields_used)
+            loss, slope = fields.program_path_loss_and_jacobian(program, table, used, combining, offsets)
+            return loss, slope[:, rows, place]
 
-        self._value = partial(jax.jit(jax.vmap(one, in_axes=(None, 0))), program)
+        self._value = partial(jax.jit(jax.vmap(value, in_axes=(None, 0))), program)
         self._jacobian = partial(jax.jit(jax.vmap(with_jacobian, in_axes=(None, 0))), program)
         room = max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
         self._sizes = [size for size in BLOCK_SIZES if size <= room]
@@ -194,11 +197,11 @@ class Retrace:
         trace = self._tracer.trace(self._links)
         gain, link, delay = trace.path_gains(), trace.link(), trace.delay()
         offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
-        return np.asarray(
-            fields.combine(
-                jnp.asarray(gain), link, delay, len(self._links), self._tracer.frequency, self._combining, offsets
-            )
+        parts = tuple(jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
+        power = fields.link_power(
+            parts, link, delay, len(self._links), self._tracer.frequency, self._combining, offsets
         )
+        return np.asarray(fields.decibel(power))
 
 
 def make(study: Study, name: str | None = None, progress: Progress | None = None) -> Replay | Retrace:

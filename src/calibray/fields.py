@@ -7,7 +7,11 @@ that each group is a dense array without padding and each kind costs only where 
 - diffuse reflection: not linear in the field, its amplitude follows the field reflected specularly;
 - diffraction: affine in the reflection coefficients of the two faces, J = C_0 + sum_k R_k C_k.
 
-Precision follows the constants: float64 by default, as `jax_enable_x64` is switched on here.
+Evaluation has two stages. The first turns material constants into what each interaction takes from its material
+(`local_values`), flat over all interactions; the second carries the fields along the paths (`gains`). Complex
+numbers are pairs of real arrays, as in `calibray.slab`.
+
+Precision follows the program: float64 by default, as `jax_enable_x64` is switched on here.
 """
 
 from __future__ import annotations
@@ -20,8 +24,9 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.constants import epsilon_0, speed_of_light
+from scipy.constants import speed_of_light
 
+from calibray import slab
 from calibray.diffraction import affine_form
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material
@@ -38,67 +43,93 @@ _FIELD: Final = {name: column for column, name in enumerate(FIELDS)}
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["path", "scale", "tx", "rx", "rotation", "material", "transmitted", "cosine", "diffuse", "wedge"],
-    meta_fields=["signature"],
+    data_fields=["scale", "tx", "rx", "rotation", "turn", "wedge"],
+    meta_fields=["signature", "size", "start", "scatter"],
 )
 @dataclass(frozen=True)
 class Group:
     """Paths with the same sequence of interactions: n paths of depth k, T transmit and R receive ports.
 
     Attributes:
-        signature: One letter an interaction: c coefficient (reflection or transmission), s scattering, d diffraction.
-        path: Index of the paths in the program [n].
         scale: A lambda / 4 pi [n].
-        tx: Transmit field [T, 2, n].
-        rx: Receive field, conjugated [R, 2, n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n].
+        rx: Receive field, real and imaginary part [2, R, 2, n].
         rotation: (cos, sin) into the frame of each interaction [k, 2, n].
-        material: Material of each interaction [k, n].
-        transmitted: Whether it is a transmission [k, n].
-        cosine: Cosine of the angle of incidence [k, n].
-        diffuse: Per position the columns of `Diffuse`, or None [6, n].
-        wedge: Per position the second face's cosine and the matrices C_0 .. C_4, or None ([n], [5, 2, 2, n]).
+        turn: Per position (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
+        wedge: Per position the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
+        signature: One letter an interaction: c coefficient (reflection or transmission), s scattering, d diffraction.
+        size: Number of paths n.
+        start: Per position the first of its n coefficients in the flat arrays; a diffraction has 2 n, face after face.
+        scatter: Per position the first of its n rows in the table of diffuse interactions, or None.
     """
 
-    signature: str
-    path: jax.Array
     scale: jax.Array
     tx: jax.Array
     rx: jax.Array
     rotation: jax.Array
-    material: jax.Array
-    transmitted: jax.Array
-    cosine: jax.Array
-    diffuse: tuple
+    turn: tuple
     wedge: tuple
+    signature: str
+    size: int
+    start: tuple[int, ...]
+    scatter: tuple[int | None, ...]
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["groups", "link", "delay", "wavelength"],
-    meta_fields=["num_links", "patterns"],
+    data_fields=["groups", "link", "delay", "wavelength", "material", "cosine", "transmitted", "raw", "diffuse", "owner"],
+    meta_fields=["num_links", "patterns", "any_transmitted"],
 )
 @dataclass(frozen=True)
 class Program:
-    """A path program laid out for evaluation.
+    """A path program laid out for evaluation: J coefficients, D diffuse interactions.
 
     Attributes:
         groups: The paths by kind of interactions.
         link: Link of every path, in the order of the groups [P].
         delay: Delay of every path, in the order of the groups [P], [s].
         wavelength: [m].
+        material: Material of every coefficient [J].
+        cosine: Cosine of its angle of incidence [J].
+        transmitted: Whether it is a transmission [J].
+        raw: Whether it is a reflection that keeps the scattered energy, as a diffuse one does [J].
+        diffuse: Material, solid angle, and the cosines of incidence, of the scattered direction to the normal, to the
+            specular direction and to the way back, of every diffuse interaction (each [D]).
+        owner: Link of every coefficient [J] and of every diffuse interaction [D].
         num_links: Number of links.
         patterns: Scattering pattern of every material.
+        any_transmitted: Whether any coefficient is a transmission.
     """
 
     groups: tuple[Group, ...]
     link: jax.Array
     delay: jax.Array
     wavelength: jax.Array
+    material: jax.Array
+    cosine: jax.Array
+    transmitted: jax.Array
+    raw: jax.Array
+    diffuse: tuple[jax.Array, ...]
+    owner: tuple[jax.Array, jax.Array]
     num_links: int
     patterns: tuple[str, ...]
+    any_transmitted: bool
 
 
-def layout(paths: Paths, dtype: type = np.float64) -> Program:
+@dataclass(frozen=True)
+class Layout:
+    """A program and the order in which it holds the paths.
+
+    Attributes:
+        program: The program.
+        order: Path of the path program at each place [P].
+    """
+
+    program: Program
+    order: np.ndarray
+
+
+def layout(paths: Paths, dtype: type = np.float64) -> Layout:
     """Lay a path program out for evaluation.
 
     Args:
@@ -109,65 +140,110 @@ def layout(paths: Paths, dtype: type = np.float64) -> Program:
         The grouped program, on JAX's default device.
     """
     depth = np.diff(paths.first)
-    letters = np.select([paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [1, 2], 0)
-    code = np.zeros(paths.num_paths, dtype=np.int64)  # the signature in base 3, led by the depth
+    letter = np.select([paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], 1).astype(np.int64)
+    code = np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
-        has = depth > step
-        code[has] += (letters[paths.first[:-1][has] + step] + 1) * 4**step
-    groups, order = [], []
-    for value in np.unique(code):
-        index = np.flatnonzero(code == value)
-        groups.append(_group(paths, index, int(depth[index[0]]), dtype))
-        order.append(index)
-    path = np.concatenate(order) if order else np.zeros(0, dtype=np.int64)
-    return Program(
-        groups=tuple(groups),
-        link=jnp.asarray(paths.link[path]),
-        delay=jnp.asarray(paths.delay[path]),
+        deep = depth > step
+        code[deep] = code[deep] * 4 + letter[paths.first[:-1][deep] + step]
+    index = [np.flatnonzero(code == value) for value in np.unique(code)]
+    order = np.concatenate(index) if index else np.zeros(0, dtype=np.int64)
+    flat = _Flat(paths)
+    groups = tuple(_group(paths, some, int(depth[some[0]]), flat, dtype) for some in index)
+    rows = flat.scattered()
+    table, at = paths.diffuse, flat.table_row[rows]
+    columns = (table.solid_angle[at], paths.cos_incidence[rows], table.cos_scattered[at],
+               table.cos_specular[at], table.cos_backward[at])  # fmt: skip
+    interaction, cosine = flat.coefficients()
+    owner = np.repeat(paths.link, depth)
+    program = Program(
+        groups=groups,
+        link=jnp.asarray(paths.link[order]),
+        delay=jnp.asarray(paths.delay[order]),
         wavelength=jnp.asarray(speed_of_light / paths.frequency, dtype=dtype),
+        material=jnp.asarray(paths.material[interaction]),
+        cosine=jnp.asarray(cosine.astype(dtype)),
+        transmitted=jnp.asarray(paths.kind[interaction] == Kind.REFRACTION),
+        raw=jnp.asarray(paths.kind[interaction] == Kind.DIFFUSE),
+        diffuse=(jnp.asarray(paths.material[rows]), *(jnp.asarray(column.astype(dtype)) for column in columns)),
+        owner=(jnp.asarray(owner[interaction]), jnp.asarray(owner[rows])),
         num_links=paths.num_links,
         patterns=tuple(material.scattering_pattern for material in paths.materials.values()),
+        any_transmitted=bool((paths.kind == Kind.REFRACTION).any()),
     )
+    return Layout(program, order)
 
 
-def _group(paths: Paths, index: np.ndarray, depth: int, dtype: type) -> Group:
-    complex_dtype = np.result_type(dtype, np.complex64)
+class _Flat:
+    """Collects, position by position, which interactions the flat arrays hold."""
+
+    def __init__(self, paths: Paths) -> None:
+        self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []
+        self._length, self._rows = 0, 0
+        self.table_row = np.maximum(_row_of(paths.kind, Kind.DIFFUSE), _row_of(paths.kind, Kind.DIFFRACTION))
+
+    def add(self, interaction: np.ndarray, kind: int) -> tuple[int, int | None]:
+        """Append one position's interactions; where their coefficients and their diffuse rows begin."""
+        start, row = self._length, None
+        self._append(interaction, self._paths.cos_incidence[interaction])
+        if kind == Kind.DIFFRACTION:
+            self._append(interaction, self._paths.diffraction.cos_incidence_n[self.table_row[interaction]])
+        if kind == Kind.DIFFUSE:
+            row, self._rows = self._rows, self._rows + len(interaction)
+            self._scattered.append(interaction)
+        return start, row
+
+    def _append(self, interaction: np.ndarray, cosine: np.ndarray) -> None:
+        self._interactions.append(interaction)
+        self._cosines.append(cosine)
+        self._length += len(interaction)
+
+    def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
+        """Interaction and cosine of every coefficient [J]."""
+        return _joined(self._interactions, np.int64), _joined(self._cosines, float)
+
+    def scattered(self) -> np.ndarray:
+        """Interaction of every diffuse row [D]."""
+        return _joined(self._scattered, np.int64)
+
+
+def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
+
+
+def _row_of(kind: np.ndarray, which: Kind) -> np.ndarray:
+    chosen = kind == which
+    return np.where(chosen, np.cumsum(chosen) - 1, -1)
+
+
+def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type) -> Group:
     at = paths.first[index] + np.arange(depth)[:, None]  # interactions [k, n]
-    kinds = paths.kind[at[:, 0]] if depth else []
-    diffuse_row = np.cumsum(paths.kind == Kind.DIFFUSE) - 1
-    wedge_row = np.cumsum(paths.kind == Kind.DIFFRACTION) - 1
-    diffuse, wedge = [], []
-    for step, kind in enumerate(kinds):
-        table, row = paths.diffuse, diffuse_row[at[step]]
-        diffuse.append(
-            jnp.asarray(
-                np.stack([table.rotation[row, 0], table.rotation[row, 1], table.solid_angle[row],
-                          table.cos_scattered[row], table.cos_specular[row], table.cos_backward[row]]).astype(dtype)
-            ) if kind == Kind.DIFFUSE else None
-        )  # fmt: skip
-        row = wedge_row[at[step]]
-        wedge.append(
-            (
-                jnp.asarray(paths.diffraction.cos_incidence_n[row].astype(dtype)),
-                jnp.asarray(affine_form(paths.diffraction, row, paths.frequency).astype(complex_dtype)),
-            )
-            if kind == Kind.DIFFRACTION
-            else None
-        )
+    kinds = [int(kind) for kind in paths.kind[at[:, 0]]] if depth else []
+    turn, wedge, start, scatter = [], [], [], []
+    for kind, interaction in zip(kinds, at, strict=True):
+        first, row = flat.add(interaction, kind)
+        start.append(first)
+        scatter.append(row)
+        rows = flat.table_row[interaction]
+        turn.append(jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if kind == Kind.DIFFUSE else None)
+        form = affine_form(paths.diffraction, rows, paths.frequency) if kind == Kind.DIFFRACTION else None
+        wedge.append(None if form is None else _parts(form, dtype))
     scale = paths.spreading[index] * speed_of_light / paths.frequency / (4 * np.pi)
     return Group(
-        signature="".join(_LETTER[Kind(kind)] for kind in kinds),
-        path=jnp.asarray(index),
         scale=jnp.asarray(scale.astype(dtype)),
-        tx=jnp.asarray(np.moveaxis(paths.tx_field[index], 0, -1).astype(complex_dtype)),
-        rx=jnp.asarray(np.moveaxis(paths.rx_field[index].conj(), 0, -1).astype(complex_dtype)),
+        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype),
+        rx=_parts(np.moveaxis(paths.rx_field[index], 0, -1), dtype),
         rotation=jnp.asarray(np.moveaxis(paths.rotation[at], -1, 1).astype(dtype)),
-        material=jnp.asarray(paths.material[at]),
-        transmitted=jnp.asarray(paths.kind[at] == Kind.REFRACTION),
-        cosine=jnp.asarray(paths.cos_incidence[at].astype(dtype)),
-        diffuse=tuple(diffuse),
+        turn=tuple(turn),
         wedge=tuple(wedge),
+        signature="".join(_LETTER[Kind(kind)] for kind in kinds),
+        size=len(index),
+        start=tuple(start),
+        scatter=tuple(scatter),
     )
+
+
+def _parts(value: np.ndarray, dtype: type) -> jax.Array:
+    return jnp.asarray(np.stack([value.real, value.imag]).astype(dtype))
 
 
 def constants(paths: Paths, materials: Mapping[str, Material] | None = None) -> np.ndarray:
@@ -197,102 +273,130 @@ def constants(paths: Paths, materials: Mapping[str, Material] | None = None) -> 
     return constants_matrix({**paths.materials, **materials})
 
 
-def slab_coefficients(
-    cosine: jax.Array, permittivity: jax.Array, thickness: jax.Array, wavelength: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Reflection and transmission coefficients of a slab in air (ITU-R P.2040-3 eqs. 37, 43, 44).
+@partial(jax.tree_util.register_dataclass, data_fields=["te", "tm", "amplitude", "xpd"], meta_fields=[])
+@dataclass(frozen=True)
+class Local:
+    """All that the fields take from the materials.
+
+    Attributes:
+        te: Transverse electric coefficients, (real, imaginary) [J].
+        tm: Transverse magnetic coefficients, (real, imaginary) [J].
+        amplitude: S sqrt(f_s dOmega) of the diffuse interactions [D].
+        xpd: Their XPD coefficient K_x [D].
+    """
+
+    te: slab.Pair
+    tm: slab.Pair
+    amplitude: jax.Array
+    xpd: jax.Array
+
+
+def local_values(program: Program, table: jax.Array) -> Local:
+    """What the materials contribute at every interaction.
 
     Args:
-        cosine: Cosine of the angle of incidence [...].
-        permittivity: Complex relative permittivity eta, imaginary part at most 0 [...].
-        thickness: Thickness d [...], [m].
-        wavelength: [m].
+        program: The program.
+        table: Material constants [M, 8].
 
     Returns:
-        R_te, R_tm, T_te, T_tm [...], complex.
+        The contributions.
     """
-    root = jnp.sqrt(permittivity - (1 - cosine**2))
-    phase = jnp.exp(-1j * (2 * jnp.pi * thickness / wavelength) * root)  # e^{-jq}, q of eq. 44
-    half_te = (cosine - root) / (cosine + root)  # eq. 37a
-    half_tm = (permittivity * cosine - root) / (permittivity * cosine + root)  # eq. 37b
-    inverse_te = 1 / (1 - (half_te * phase) ** 2)
-    inverse_tm = 1 / (1 - (half_tm * phase) ** 2)
-    return (
-        half_te * (1 - phase**2) * inverse_te,  # eq. 43a
-        half_tm * (1 - phase**2) * inverse_tm,
-        (1 - half_te**2) * phase * inverse_te,  # eq. 43b
-        (1 - half_tm**2) * phase * inverse_tm,
+    column = {name: table[:, index] for name, index in _FIELD.items()}
+    loss = slab.loss_term(column["conductivity"], program.wavelength)
+    te, tm = slab.coefficients(
+        program.cosine,
+        column["relative_permittivity"][program.material],
+        loss[program.material],
+        column["thickness"][program.material],
+        program.wavelength,
+        program.transmitted if program.any_transmitted else False,
+    )
+    kept = _safe_sqrt(1 - column["scattering_coefficient"] ** 2)  # what scattering leaves to the specular field
+    factor = jnp.where(program.transmitted | program.raw, 1.0, kept[program.material]).astype(program.cosine.dtype)
+    material, solid_angle, cosine, scattered, specular, backward = program.diffuse
+    f_s = pattern_value(table[material], material, cosine, scattered, specular, backward, program.patterns)
+    return Local(
+        te=(te[0] * factor, te[1] * factor),
+        tm=(tm[0] * factor, tm[1] * factor),
+        amplitude=column["scattering_coefficient"][material] * _safe_sqrt(f_s * solid_angle),
+        xpd=column["xpd_coefficient"][material],
     )
 
 
-def _complex_permittivity(table: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """eta = eps_r - j sigma / (2 pi f eps_0) (ITU-R P.2040-3 eq. 9) of every material [M]."""
-    angular_frequency = 2 * jnp.pi * speed_of_light / wavelength
-    return jax.lax.complex(
-        table[:, _FIELD["relative_permittivity"]],
-        -table[:, _FIELD["conductivity"]] / (angular_frequency * epsilon_0),
-    )
-
-
-def _group_gains(group: Group, table: jax.Array, wavelength: jax.Array, patterns: tuple[str, ...]) -> jax.Array:
-    """Gains of one group's paths [n, R, T]."""
-    te, tm = group.tx[:, 0], group.tx[:, 1]  # field in the present frame [T, n]
-    eta = _complex_permittivity(table, wavelength)
-    scattering = table[:, _FIELD["scattering_coefficient"]]
+def _group_gains(group: Group, local: Local) -> slab.Pair:
+    """Gains of one group's paths, real and imaginary part [R, T, n]."""
+    te, tm = (group.tx[0, :, 0], group.tx[1, :, 0]), (group.tx[0, :, 1], group.tx[1, :, 1])  # [T, n]
     for step, letter in enumerate(group.signature):
-        material, cosine = group.material[step], group.cosine[step]
-        cos, sin = group.rotation[step]
-        te, tm = cos * te + sin * tm, cos * tm - sin * te
-        slab = partial(
-            slab_coefficients,
-            permittivity=eta[material],
-            thickness=table[material, _FIELD["thickness"]],
-            wavelength=wavelength,
-        )
-        r_te, r_tm, t_te, t_tm = slab(cosine)
-        kept = jnp.sqrt(1 - scattering[material] ** 2)  # what the scattered energy leaves to the specular field
+        te, tm = _turn(group.rotation[step], te, tm)
+        c_te, c_tm = (_slice(pair, group.start[step], group.size) for pair in (local.te, local.tm))
         if letter == "c":
-            transmitted = group.transmitted[step]
-            te = te * jnp.where(transmitted, t_te, r_te * kept)
-            tm = tm * jnp.where(transmitted, t_tm, r_tm * kept)
+            te, tm = _times(c_te, te), _times(c_tm, tm)
         elif letter == "s":
-            te, tm = _scatter(te, tm, r_te, r_tm, table[material], material, cosine, group.diffuse[step], patterns)
+            first = group.scatter[step]
+            amplitude, xpd = (value[first : first + group.size] for value in (local.amplitude, local.xpd))
+            te, tm = _scatter(te, tm, c_te, c_tm, amplitude, xpd, group.turn[step])
         else:
-            cosine_n, form = group.wedge[step]
-            n_te, n_tm, _, _ = slab(cosine_n)
-            weights = jnp.stack([jnp.ones_like(r_te), kept * r_te, kept * r_tm, kept * n_te, kept * n_tm])
-            matrix = jnp.einsum("kn,kijn->ijn", weights, form)  # J = C_0 + sum_k R_k C_k
-            te, tm = matrix[0, 0] * te + matrix[0, 1] * tm, matrix[1, 0] * te + matrix[1, 1] * tm
-    field = jnp.stack([te, tm])  # [2, T, n]
-    return jnp.einsum("rin,itn->nrt", group.rx, field) * group.scale[:, None, None]
+            n_te, n_tm = (_slice(pair, group.start[step] + group.size, group.size) for pair in (local.te, local.tm))
+            te, tm = _diffract(te, tm, (c_te, c_tm, n_te, n_tm), group.wedge[step])
+    real = imaginary = 0.0
+    for component, field in enumerate((te, tm)):  # E_rx^H E
+        rx_real, rx_imaginary = group.rx[:, :, component][:, :, None, :]  # [R, 1, n]
+        real = real + rx_real * field[0] + rx_imaginary * field[1]
+        imaginary = imaginary + rx_real * field[1] - rx_imaginary * field[0]
+    return real * group.scale, imaginary * group.scale
+
+
+def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
+    cos, sin = rotation
+    return (cos * a[0] + sin * b[0], cos * a[1] + sin * b[1]), (cos * b[0] - sin * a[0], cos * b[1] - sin * a[1])
+
+
+def _times(a: slab.Pair, b: slab.Pair) -> slab.Pair:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _slice(pair: slab.Pair, start: int, size: int) -> slab.Pair:
+    return pair[0][start : start + size], pair[1][start : start + size]
 
 
 def _scatter(
-    te: jax.Array,
-    tm: jax.Array,
-    r_te: jax.Array,
-    r_tm: jax.Array,
-    row: jax.Array,
-    material: jax.Array,
-    cosine: jax.Array,
-    geometry: jax.Array,
-    patterns: tuple[str, ...],
-) -> tuple[jax.Array, jax.Array]:
+    te: slab.Pair,
+    tm: slab.Pair,
+    r_te: slab.Pair,
+    r_tm: slab.Pair,
+    amplitude: jax.Array,
+    xpd: jax.Array,
+    turn: jax.Array,
+) -> tuple[slab.Pair, slab.Pair]:
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
-    cos, sin, solid_angle, scattered, specular, backward = geometry
-    incident = _square(te) + _square(tm)
-    reflected = _square(r_te) * _square(te) + _square(r_tm) * _square(tm)
-    gamma_squared = reflected / jnp.where(incident > 0, incident, 1.0)
-    f_s = pattern_value(row, material, cosine, scattered, specular, backward, patterns)
-    xpd = row[:, _FIELD["xpd_coefficient"]]
-    amplitude = row[:, _FIELD["scattering_coefficient"]] * _safe_sqrt(gamma_squared * f_s * solid_angle)
-    theta, phi = cos * te + sin * tm, cos * tm - sin * te  # the XPD matrix acts in the spherical basis
-    straight, crossed = _safe_sqrt(1 - xpd), _safe_sqrt(xpd)
-    return amplitude * (straight * theta - crossed * phi), amplitude * (crossed * theta + straight * phi)
+    incident = _power(te) + _power(tm)
+    reflected = _power(r_te) * _power(te) + _power(r_tm) * _power(tm)
+    strength = amplitude * _safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0))  # Gamma = |R E| / |E|
+    theta, phi = _turn(turn, te, tm)  # the XPD matrix acts in the basis (theta, phi)
+    straight, crossed = strength * _safe_sqrt(1 - xpd), strength * _safe_sqrt(xpd)
+    return (
+        (straight * theta[0] - crossed * phi[0], straight * theta[1] - crossed * phi[1]),
+        (crossed * theta[0] + straight * phi[0], crossed * theta[1] + straight * phi[1]),
+    )
 
 
-def _square(value: jax.Array) -> jax.Array:
-    return value.real**2 + value.imag**2
+def _diffract(
+    te: slab.Pair, tm: slab.Pair, coefficients: tuple[slab.Pair, ...], form: jax.Array
+) -> tuple[slab.Pair, slab.Pair]:
+    """Diffraction, J = C_0 + sum_k R_k C_k."""
+    real, imaginary = form[0, 0], form[1, 0]  # [2, 2, n]
+    for k, (r_real, r_imaginary) in enumerate(coefficients, start=1):
+        real = real + r_real * form[0, k] - r_imaginary * form[1, k]
+        imaginary = imaginary + r_real * form[1, k] + r_imaginary * form[0, k]
+    rows = []
+    for i in range(2):
+        a, b = _times((real[i, 0], imaginary[i, 0]), te), _times((real[i, 1], imaginary[i, 1]), tm)
+        rows.append((a[0] + b[0], a[1] + b[1]))
+    return rows[0], rows[1]
+
+
+def _power(value: slab.Pair) -> jax.Array:
+    return value[0] * value[0] + value[1] * value[1]
 
 
 def _safe_sqrt(value: jax.Array) -> jax.Array:
@@ -301,18 +405,21 @@ def _safe_sqrt(value: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
-def program_gains(program: Program, table: jax.Array) -> jax.Array:
-    """Path gains of a program.
+def gains(program: Program, local: Local) -> slab.Pair:
+    """Path gains from what the materials contribute.
 
     Args:
-        program: The grouped program.
-        table: Material constants [M, 8].
+        program: The program.
+        local: The contributions of the materials.
 
     Returns:
-        Gains in the order of the groups [P, R, T], complex.
+        Gains in the order of the groups, real and imaginary part [R, T, P].
     """
-    parts = [_group_gains(group, table, program.wavelength, program.patterns) for group in program.groups]
-    return jnp.concatenate(parts) if parts else jnp.zeros((0, 1, 1), dtype=complex)
+    parts = [_group_gains(group, local) for group in program.groups]
+    if not parts:
+        empty = jnp.zeros((1, 1, 0), dtype=program.wavelength.dtype)
+        return empty, empty
+    return tuple(jnp.concatenate(side, axis=-1) for side in zip(*parts, strict=True))
 
 
 def program_path_loss(
@@ -321,7 +428,7 @@ def program_path_loss(
     """Path loss of every link of a program.
 
     Args:
-        program: The grouped program.
+        program: The program.
         table: Material constants [M, 8].
         combining: "power", "coherent" or "band".
         offsets: For "band": quadrature over the band, frequencies relative to the carrier [Hz] and weights [2, q].
@@ -329,13 +436,63 @@ def program_path_loss(
     Returns:
         Path loss [L], [dB]; +inf where a link has no path.
     """
-    gain = program_gains(program, table)
+    return decibel(_program_power(program, local_values(program, table), combining, offsets))
+
+
+def program_path_loss_and_jacobian(
+    program: Program,
+    table: jax.Array,
+    columns: tuple[int, ...],
+    combining: str = "power",
+    offsets: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Path loss of every link and its derivatives by the constants of the materials.
+
+    Every path belongs to one link and every interaction to one material. So one reverse pass over the summed power
+    gives each link's derivative by each interaction's contribution, and one forward pass for every field, over all
+    materials at once, gives the contribution's derivative: the cost does not grow with the number of materials.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+        columns: Columns of the table to derive by.
+        combining: "power", "coherent" or "band".
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Path loss [L], [dB], and derivatives [L, M, columns], [dB] per unit; 0 where a link has no path.
+    """
+    local, push = jax.linearize(partial(local_values, program), table)
+    power, pull = jax.vjp(lambda local: _program_power(program, local, combining, offsets), local)
+    (slope,) = pull(jnp.ones_like(power))
+    bins = program.num_links * table.shape[0]
+    parts = []
+    for column in columns:
+        tangent = push(jnp.zeros_like(table).at[:, column].set(1.0))
+        by_coefficient = sum(
+            a * b
+            for side in ("te", "tm")
+            for a, b in zip(getattr(slope, side), getattr(tangent, side), strict=True)
+        )
+        by_diffuse = slope.amplitude * tangent.amplitude + slope.xpd * tangent.xpd
+        total = jax.ops.segment_sum(by_coefficient, program.owner[0] * table.shape[0] + program.material, bins)
+        if program.owner[1].shape[0]:
+            total += jax.ops.segment_sum(by_diffuse, program.owner[1] * table.shape[0] + program.diffuse[0], bins)
+        parts.append(total.reshape(program.num_links, -1))
+    inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
+    derivative = jnp.stack(parts, axis=-1) if parts else jnp.zeros((program.num_links, table.shape[0], 0))
+    return decibel(power), -10 / np.log(10) * inverse[:, None, None] * derivative
+
+
+def _program_power(program: Program, local: Local, combining: str, offsets: jax.Array | None) -> jax.Array:
     frequency = speed_of_light / program.wavelength
-    return combine(gain, program.link, program.delay, program.num_links, frequency, combining, offsets)
+    return link_power(
+        gains(program, local), program.link, program.delay, program.num_links, frequency, combining, offsets
+    )
 
 
-def combine(
-    gain: jax.Array,
+def link_power(
+    gain: slab.Pair,
     link: jax.Array,
     delay: jax.Array,
     num_links: int,
@@ -343,32 +500,37 @@ def combine(
     combining: str = "power",
     offsets: jax.Array | None = None,
 ) -> jax.Array:
-    """Path loss of every link from its path gains.
+    """Power gain of every link from its path gains.
 
     With several ports the power is summed over receive ports and averaged over transmit ports.
 
     Args:
-        gain: Path gains [P, R, T].
+        gain: Path gains, real and imaginary part [R, T, P].
         link: Link of every path [P].
         delay: Delay of every path [P], [s].
         num_links: Number of links L.
         frequency: Carrier frequency [Hz].
-        combining: "power": -10 log10 sum |a|^2; "coherent": -10 log10 |sum a e^{-j 2 pi f tau}|^2; "band": the
-            average of the coherent power over a band.
+        combining: "power": sum |a|^2; "coherent": |sum a e^{-j 2 pi f tau}|^2; "band": the average of the coherent
+            power over a band.
         offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
 
     Returns:
-        Path loss [L], [dB]; +inf where a link has no path.
+        Power gain [L]; 0 where a link has no path.
     """
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
+    ports = gain[0].shape[1]
     if combining == "power":
-        power = total(_square(gain).sum(axis=(1, 2)))
-    else:
-        nodes = jnp.array([[0.0], [1.0]]) if offsets is None else offsets
-        phase = jnp.exp(-2j * jnp.pi * delay[:, None] * (frequency + nodes[0])).astype(gain.dtype)  # [P, q]
-        field = total(gain[..., None] * phase[:, None, None, :])  # [L, R, T, q]
-        power = (_square(field) * nodes[1]).sum(axis=(1, 2, 3))
-    power = power / gain.shape[2]
+        return total(_power(gain).sum(axis=(0, 1))) / ports
+    nodes = jnp.array([[0.0], [1.0]]) if offsets is None else offsets
+    phase = -2 * jnp.pi * delay[:, None] * (frequency + nodes[0])  # [P, q]
+    turn = jnp.cos(phase), jnp.sin(phase)
+    rotated = _times((gain[0][..., None], gain[1][..., None]), turn)  # [R, T, P, q]
+    field = tuple(total(jnp.moveaxis(part, 2, 0)) for part in rotated)  # [L, R, T, q]
+    return (_power(field) * nodes[1]).sum(axis=(1, 2, 3)) / ports
+
+
+def decibel(power: jax.Array) -> jax.Array:
+    """Path loss [dB] of power gains; +inf where the power is 0."""
     reached = power > 0
     return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
 
@@ -413,12 +575,11 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
     Raises:
         InputError: A material is unknown.
     """
-    program = layout(paths)
-    gains = np.zeros((paths.num_paths, *(max(n, 1) for n in (paths.rx_field.shape[1], paths.tx_field.shape[1]))), complex)
-    if paths.num_paths:
-        order = np.concatenate([np.asarray(group.path) for group in program.groups])
-        gains[order] = np.asarray(_compiled_gains(program, jnp.asarray(constants(paths, materials))))
-    return gains[:, 0, 0] if gains.shape[1:] == (1, 1) else gains
+    plan = layout(paths)
+    real, imaginary = _compiled_gains(plan.program, jnp.asarray(constants(paths, materials)))
+    found = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
+    found[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
+    return found[:, 0, 0] if found.shape[1:] == (1, 1) else found
 
 
 def path_loss(
@@ -443,9 +604,8 @@ def path_loss(
         InputError: The combining or a material is unknown, or the bandwidth missing.
     """
     offsets = check_combining(paths, combining, bandwidth)
-    return np.asarray(
-        _compiled_path_loss(layout(paths), jnp.asarray(constants(paths, materials)), combining, offsets)
-    )
+    program = layout(paths).program
+    return np.asarray(_compiled_path_loss(program, jnp.asarray(constants(paths, materials)), combining, offsets))
 
 
 def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np.ndarray | None:
@@ -467,5 +627,9 @@ def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np
     return band_quadrature(paths.link, paths.delay, bandwidth) if combining == "band" else None
 
 
-_compiled_gains = jax.jit(program_gains)
+@jax.jit
+def _compiled_gains(program: Program, table: jax.Array) -> slab.Pair:
+    return gains(program, local_values(program, table))
+
+
 _compiled_path_loss = jax.jit(program_path_loss, static_argnames="combining")

@@ -1,0 +1,92 @@
+"""Coefficients of a homogeneous slab in air (ITU-R P.2040-3 section 2.2.2.2), in real arithmetic.
+
+Complex numbers are pairs (real, imaginary): compilers vectorize that form, and it runs several times faster than
+complex types. All functions are elementwise and differentiable.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from scipy.constants import epsilon_0, speed_of_light
+
+Pair = tuple[jax.Array, jax.Array]
+
+
+def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
+    """sigma / (2 pi f eps_0), the negative imaginary part of eta (ITU-R P.2040-3 eq. 9).
+
+    Args:
+        conductivity: [S/m].
+        wavelength: [m].
+
+    Returns:
+        The term [1].
+    """
+    return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
+
+
+def coefficients(
+    cosine: jax.Array,
+    permittivity: jax.Array,
+    loss: jax.Array,
+    thickness: jax.Array,
+    wavelength: jax.Array,
+    transmitted: jax.Array | bool,
+) -> tuple[Pair, Pair]:
+    """Transverse electric and magnetic coefficient of reflection or transmission.
+
+    Args:
+        cosine: Cosine of the angle of incidence [...].
+        permittivity: Relative permittivity eps_r [...].
+        loss: `loss_term` [...].
+        thickness: Thickness d [...], [m].
+        wavelength: [m].
+        transmitted: Where the transmission coefficient is wanted in place of the reflection coefficient [...].
+
+    Returns:
+        The two coefficients, each as (real, imaginary) [...].
+    """
+    root = _root(permittivity - (1 - cosine * cosine), loss)  # sqrt(eta - sin^2 theta)
+    scale = 2 * jnp.pi * thickness / wavelength
+    decay, turn = jnp.exp(scale * root[1]), scale * root[0]
+    phase = decay * jnp.cos(turn), -decay * jnp.sin(turn)  # e^{-jq}, q of eq. 44
+    across = _multiply(phase, phase)
+    eta_cosine = permittivity * cosine, -loss * cosine
+    half = (
+        _divide((cosine - root[0], -root[1]), (cosine + root[0], root[1])),  # eq. 37a
+        _divide(
+            (eta_cosine[0] - root[0], eta_cosine[1] - root[1]), (eta_cosine[0] + root[0], eta_cosine[1] + root[1])
+        ),  # eq. 37b
+    )
+    return tuple(_slab(single, phase, across, transmitted) for single in half)
+
+
+def _slab(half: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
+    square = _multiply(half, half)
+    loop = _multiply(square, across)
+    denominator = 1 - loop[0], -loop[1]
+    reflected = _multiply(half, (1 - across[0], -across[1]))  # eq. 43a
+    if transmitted is False:
+        return _divide(reflected, denominator)
+    through = _multiply((1 - square[0], -square[1]), phase)  # eq. 43b
+    chosen = tuple(jnp.where(transmitted, t, r) for t, r in zip(through, reflected, strict=True))
+    return _divide(chosen, denominator)
+
+
+def _root(real: jax.Array, loss: jax.Array) -> Pair:
+    """Principal square root of real - j loss, with real >= 0 and loss >= 0."""
+    tiny = jnp.finfo(real.dtype).tiny ** 0.5
+    size = jnp.maximum(real, tiny)
+    modulus = jnp.sqrt(size * size + loss * loss)
+    root = jnp.sqrt(0.5 * (modulus + size))
+    return root, -0.5 * loss / root
+
+
+def _multiply(a: Pair, b: Pair) -> Pair:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def _divide(a: Pair, b: Pair) -> Pair:
+    inverse = 1 / (b[0] * b[0] + b[1] * b[1])
+    return (a[0] * b[0] + a[1] * b[1]) * inverse, (a[1] * b[0] - a[0] * b[1]) * inverse
