@@ -315,12 +315,13 @@ def local_values(program: Program, table: jax.Array) -> Local:
     factor = jnp.where(program.transmitted | program.raw, 1.0, kept[program.material]).astype(program.cosine.dtype)
     material, solid_angle, cosine, scattered, specular, backward = program.diffuse
     f_s = pattern_value(table[material], material, cosine, scattered, specular, backward, program.patterns)
-    return Local(
+    local = Local(
         te=(te[0] * factor, te[1] * factor),
         tm=(tm[0] * factor, tm[1] * factor),
         amplitude=column["scattering_coefficient"][material] * _safe_sqrt(f_s * solid_angle),
         xpd=column["xpd_coefficient"][material],
     )
+    return slab.keep(local, program.wavelength)
 
 
 def _group_gains(group: Group, local: Local) -> slab.Pair:

@@ -6,11 +6,14 @@ complex types. All functions are elementwise and differentiable.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from scipy.constants import epsilon_0, speed_of_light
 
 Pair = tuple[jax.Array, jax.Array]
+Values = TypeVar("Values")
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
@@ -24,6 +27,22 @@ def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
         The term [1].
     """
     return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
+
+
+def keep(values: Values, positive: jax.Array) -> Values:
+    """The same values, computed once.
+
+    XLA on CPU fuses a computation into each of its uses, and so repeats sines and exponentials many times over; it
+    also drops `optimization_barrier`. It cannot look through a branch on a value that it does not know.
+
+    Args:
+        values: Arrays.
+        positive: Any positive number known at run time only.
+
+    Returns:
+        The values.
+    """
+    return jax.lax.cond(positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values)
 
 
 def coefficients(
@@ -47,10 +66,10 @@ def coefficients(
     Returns:
         The two coefficients, each as (real, imaginary) [...].
     """
-    root = _root(permittivity - (1 - cosine * cosine), loss)  # sqrt(eta - sin^2 theta)
+    root = keep(_root(permittivity - (1 - cosine * cosine), loss), wavelength)  # sqrt(eta - sin^2 theta)
     scale = 2 * jnp.pi * thickness / wavelength
     decay, turn = jnp.exp(scale * root[1]), scale * root[0]
-    phase = decay * jnp.cos(turn), -decay * jnp.sin(turn)  # e^{-jq}, q of eq. 44
+    phase = keep((decay * jnp.cos(turn), -decay * jnp.sin(turn)), wavelength)  # e^{-jq}, q of eq. 44
     across = _multiply(phase, phase)
     eta_cosine = permittivity * cosine, -loss * cosine
     half = (
