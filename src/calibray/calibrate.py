@@ -14,11 +14,12 @@ import pandas as pd
 from calibray import engines
 from calibray.engines import Engine, Replay
 from calibray.errors import InputError
+from calibray.files import check_folder
 from calibray.likelihood import Interval, LogDistance, Objective, intervals, make_objective
 from calibray.measurements import Measurements
 from calibray.optimizers import METHODS, Optimizer
 from calibray.parameters import Parameters
-from calibray.result import Result, by_group, writable_folder
+from calibray.result import Result, by_group
 from calibray.spelling import did_you_mean
 from calibray.study import Study
 
@@ -57,9 +58,10 @@ def calibrate(
     study = study.replace(method=method, seed=seed)
     check_method(study.method.name)
     if out is not None:
-        writable_folder(out)
+        check_folder(out)
     started = time.perf_counter()
     links = study.measurements()
+    study.split(links)  # refuses a hold-out that leaves nothing, before anything is traced
     if engine is None:
         engine = engines.make(study, progress=_stage(progress, "tracing"))
     problem = Problem.of(study, links, engine)
@@ -118,7 +120,7 @@ class Problem:
             The problem.
 
         Raises:
-            InputError: No link is left to calibrate on.
+            InputError: No link is left to calibrate on, or none of a group of which links are held out.
         """
         held_out = links.where(study.holdout.where) if study.holdout else np.zeros(len(links), dtype=bool)
         before = engine.path_loss(engine.parameters.start[None])[0]
@@ -130,12 +132,24 @@ class Problem:
             bounds=study.offset.bounds if study.offset else None,
             ceiling_db=study.objective.ceiling_db,
         )
+        _check_groups(links, objective, held_out & np.isfinite(before))
         return cls(study, links, engine, objective, held_out, before)
+
+
+def _check_groups(links: Measurements, objective: Objective, judged: np.ndarray) -> None:
+    """Refuse links held out whose offset no link to calibrate on could tell."""
+    if objective.num_groups:
+        unknown = np.setdiff1d(objective.group[judged], objective.group[objective.weight > 0])
+        if len(unknown):
+            raise InputError(
+                f"{links.source}: group {links.group_names[unknown[0]]!r} is held out but has no link to "
+                "calibrate its offset on; change [holdout] or [offset]"
+            )
 
 
 @dataclass
 class Run:
-    """What a search has seen: every RT call in order, and the path loss at the best candidate."""
+    """What a search has seen: every RT call in order, the path loss at the best candidate, and the engine's count."""
 
     candidates: list[np.ndarray] = field(default_factory=list)
     rmse_db: list[float] = field(default_factory=list)
@@ -144,6 +158,7 @@ class Run:
     best: np.ndarray = field(default_factory=lambda: np.zeros(0))
     best_loss: np.ndarray = field(default_factory=lambda: np.zeros(0))
     best_rmse_db: float = np.inf
+    rt_calls: int = 0
 
     def add(self, candidates: np.ndarray, loss: np.ndarray, rmse_db: np.ndarray, iteration: int, now: float) -> None:
         """Record one batch of RT calls."""
@@ -185,7 +200,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     """
     engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
     derivatives = "jacobian" in optimizer.uses and isinstance(engine, Replay)
-    started, iteration = time.perf_counter(), 0
+    started, iteration, calls = time.perf_counter(), 0, engine.calls
     while not optimizer.done:
         points = optimizer.ask()
         candidates = from_search(parameters, points)
@@ -201,6 +216,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         run.add(candidates, loss, rmse, iteration, time.perf_counter() - started)
         if progress is not None:
             progress("calibrating", len(run.rmse_db), optimizer.budget)
+    run.rt_calls = engine.calls - calls
     if not np.isfinite(run.best_rmse_db):
         raise InputError("every candidate lost the path of some link; exclude those links or use no_path = 'censor'")
     return run
@@ -263,27 +279,26 @@ def _optimizer(problem: Problem) -> Optimizer:
 def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) -> Result:
     study, links, engine, objective = problem.study, problem.links, problem.engine, problem.objective
     names = engine.parameters.names
-    calls = len(run.rmse_db)
-    offsets = objective.offsets(run.best_loss[None])[0] if objective.num_groups else np.zeros(0)
-    after = run.best_loss + (offsets[objective.group] if objective.num_groups else 0.0)
-    weight, counted = links.weight, objective.weight > 0
+    before, best, counted = problem.before, run.best_loss, objective.weight > 0
+    reached = np.isfinite(before) & np.isfinite(best)
+    judged = problem.held_out & (reached | (objective.ceiling_db is not None))
+    offsets = objective.offsets(best[None])[0] if objective.num_groups else np.zeros(0)
+    offset_only, after = objective.model(np.stack([before, best]))
     rival = LogDistance.fit(links.distance, links.path_loss_db, objective.weight).path_loss(links.distance)
-    judged = problem.held_out & np.isfinite(problem.before)
 
     def rmse(model: np.ndarray, mask: np.ndarray) -> float | None:
         if not mask.any():
             return None
-        model = model if objective.ceiling_db is None else np.minimum(model, objective.ceiling_db)
-        return float(np.sqrt(np.average((model - links.path_loss_db)[mask] ** 2, weights=weight[mask])))
+        return float(np.sqrt(np.average((model - links.path_loss_db)[mask] ** 2, weights=links.weight[mask])))
 
     table = pd.DataFrame(
         {
             "row": links.row,
             "measured_db": links.path_loss_db,
-            "before_db": problem.before,
-            "after_db": after,
+            "before_db": before,
+            "after_db": best + (offsets[objective.group] if objective.num_groups else 0.0),
             "log_distance_db": rival,
-            "has_path": np.isfinite(problem.before),
+            "has_path": reached,
             "held_out": problem.held_out,
         }
     )
@@ -293,15 +308,18 @@ def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) ->
         initial_parameters=by_group(names, engine.parameters.start),
         intervals=_intervals(problem, run.best),
         materials=engine.parameters.materials(run.best, engine.materials),
-        offsets_db=dict(by_group(links.group_names, offsets)) if objective.num_groups else {},
+        offsets_db={links.group_names[k]: float(offsets[k]) for k in np.unique(objective.group[counted])}
+        if objective.num_groups
+        else {},
         rmse_db=run.best_rmse_db,
-        initial_rmse_db=rmse(problem.before, counted),
-        offset_only_rmse_db=float(objective.rmse(problem.before[None])[0]) if objective.num_groups else None,
+        initial_rmse_db=rmse(objective.capped(before), counted),
+        offset_only_rmse_db=rmse(offset_only, counted) if objective.num_groups else None,
         holdout_rmse_db=rmse(after, judged),
-        initial_holdout_rmse_db=rmse(problem.before, judged),
+        initial_holdout_rmse_db=rmse(objective.capped(before), judged),
+        offset_only_holdout_rmse_db=rmse(offset_only, judged) if objective.num_groups else None,
         log_distance_rmse_db=rmse(rival, counted),
         log_distance_holdout_rmse_db=rmse(rival, judged),
-        rt_calls=calls,
+        rt_calls=run.rt_calls,
         seconds=seconds,
         trace_seconds=trace_seconds,
         links=table,

@@ -9,6 +9,7 @@ A run of one candidate over all links is an RT call. It is counted here, where t
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Final, Protocol, runtime_checkable
 
@@ -235,15 +236,18 @@ def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> T
 
     Args:
         study: The study.
-        materials: Constants in place of the scene's, by name.
+        materials: Constants in place of the scene's, by name; None for the scene's with the parameters' starts.
 
     Returns:
         The tracer.
 
     Raises:
-        InputError: The scene cannot be used.
+        InputError: The scene or the parameters cannot be used.
     """
     scene = read_scene(study.scene_source, study.scene.frequency, {**study.overrides, **(materials or {})})
+    if materials is None:  # what is sampled while tracing, as diffuse reflection is, follows the materials
+        parameters = study.parameter_set(scene.materials)
+        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
     return Tracer(scene, study.scene.frequency, study.trace, study.antennas.tx, study.antennas.rx)
 
 

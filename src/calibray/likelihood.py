@@ -47,10 +47,22 @@ class Objective:
         Returns:
             Offset of every group [n, num_groups], [dB]; 0 for a group without a link that counts.
         """
-        gap = np.where(self.weight > 0, self.measured - self._capped(path_loss), 0.0)
+        gap = np.where(self.weight > 0, self.measured - self.capped(path_loss), 0.0)
         total = self._per_group(np.broadcast_to(self.weight, gap.shape))
         mean = self._per_group(self.weight * gap) / np.where(total > 0, total, 1.0)
         return np.clip(mean, *self.bounds)
+
+    def model(self, path_loss: np.ndarray) -> np.ndarray:
+        """What is compared with the measurements.
+
+        Args:
+            path_loss: Modelled path loss [n, L], [dB].
+
+        Returns:
+            The path loss, at most the ceiling, plus the best offsets [n, L], [dB].
+        """
+        model = self.capped(path_loss)
+        return model + self.offsets(path_loss)[:, self.group] if self.num_groups else model
 
     def residuals(self, path_loss: np.ndarray) -> np.ndarray:
         """Residuals whose root mean square is the RMSE.
@@ -62,10 +74,7 @@ class Objective:
             Model plus offset minus measurement, scaled by the square root of the weights [n, counted links], [dB].
         """
         counted = self.weight > 0
-        model = self._capped(path_loss)
-        if self.num_groups:
-            model = model + self.offsets(path_loss)[:, self.group]
-        return (model - self.measured)[:, counted] * self._scale()[counted]
+        return (self.model(path_loss) - self.measured)[:, counted] * self._scale()[counted]
 
     def jacobian(self, path_loss: np.ndarray, derivative: np.ndarray) -> np.ndarray:
         """Derivatives of the residuals.
@@ -100,7 +109,8 @@ class Objective:
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
-    def _capped(self, path_loss: np.ndarray) -> np.ndarray:
+    def capped(self, path_loss: np.ndarray) -> np.ndarray:
+        """Path loss as it could have been measured: at most the ceiling, if there is one [dB]."""
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def _scale(self) -> np.ndarray:

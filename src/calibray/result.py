@@ -14,6 +14,7 @@ import pandas as pd
 from calibray import fields
 from calibray.engines import make_tracer
 from calibray.errors import InputError
+from calibray.files import check_folder, write_text
 from calibray.likelihood import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements, links_from_frame
@@ -22,8 +23,8 @@ from calibray.study import Study
 from calibray.tracing import Progress
 
 VERSION: Final = 1
-RESULT_FILE: Final = "result.json"
-SCENE_FILE: Final = "scene.xml"
+FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")
+RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class Result:
         offset_only_rmse_db: The same with only the offsets fitted; None without `[offset]`.
         holdout_rmse_db: RMSE over the links held out; None without `[holdout]`.
         initial_holdout_rmse_db: The same before anything was fitted.
+        offset_only_holdout_rmse_db: The same with only the offsets fitted, on the links calibrated on.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the links calibrated on.
         log_distance_holdout_rmse_db: Its RMSE over the links held out.
         rt_calls: RT calls that the method spent.
@@ -63,6 +65,7 @@ class Result:
     offset_only_rmse_db: float | None
     holdout_rmse_db: float | None
     initial_holdout_rmse_db: float | None
+    offset_only_holdout_rmse_db: float | None
     log_distance_rmse_db: float
     log_distance_holdout_rmse_db: float | None
     rt_calls: int
@@ -82,11 +85,20 @@ class Result:
         Raises:
             InputError: The folder cannot be written.
         """
-        target = writable_folder(folder)
+        target = check_folder(folder)
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            self._write(target)
+        except OSError as error:
+            raise InputError(
+                f"output folder {target}: cannot be written ({error.strerror}); name another"
+            ) from None
+
+    def _write(self, target: Path) -> None:
         export_scene(self.study.scene_source, self.materials, target / SCENE_FILE)
-        _replace(target / "links.csv", self.links.to_csv(index=False, float_format="%.6g"))
-        _replace(target / "history.csv", self.history.to_csv(index=False, float_format="%.9g"))
-        _replace(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
+        write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.6g"))
+        write_text(target / HISTORY_FILE, self.history.to_csv(index=False, float_format="%.9g"))
+        write_text(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
 
     def content(self) -> dict[str, Any]:
         """The result as plain values, but for the tables of links and calls."""
@@ -99,6 +111,7 @@ class Result:
             "offset_only_rmse_db": self.offset_only_rmse_db,
             "holdout_rmse_db": self.holdout_rmse_db,
             "initial_holdout_rmse_db": self.initial_holdout_rmse_db,
+            "offset_only_holdout_rmse_db": self.offset_only_holdout_rmse_db,
             "log_distance_rmse_db": self.log_distance_rmse_db,
             "log_distance_holdout_rmse_db": self.log_distance_holdout_rmse_db,
             "rt_calls": self.rt_calls,
@@ -127,7 +140,7 @@ class Result:
         source = Path(folder) / RESULT_FILE
         try:
             content = json.loads(source.read_text(encoding="utf-8"))
-            links, history = (pd.read_csv(source.with_name(name)) for name in ("links.csv", "history.csv"))
+            links, history = (pd.read_csv(source.with_name(name)) for name in (LINKS_FILE, HISTORY_FILE))
         except (OSError, ValueError) as error:
             raise InputError(f"{source}: is no result of `calibray run` ({error}); name its --out folder") from None
         if content.get("version") != VERSION:
@@ -170,35 +183,6 @@ class Result:
         return np.array([self.offsets_db[name] for name in links.group_names])[links.group_index]
 
 
-def writable_folder(folder: str | Path) -> Path:
-    """A folder that files can be written into, made if absent.
-
-    Args:
-        folder: The folder.
-
-    Returns:
-        Its path.
-
-    Raises:
-        InputError: It is a file, or cannot be made or written.
-    """
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        probe = target / ".calibray-probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"output folder {target}: cannot be written ({error.strerror}); name another") from None
-    return target
-
-
 def by_group(names: tuple[str, ...], values: np.ndarray) -> Mapping[str, float]:
     """Values by group name."""
     return {name: float(value) for name, value in zip(names, values, strict=True)}
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
