@@ -6,14 +6,23 @@ running, 2 for bad input. Commands import what they need when they run, so that 
 
 from __future__ import annotations
 
+import json
 from importlib import metadata
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
 from calibray.errors import EngineError, InputError
+
+if TYPE_CHECKING:
+    from calibray.measurements import Measurements
+    from calibray.terminal import Enclosed
+    from calibray.tracing import Tracer
+
+PREDICTED: Final = "path_loss_db"  # the column that `predict` adds
 
 log = Console(stderr=True, highlight=False)
 """Where progress and messages go; data goes to stdout through `typer.echo`."""
@@ -81,6 +90,125 @@ def doctor() -> None:
     typer.echo(render(diagnosis))
     if not diagnosis.usable:
         raise typer.Exit(1)
+
+
+StudyFile = Annotated[
+    Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
+]
+
+
+@app.command()
+def run(
+    study_file: StudyFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write the result into.")],
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Method in place of the study's: auto, sgwo-im, gwo, ..."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed in place of the study's.")] = None,
+    engine: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Engine in place of the study's: replay or retrace.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
+    ] = False,
+) -> None:
+    """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
+    from calibray import terminal
+    from calibray.calibrate import calibrate
+    from calibray.engines import make_tracer
+    from calibray.result import FILES
+    from calibray.study import Study
+
+    study = Study.load(study_file).replace(engine=engine)
+    with terminal.progress_bars(log) as progress:
+        result = calibrate(study, method, seed, out, progress=progress)
+    enclosed = _enclosed(make_tracer(study), study.measurements())
+    if as_json:
+        typer.echo(json.dumps(result.content() | {"links": terminal.summary(result, enclosed)}, indent=2))
+    else:
+        typer.echo(terminal.render_result(result, enclosed))
+    typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)
+
+
+@app.command()
+def trace(
+    study_file: StudyFile,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file to write the paths into.")
+    ],
+) -> None:
+    """Find the paths of a study's links and store them as a path program."""
+    from calibray import terminal
+    from calibray.engines import make_tracer
+    from calibray.files import check_file
+    from calibray.study import Study
+
+    study = Study.load(study_file)
+    check_file(out)
+    links, tracer = study.measurements(), make_tracer(study)
+    with terminal.progress_bars(log) as progress:
+        paths = tracer.trace(links, lambda done, total: progress("tracing", done, total)).paths()
+    paths.save(out)
+    typer.echo(terminal.render_paths(paths, links.row, _enclosed(tracer, links)))
+    typer.echo(f"Written to {out}", err=True)
+
+
+@app.command()
+def predict(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+    ],
+    links_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LINKS",
+            help="CSV or Parquet file with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], and the study's "
+            "group column if its offset has one.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write instead of CSV on stdout."
+        ),
+    ] = None,
+) -> None:
+    """Predict path loss at links that were never measured, with the calibrated scene."""
+    import numpy as np
+
+    from calibray import terminal
+    from calibray.files import check_table, write_table
+    from calibray.measurements import read_links
+    from calibray.result import Result
+
+    result = Result.load(folder)
+    links = read_links(links_file, group=result.study.offset.per if result.study.offset else None)
+    if PREDICTED in links.frame:
+        raise InputError(f"{links_file}: has a column {PREDICTED!r} already; rename or remove it")
+    if out is not None:
+        check_table(out)
+    with terminal.progress_bars(log) as progress:
+        path_loss_db = result.predict(links, lambda done, total: progress("tracing", done, total))
+    table = links.frame.assign(**{PREDICTED: path_loss_db})
+    if out is None:
+        typer.echo(table.to_csv(index=False), nl=False)
+    else:
+        write_table(out, table)
+    lost = links.row[np.isinf(path_loss_db)].tolist()
+    if lost:
+        typer.echo(
+            f"Warning: no path leads to {len(lost)} of {len(links)} links, {terminal.rows_text(lost)}",
+            err=True,
+        )
+
+
+def _enclosed(tracer: Tracer, links: Measurements) -> Enclosed:
+    """Which antennas of some links stand inside closed bodies."""
+    from calibray.terminal import Enclosed
+
+    return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
 
 
 def main() -> None:

@@ -1,0 +1,264 @@
+"""What the command line shows: tables of a calibration as plain text, and progress bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import StringIO
+from typing import Any, Final
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+
+from calibray.calibrate import Progress as Report
+from calibray.materials import BOUNDS
+from calibray.paths import Paths
+from calibray.result import Result
+
+LISTED: Final = 12  # rows named one by one before the rest is only counted
+
+
+@dataclass(frozen=True)
+class Enclosed:
+    """Antennas that stand inside closed bodies of the scene.
+
+    Attributes:
+        tx: Lines in the source file of the links whose transmitter is enclosed.
+        rx: The same for receivers.
+        indoors: Whether most are, as they are in a building's inside; then none is suspect.
+    """
+
+    tx: tuple[int, ...]
+    rx: tuple[int, ...]
+    indoors: bool
+
+    @classmethod
+    def of(cls, row: np.ndarray, tx: np.ndarray, rx: np.ndarray) -> Enclosed:
+        """Sort out which antennas are enclosed.
+
+        Args:
+            row: Line of every link in the source file [L].
+            tx: Whether its transmitter is enclosed [L].
+            rx: Whether its receiver is enclosed [L].
+
+        Returns:
+            The lines of the links concerned.
+        """
+        indoors = bool(np.mean(tx | rx) > 0.5)
+        return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)
+
+
+def summary(result: Result, enclosed: Enclosed) -> dict[str, Any]:
+    """The links of a calibration in numbers, with the rows that need a look.
+
+    Args:
+        result: The calibration.
+        enclosed: Its antennas inside closed bodies.
+
+    Returns:
+        How many links were calibrated on and held out, and the rows without a path or with an enclosed antenna.
+    """
+    links = result.links
+    has_path, held_out = links["has_path"].to_numpy(bool), links["held_out"].to_numpy(bool)
+    counted = ~held_out & (has_path | (result.study.objective.no_path == "censor"))
+    return {
+        "calibrated_on": int(counted.sum()),
+        "held_out": int(held_out.sum()),
+        "rows_without_path": links["row"][~has_path].tolist(),
+        "rows_with_enclosed_tx": list(enclosed.tx),
+        "rows_with_enclosed_rx": list(enclosed.rx),
+    }
+
+
+def render_result(result: Result, enclosed: Enclosed) -> str:
+    """A calibration as tables of plain text.
+
+    Args:
+        result: The calibration.
+        enclosed: Its antennas inside closed bodies.
+
+    Returns:
+        Lines of text, without a line break at the end.
+    """
+    sections = [
+        _heading(result),
+        _links(result, enclosed),
+        _parameters(result),
+        _offsets(result),
+        _accuracy(result),
+        _costs(result),
+    ]
+    return "\n\n".join(section for section in sections if section)
+
+
+def render_paths(paths: Paths, row: np.ndarray, enclosed: Enclosed) -> str:
+    """A trace as a table of plain text.
+
+    Args:
+        paths: What was traced.
+        row: Line of every link in the source file [L].
+        enclosed: Antennas inside closed bodies.
+
+    Returns:
+        Lines of text, without a line break at the end.
+    """
+    reached = np.bincount(paths.link, minlength=paths.num_links) > 0
+    rows = [
+        ("links", f"{paths.num_links:,}", ""),
+        ("paths", f"{paths.num_paths:,}", ""),
+        ("interactions", f"{paths.num_interactions:,}", ""),
+        *_suspects(row[~reached].tolist(), "", enclosed),
+    ]
+    return _table(("Trace", ">", ""), rows)
+
+
+def rows_text(rows: Sequence[int]) -> str:
+    """Rows of a file, named one by one while they are few.
+
+    Args:
+        rows: Lines of the file.
+
+    Returns:
+        Them as words, empty if there is none.
+
+    Example:
+        >>> rows_text([3, 4, 9])
+        'rows 3, 4, 9'
+        >>> rows_text(range(2, 40))
+        'rows 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13 and 26 more'
+    """
+    if not rows:
+        return ""
+    named = ", ".join(map(str, rows[:LISTED]))
+    more = f" and {len(rows) - LISTED} more" if len(rows) > LISTED else ""
+    return f"row{'s' if len(rows) > 1 else ''} {named}{more}"
+
+
+@contextmanager
+def progress_bars(console: Console) -> Iterator[Report]:
+    """Progress bars, one for each stage of the work; none where nobody watches.
+
+    Args:
+        console: Where to draw them; must be a terminal, else nothing is drawn.
+
+    Yields:
+        What to call with the stage's name, how much is done, and out of how much.
+    """
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description:<12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+        tasks = {"tracing": bars.add_task("tracing", total=None)}
+
+        def report(stage: str, done: int, total: int | None) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def _heading(result: Result) -> str:
+    study = result.study
+    return (
+        f"{study.path.name}: method {study.method.name}, engine {study.engine.name}, seed {study.method.seed}"
+    )
+
+
+def _links(result: Result, enclosed: Enclosed) -> str:
+    count = summary(result, enclosed)
+    censored = result.study.objective.no_path == "censor"
+    verdict = f"counted as lost at {result.study.objective.ceiling_db:g} dB" if censored else "left out"
+    rows = [
+        ("calibrated on", str(count["calibrated_on"]), ""),
+        ("held out", str(count["held_out"]), ""),
+        *_suspects(count["rows_without_path"], f", {verdict}", enclosed),
+    ]
+    return _table(("Links", ">", ""), rows)
+
+
+def _suspects(
+    without_path: Sequence[int], verdict: str, enclosed: Enclosed
+) -> Iterator[tuple[str, str, str]]:
+    lost = rows_text(without_path)
+    yield "without a path", str(len(without_path)), lost + verdict if lost else ""
+    for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
+        if enclosed.indoors:
+            remedy = "as most are: taken for an indoor scene"
+        else:
+            remedy = f"{rows_text(rows)}: check the positions" if rows else ""
+        yield f"{end} inside a building", str(len(rows)), remedy if rows else ""
+
+
+def _parameters(result: Result) -> str:
+    rows = []
+    for name, after in result.parameters.items():
+        unit = BOUNDS[name.rpartition(".")[2]].unit
+        label = name if unit == "1" else f"{name} [{unit}]"
+        before, interval = result.initial_parameters[name], result.intervals.get(name)
+        ends = (
+            (f"{interval.lower:.4g} to {interval.upper:.4g}", interval.verdict)
+            if interval
+            else ("-", "not known")
+        )
+        rows.append((label, f"{before:.4g}", f"{after:.4g}", *ends))
+    return _table(("Parameters", ">before", ">after", ">95 % interval", "verdict"), rows)
+
+
+def _offsets(result: Result) -> str:
+    rows = [(name or "all links", f"{value:+.2f}") for name, value in result.offsets_db.items()]
+    return _table(("Offsets", ">[dB]"), rows) if rows else ""
+
+
+def _accuracy(result: Result) -> str:
+    rows = [
+        ("before", result.initial_rmse_db, result.initial_holdout_rmse_db),
+        ("offset only", result.offset_only_rmse_db, result.offset_only_holdout_rmse_db),
+        ("after", result.rmse_db, result.holdout_rmse_db),
+        ("log-distance model", result.log_distance_rmse_db, result.log_distance_holdout_rmse_db),
+    ]
+    shown = [(name, _decibels(fit), _decibels(held)) for name, fit, held in rows if fit is not None]
+    return _table(("RMSE [dB]", ">calibrated on", ">held out"), shown)
+
+
+def _costs(result: Result) -> str:
+    rows = [
+        ("RT calls", f"{result.rt_calls:,}"),
+        ("tracing", f"{result.trace_seconds:.1f} s"),
+        ("calibrating", f"{result.seconds:.1f} s"),
+    ]
+    return _table(("Cost", ">"), rows)
+
+
+def _decibels(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as plain text; a heading that begins with ">" is of a column aligned to the right."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for heading in header:
+        table.add_column(
+            heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left", no_wrap=True
+        )
+    for row in rows:
+        table.add_row(*row)
+    # As wide as it needs to be: output is for files and pipes as much as for a screen.
+    text = Console(file=StringIO(), width=1000, markup=False, highlight=False, color_system=None)
+    text.print(table)
+    return "\n".join(line.rstrip() for line in text.file.getvalue().splitlines())
