@@ -465,11 +465,11 @@ def program_path_loss_and_jacobian(
     """
     local, push = jax.linearize(partial(local_values, program), table)
     power, pull = jax.vjp(lambda local: _program_power(program, local, combining, offsets), local)
-    (slope,) = pull(jnp.ones_like(power))
+    (slope,) = slab.keep(pull(jnp.ones_like(power)), program.wavelength)
     bins = program.num_links * table.shape[0]
     parts = []
     for column in columns:
-        tangent = push(jnp.zeros_like(table).at[:, column].set(1.0))
+        tangent = slab.keep(push(jnp.zeros_like(table).at[:, column].set(1.0)), program.wavelength)
         by_coefficient = sum(
             a * b
             for side in ("te", "tm")
