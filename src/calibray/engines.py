@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibray import fields
+from calibray import fields, tabulation
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements
@@ -29,6 +29,10 @@ from calibray.tracing import Tracer
 
 ENGINES: Final = ("replay", "retrace")
 BLOCK_INTERACTIONS: Final = 2_000_000  # interactions x candidates evaluated at once, which bounds the memory
+TABULATED: Final = 50_000  # interactions beyond which coefficients come from tables
+FIRST_INTERVALS: Final = 2048  # of a table over the cosine of incidence
+LAST_INTERVALS: Final = 65536
+TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
 BLOCK_SIZES: Final = (1, 8, 32)  # candidates a call; every size is compiled once
 
 Progress = Callable[[int, int], None]
@@ -82,24 +86,15 @@ class Replay:
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         self._dtype = dtype
-        rows, columns = parameters.indices(list(paths.materials))
-        fields_used, place = np.unique(columns, return_inverse=True)
-        offsets = fields.check_combining(paths, combining, bandwidth)
-        program = fields.layout(paths, dtype).program
-        base = jnp.asarray(fields.constants(paths).astype(dtype))
-
-        def value(program: fields.Program, candidate: jax.Array) -> jax.Array:
-            table = base.at[rows, columns].set(candidate)
-            return fields.program_path_loss(program, table, combining, offsets)
-
-        def with_jacobian(program: fields.Program, candidate: jax.Array) -> tuple[jax.Array, jax.Array]:
-            table = base.at[rows, columns].set(candidate)
-            used = tuple(int(column) for column in fields_used)
-            loss, slope = fields.program_path_loss_and_jacobian(program, table, used, combining, offsets)
-            return loss, slope[:, rows, place]
-
-        self._value = partial(jax.jit(jax.vmap(value, in_axes=(None, 0))), program)
-        self._jacobian = partial(jax.jit(jax.vmap(with_jacobian, in_axes=(None, 0))), program)
+        self._offsets = fields.check_combining(paths, combining, bandwidth)
+        self._combining = combining
+        self._rows, columns = parameters.indices(list(paths.materials))
+        used, self._places = np.unique(columns, return_inverse=True)
+        self._columns = columns
+        self._base = jnp.asarray(fields.constants(paths).astype(dtype))
+        self._fields = tuple(int(column) for column in used)
+        self._intervals = FIRST_INTERVALS if paths.num_interactions > TABULATED else None
+        self._program = fields.layout(paths, dtype, self._intervals).program
         room = max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
         self._sizes = [size for size in BLOCK_SIZES if size <= room]
 
@@ -115,7 +110,7 @@ class Replay:
         Raises:
             InputError: The candidates have another width, or a value is not finite.
         """
-        (loss,) = self._run(lambda block: (self._value(block),), candidates)
+        (loss,) = self._run(self._value, candidates)
         return loss
 
     def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,6 +128,17 @@ class Replay:
         loss, jacobian = self._run(self._jacobian, candidates)
         return loss, jacobian
 
+    def _value(self, tables: jax.Array) -> tuple[jax.Array]:
+        local = _local_values(self._program, tables)
+        power = _power(self._program, local, self._combining, self._offsets)
+        return (fields.decibel(power),)
+
+    def _jacobian(self, tables: jax.Array) -> tuple[jax.Array, jax.Array]:
+        local, tangents = _local_tangents(self._program, tables, self._fields)
+        power, slope = _power_and_slope(self._program, local, self._combining, self._offsets)
+        derivative = _decibel_slope(self._program, power, slope, tangents, tables.shape[1])
+        return fields.decibel(power), derivative[:, :, self._rows, self._places]
+
     def _run(self, function: Callable, candidates: np.ndarray) -> tuple[np.ndarray, ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
         parts, start = [], 0
@@ -141,10 +147,51 @@ class Replay:
             size = next((size for size in self._sizes if size >= left), self._sizes[-1])
             block = values[start : start + size]
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
-            parts.append([np.asarray(part)[: len(block)] for part in function(jnp.asarray(padded))])
+            tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
+            self._refine(tables)
+            parts.append([np.asarray(part)[: len(block)] for part in function(tables)])
             start += len(block)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+    def _refine(self, tables: jax.Array) -> None:
+        """Make the tables of coefficients fine enough for these candidates, and for all that follow."""
+        while self._intervals is not None and (
+            float(_table_error(self._program.lookup, tables, self._program.wavelength).max()) > TABLE_TOLERANCE
+        ):
+            self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
+            self._program = fields.layout(self.paths, self._dtype, self._intervals).program
+
+
+# Stages compiled apart, each over a batch of candidates; see `calibray.fields`.
+_tables = jax.jit(lambda base, rows, columns, values: jax.vmap(lambda value: base.at[rows, columns].set(value))(values))
+_local_values = jax.jit(jax.vmap(fields.local_values, in_axes=(None, 0)))
+_table_error = jax.jit(jax.vmap(tabulation.table_error, in_axes=(None, 0, None)))
+
+
+@partial(jax.jit, static_argnames="columns")
+def _local_tangents(program: fields.Program, tables: jax.Array, columns: tuple[int, ...]) -> tuple:
+    return jax.vmap(lambda table: fields.local_tangents(program, table, columns))(tables)
+
+
+@partial(jax.jit, static_argnames="combining")
+def _power(program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None) -> jax.Array:
+    return jax.vmap(lambda one: fields.program_power(program, one, combining, offsets))(local)
+
+
+@partial(jax.jit, static_argnames="combining")
+def _power_and_slope(
+    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
+) -> tuple[jax.Array, fields.Local]:
+    return jax.vmap(lambda one: fields.power_and_slope(program, one, combining, offsets))(local)
+
+
+@partial(jax.jit, static_argnames="materials")
+def _decibel_slope(
+    program: fields.Program, power: jax.Array, slope: fields.Local, tangents: tuple, materials: int
+) -> jax.Array:
+    one = partial(fields.decibel_slope, program, num_materials=materials)
+    return jax.vmap(lambda power, slope, tangents: one(power, slope, tangents))(power, slope, tangents)
 
 
 class Retrace:

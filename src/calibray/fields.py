@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.constants import speed_of_light
 
-from calibray import slab
+from calibray import slab, tabulation
 from calibray.diffraction import affine_form
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material
@@ -77,7 +77,9 @@ class Group:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["groups", "link", "delay", "wavelength", "material", "cosine", "transmitted", "raw", "diffuse", "owner"],
+    data_fields=[
+        "groups", "link", "delay", "wavelength", "material", "cosine", "transmitted", "raw", "diffuse", "owner", "lookup",
+    ],
     meta_fields=["num_links", "patterns", "any_transmitted"],
 )
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ class Program:
         num_links: Number of links.
         patterns: Scattering pattern of every material.
         any_transmitted: Whether any coefficient is a transmission.
+        lookup: Where to find the coefficients in a table; None where they are evaluated one by one.
     """
 
     groups: tuple[Group, ...]
@@ -114,6 +117,7 @@ class Program:
     num_links: int
     patterns: tuple[str, ...]
     any_transmitted: bool
+    lookup: tabulation.Lookup | None = None
 
 
 @dataclass(frozen=True)
@@ -129,12 +133,14 @@ class Layout:
     order: np.ndarray
 
 
-def layout(paths: Paths, dtype: type = np.float64) -> Layout:
+def layout(paths: Paths, dtype: type = np.float64, intervals: int | None = None) -> Layout:
     """Lay a path program out for evaluation.
 
     Args:
         paths: The path program.
         dtype: Precision of the constants, `numpy.float64` or `numpy.float32`.
+        intervals: Tabulate the coefficients over the cosine of incidence with so many intervals; None evaluates
+            every coefficient by itself.
 
     Returns:
         The grouped program, on JAX's default device.
@@ -155,20 +161,26 @@ def layout(paths: Paths, dtype: type = np.float64) -> Layout:
                table.cos_specular[at], table.cos_backward[at])  # fmt: skip
     interaction, cosine = flat.coefficients()
     owner = np.repeat(paths.link, depth)
+    kind = paths.kind[interaction]
+    lookup = None
+    if intervals is not None:
+        mode = np.select([kind == Kind.REFRACTION, kind == Kind.DIFFUSE], [tabulation.TRANSMITTED, tabulation.RAW], 0)
+        lookup = tabulation.make_lookup(paths.material[interaction], mode, cosine, intervals, dtype)
     program = Program(
         groups=groups,
         link=jnp.asarray(paths.link[order]),
         delay=jnp.asarray(paths.delay[order]),
         wavelength=jnp.asarray(speed_of_light / paths.frequency, dtype=dtype),
         material=jnp.asarray(paths.material[interaction]),
-        cosine=jnp.asarray(cosine.astype(dtype)),
-        transmitted=jnp.asarray(paths.kind[interaction] == Kind.REFRACTION),
-        raw=jnp.asarray(paths.kind[interaction] == Kind.DIFFUSE),
+        cosine=jnp.asarray((cosine if lookup is None else cosine[:0]).astype(dtype)),
+        transmitted=jnp.asarray(kind == Kind.REFRACTION),
+        raw=jnp.asarray(kind == Kind.DIFFUSE),
         diffuse=(jnp.asarray(paths.material[rows]), *(jnp.asarray(column.astype(dtype)) for column in columns)),
         owner=(jnp.asarray(owner[interaction]), jnp.asarray(owner[rows])),
         num_links=paths.num_links,
         patterns=tuple(material.scattering_pattern for material in paths.materials.values()),
         any_transmitted=bool((paths.kind == Kind.REFRACTION).any()),
+        lookup=lookup,
     )
     return Layout(program, order)
 
@@ -301,27 +313,26 @@ def local_values(program: Program, table: jax.Array) -> Local:
     Returns:
         The contributions.
     """
-    column = {name: table[:, index] for name, index in _FIELD.items()}
-    loss = slab.loss_term(column["conductivity"], program.wavelength)
-    te, tm = slab.coefficients(
-        program.cosine,
-        column["relative_permittivity"][program.material],
-        loss[program.material],
-        column["thickness"][program.material],
-        program.wavelength,
-        program.transmitted if program.any_transmitted else False,
-    )
-    kept = _safe_sqrt(1 - column["scattering_coefficient"] ** 2)  # what scattering leaves to the specular field
-    factor = jnp.where(program.transmitted | program.raw, 1.0, kept[program.material]).astype(program.cosine.dtype)
+    if program.lookup is None:
+        te, tm = tabulation.evaluate(
+            program.cosine,
+            table,
+            program.material,
+            program.wavelength,
+            program.transmitted if program.any_transmitted else False,
+            program.transmitted | program.raw,
+        )
+    else:
+        te, tm = tabulation.look_up(program.lookup, table, program.wavelength)
     material, solid_angle, cosine, scattered, specular, backward = program.diffuse
     f_s = pattern_value(table[material], material, cosine, scattered, specular, backward, program.patterns)
-    local = Local(
-        te=(te[0] * factor, te[1] * factor),
-        tm=(tm[0] * factor, tm[1] * factor),
-        amplitude=column["scattering_coefficient"][material] * _safe_sqrt(f_s * solid_angle),
-        xpd=column["xpd_coefficient"][material],
+    scattering = table[material, _FIELD["scattering_coefficient"]]
+    return Local(
+        te=te,
+        tm=tm,
+        amplitude=scattering * slab.safe_sqrt(f_s * solid_angle),
+        xpd=table[material, _FIELD["xpd_coefficient"]],
     )
-    return slab.keep(local, program.wavelength)
 
 
 def _group_gains(group: Group, local: Local) -> slab.Pair:
@@ -372,9 +383,9 @@ def _scatter(
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
     incident = _power(te) + _power(tm)
     reflected = _power(r_te) * _power(te) + _power(r_tm) * _power(tm)
-    strength = amplitude * _safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0))  # Gamma = |R E| / |E|
+    strength = amplitude * slab.safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0))  # Gamma = |R E| / |E|
     theta, phi = _turn(turn, te, tm)  # the XPD matrix acts in the basis (theta, phi)
-    straight, crossed = strength * _safe_sqrt(1 - xpd), strength * _safe_sqrt(xpd)
+    straight, crossed = strength * slab.safe_sqrt(1 - xpd), strength * slab.safe_sqrt(xpd)
     return (
         (straight * theta[0] - crossed * phi[0], straight * theta[1] - crossed * phi[1]),
         (crossed * theta[0] + straight * phi[0], crossed * theta[1] + straight * phi[1]),
@@ -400,12 +411,6 @@ def _power(value: slab.Pair) -> jax.Array:
     return value[0] * value[0] + value[1] * value[1]
 
 
-def _safe_sqrt(value: jax.Array) -> jax.Array:
-    """Square root with derivative 0 instead of infinity at 0."""
-    positive = value > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
-
-
 def gains(program: Program, local: Local) -> slab.Pair:
     """Path gains from what the materials contribute.
 
@@ -426,66 +431,108 @@ def gains(program: Program, local: Local) -> slab.Pair:
 def program_path_loss(
     program: Program, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
 ) -> jax.Array:
-    """Path loss of every link of a program.
+    """Path loss of every link of a program, as one pure function.
 
     Args:
         program: The program.
         table: Material constants [M, 8].
         combining: "power", "coherent" or "band".
-        offsets: For "band": quadrature over the band, frequencies relative to the carrier [Hz] and weights [2, q].
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
 
     Returns:
         Path loss [L], [dB]; +inf where a link has no path.
     """
-    return decibel(_program_power(program, local_values(program, table), combining, offsets))
+    local = slab.keep(local_values(program, table), program.wavelength)
+    return decibel(program_power(program, local, combining, offsets))
 
 
-def program_path_loss_and_jacobian(
-    program: Program,
-    table: jax.Array,
-    columns: tuple[int, ...],
-    combining: str = "power",
-    offsets: jax.Array | None = None,
-) -> tuple[jax.Array, jax.Array]:
-    """Path loss of every link and its derivatives by the constants of the materials.
-
-    Every path belongs to one link and every interaction to one material. So one reverse pass over the summed power
-    gives each link's derivative by each interaction's contribution, and one forward pass for every field, over all
-    materials at once, gives the contribution's derivative: the cost does not grow with the number of materials.
+def local_tangents(program: Program, table: jax.Array, columns: tuple[int, ...]) -> tuple[Local, tuple[Local, ...]]:
+    """What the materials contribute, and its derivatives by each interaction's own material.
 
     Args:
         program: The program.
         table: Material constants [M, 8].
         columns: Columns of the table to derive by.
+
+    Returns:
+        The contributions, and their derivatives by each column.
+    """
+    local, push = jax.linearize(partial(local_values, program), table)
+    return local, tuple(push(jnp.zeros_like(table).at[:, column].set(1.0)) for column in columns)
+
+
+def power_and_slope(
+    program: Program, local: Local, combining: str = "power", offsets: jax.Array | None = None
+) -> tuple[jax.Array, Local]:
+    """Power gain of every link, and its derivative by every contribution of the materials.
+
+    Every path belongs to one link, so one reverse pass over the summed power gives the derivatives of all links.
+
+    Args:
+        program: The program.
+        local: The contributions.
         combining: "power", "coherent" or "band".
         offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
 
     Returns:
-        Path loss [L], [dB], and derivatives [L, M, columns], [dB] per unit; 0 where a link has no path.
+        Power gain [L], and the derivatives in the form of the contributions.
     """
-    local, push = jax.linearize(partial(local_values, program), table)
-    power, pull = jax.vjp(lambda local: _program_power(program, local, combining, offsets), local)
-    (slope,) = slab.keep(pull(jnp.ones_like(power)), program.wavelength)
-    bins = program.num_links * table.shape[0]
+    power, pull = jax.vjp(lambda local: program_power(program, local, combining, offsets), local)
+    (slope,) = pull(jnp.ones_like(power))
+    return power, slope
+
+
+def decibel_slope(
+    program: Program, power: jax.Array, slope: Local, tangents: tuple[Local, ...], num_materials: int
+) -> jax.Array:
+    """Derivatives of path loss by the constants of the materials, from the two passes.
+
+    Every interaction belongs to one material, so one tangent per field serves all materials at once: the cost does not
+    grow with their number.
+
+    Args:
+        program: The program.
+        power: Power gain of every link [L].
+        slope: Derivative of the power by the contributions.
+        tangents: Derivatives of the contributions, one per field.
+        num_materials: Number of materials M.
+
+    Returns:
+        Derivatives [L, M, fields], [dB] per unit; 0 where a link has no path.
+    """
+    bins = program.num_links * num_materials
+    by_coefficient, by_diffuse = (
+        program.owner[0] * num_materials + program.material,
+        program.owner[1] * num_materials + program.diffuse[0],
+    )
     parts = []
-    for column in columns:
-        tangent = slab.keep(push(jnp.zeros_like(table).at[:, column].set(1.0)), program.wavelength)
-        by_coefficient = sum(
-            a * b
-            for side in ("te", "tm")
-            for a, b in zip(getattr(slope, side), getattr(tangent, side), strict=True)
+    for tangent in tangents:
+        rise = sum(
+            a * b for side in ("te", "tm") for a, b in zip(getattr(slope, side), getattr(tangent, side), strict=True)
         )
-        by_diffuse = slope.amplitude * tangent.amplitude + slope.xpd * tangent.xpd
-        total = jax.ops.segment_sum(by_coefficient, program.owner[0] * table.shape[0] + program.material, bins)
+        total = jax.ops.segment_sum(rise, by_coefficient, bins)
         if program.owner[1].shape[0]:
-            total += jax.ops.segment_sum(by_diffuse, program.owner[1] * table.shape[0] + program.diffuse[0], bins)
-        parts.append(total.reshape(program.num_links, -1))
+            rise = slope.amplitude * tangent.amplitude + slope.xpd * tangent.xpd
+            total += jax.ops.segment_sum(rise, by_diffuse, bins)
+        parts.append(total.reshape(program.num_links, num_materials))
     inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
-    derivative = jnp.stack(parts, axis=-1) if parts else jnp.zeros((program.num_links, table.shape[0], 0))
-    return decibel(power), -10 / np.log(10) * inverse[:, None, None] * derivative
+    return -10 / np.log(10) * inverse[:, None, None] * jnp.stack(parts, axis=-1)
 
 
-def _program_power(program: Program, local: Local, combining: str, offsets: jax.Array | None) -> jax.Array:
+def program_power(
+    program: Program, local: Local, combining: str = "power", offsets: jax.Array | None = None
+) -> jax.Array:
+    """Power gain of every link of a program.
+
+    Args:
+        program: The program.
+        local: The contributions of the materials.
+        combining: "power", "coherent" or "band".
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Power gain [L]; 0 where a link has no path.
+    """
     frequency = speed_of_light / program.wavelength
     return link_power(
         gains(program, local), program.link, program.delay, program.num_links, frequency, combining, offsets
@@ -577,7 +624,8 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
         InputError: A material is unknown.
     """
     plan = layout(paths)
-    real, imaginary = _compiled_gains(plan.program, jnp.asarray(constants(paths, materials)))
+    local = _local_values(plan.program, jnp.asarray(constants(paths, materials)))
+    real, imaginary = _gains(plan.program, local)
     found = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
     found[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
     return found[:, 0, 0] if found.shape[1:] == (1, 1) else found
@@ -606,7 +654,8 @@ def path_loss(
     """
     offsets = check_combining(paths, combining, bandwidth)
     program = layout(paths).program
-    return np.asarray(_compiled_path_loss(program, jnp.asarray(constants(paths, materials)), combining, offsets))
+    local = _local_values(program, jnp.asarray(constants(paths, materials)))
+    return np.asarray(decibel(_program_power(program, local, combining, offsets)))
 
 
 def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np.ndarray | None:
@@ -628,9 +677,7 @@ def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np
     return band_quadrature(paths.link, paths.delay, bandwidth) if combining == "band" else None
 
 
-@jax.jit
-def _compiled_gains(program: Program, table: jax.Array) -> slab.Pair:
-    return gains(program, local_values(program, table))
-
-
-_compiled_path_loss = jax.jit(program_path_loss, static_argnames="combining")
+# Compiled apart: XLA on CPU would otherwise fuse the first stage into each of its uses, and repeat it there.
+_local_values = jax.jit(local_values)
+_gains = jax.jit(gains)
+_program_power = jax.jit(program_power, static_argnames="combining")

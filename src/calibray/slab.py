@@ -78,7 +78,20 @@ def coefficients(
             (eta_cosine[0] - root[0], eta_cosine[1] - root[1]), (eta_cosine[0] + root[0], eta_cosine[1] + root[1])
         ),  # eq. 37b
     )
-    return tuple(_slab(single, phase, across, transmitted) for single in half)
+    return tuple(_slab(single, phase, across, transmitted) for single in keep(half, wavelength))
+
+
+def safe_sqrt(value: jax.Array) -> jax.Array:
+    """Square root with derivative 0 instead of infinity at 0.
+
+    Args:
+        value: At least 0 [...].
+
+    Returns:
+        The root [...].
+    """
+    positive = value > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
 def _slab(half: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
