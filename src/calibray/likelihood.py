@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import stdtrit
 
 from calibray.errors import EngineError, InputError
 from calibray.measurements import Measurements
 
-CONFIDENCE: Final = 1.96  # standard errors either side of a 95 % interval
+CONFIDENCE: Final = 0.95
 
 
 @dataclass(frozen=True)
@@ -199,16 +200,17 @@ def intervals(
         One interval per parameter.
     """
     freedom = max(len(residuals) - len(best) - nuisances, 1)
+    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # Student's t: standard errors either side
     variance = float(residuals @ residuals) / freedom
     values, vectors = np.linalg.eigh((scaled := jacobian * (upper - lower)).T @ scaled)
     values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
     errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
     found = []
     for value, error, low, high in zip(best, errors, lower, upper, strict=True):
-        ends = max(value - CONFIDENCE * error, low), min(value + CONFIDENCE * error, high)
+        ends = max(value - reach * error, low), min(value + reach * error, high)
         span = high - low
         verdict = "identified"
-        if 2 * CONFIDENCE * error > span / 2:
+        if 2 * reach * error > span / 2:
             verdict = "not identifiable"
         elif min(value - low, high - value) < 1e-6 * span:
             verdict = "at bound"
