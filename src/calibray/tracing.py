@@ -339,7 +339,7 @@ class Tracer:
             return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
         buffer = chunk.buffer
         valid = mi.Bool(buffer.valid)
-        count = len(np.unique(chunk.link)) if False else dr.width(chunk.target)
+        count = dr.width(chunk.target)
         found = self._fields(
             wavelength=self._scene.wavelength,
             paths=buffer,
@@ -348,10 +348,11 @@ class Tracer:
             src_positions=chunk.source,
             tgt_positions=chunk.target,
             src_orientations=_points(np.array([self.tx_antenna.orientation])),
-            tgt_orientations=_points(np.tile(self.rx_antenna.orientation, (dr.width(chunk.target), 1))),
+            tgt_orientations=_points(np.tile(self.rx_antenna.orientation, (count, 1))),
             src_antenna_patterns=_patterns(self.tx_antenna),
             tgt_antenna_patterns=_patterns(self.rx_antenna),
         )
+        dr.eval(found.a, found.tau)  # at once: every array read on its own would run the whole stage again
         buffer.valid = valid  # the field stage narrows it
         return np.array([[_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
 
