@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibray import fields, tabulation
+from calibray import cache, fields, tabulation
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths
-from calibray.scene import read_scene
+from calibray.scene import Scene, read_scene
 from calibray.study import Study
 from calibray.tracing import Tracer
 
@@ -270,12 +270,53 @@ def make(study: Study, name: str | None = None, progress: Progress | None = None
     if name not in ENGINES:
         raise InputError(f"engine {name!r}: must be one of {', '.join(ENGINES)}")
     links = study.measurements()
-    tracer = make_tracer(study)
-    parameters = study.parameter_set(tracer.scene.materials)
+    scene = make_scene(study)
+    parameters = study.parameter_set(scene.materials)
     options = study.objective.combining, study.scene.bandwidth
     if name == "retrace":
-        return Retrace(tracer, links, parameters, *options, progress)
-    return Replay(tracer.trace(links, progress).paths(), parameters, *options)
+        return Retrace(_tracer(study, scene), links, parameters, *options, progress)
+    return Replay(traced_paths(study, scene, links, progress), parameters, *options)
+
+
+def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Progress | None = None) -> Paths:
+    """The paths of some links in a study's scene, from the cache if they were traced before.
+
+    Args:
+        study: The study.
+        scene: Its scene, with the materials to trace with.
+        links: The links.
+        progress: Called with (receivers traced, receivers in all) after every chunk.
+
+    Returns:
+        The path program.
+    """
+    antennas = study.antennas.tx, study.antennas.rx
+    digest = cache.trace_digest(scene, study.scene.frequency, study.trace, antennas, links.tx, links.rx)
+    paths = cache.find(digest)
+    if paths is None:
+        paths = _tracer(study, scene).trace(links, progress).paths()
+        cache.keep(digest, paths)
+    return paths
+
+
+def make_scene(study: Study, materials: dict[str, Material] | None = None) -> Scene:
+    """A study's scene.
+
+    Args:
+        study: The study.
+        materials: Constants in place of the scene's, by name; None for the scene's with the parameters' starts.
+
+    Returns:
+        The scene, with the materials to trace with.
+
+    Raises:
+        InputError: The scene or the parameters cannot be used.
+    """
+    scene = read_scene(study.scene_source, study.scene.frequency, {**study.overrides, **(materials or {})})
+    if materials is None:  # what is sampled while tracing, as diffuse reflection is, follows the materials
+        parameters = study.parameter_set(scene.materials)
+        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
+    return scene
 
 
 def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> Tracer:
@@ -291,10 +332,10 @@ def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> T
     Raises:
         InputError: The scene or the parameters cannot be used.
     """
-    scene = read_scene(study.scene_source, study.scene.frequency, {**study.overrides, **(materials or {})})
-    if materials is None:  # what is sampled while tracing, as diffuse reflection is, follows the materials
-        parameters = study.parameter_set(scene.materials)
-        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
+    return _tracer(study, make_scene(study, materials))
+
+
+def _tracer(study: Study, scene: Scene) -> Tracer:
     return Tracer(scene, study.scene.frequency, study.trace, study.antennas.tx, study.antennas.rx)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import fields
-from calibray.engines import make_tracer
+from calibray.engines import make_scene, traced_paths
 from calibray.errors import InputError
 from calibray.files import check_folder, write_text
 from calibray.likelihood import Interval
@@ -168,7 +168,7 @@ class Result:
         per = self.study.offset.per if self.study.offset else None
         wanted = links if isinstance(links, Measurements) else links_from_frame(links, group=per)
         offset = self._offset(wanted)
-        paths = make_tracer(self.study, self.materials).trace(wanted, progress).paths()
+        paths = traced_paths(self.study, make_scene(self.study, self.materials), wanted, progress)
         objective = self.study.objective
         return fields.path_loss(paths, None, objective.combining, self.study.scene.bandwidth) + offset
 

@@ -1,0 +1,116 @@
+"""Traces kept between runs: the same scene, links, antennas, settings and versions are traced once.
+
+The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` switches it off.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import numpy as np
+
+from calibray.errors import InputError
+from calibray.paths import SCHEMA_VERSION, Paths
+from calibray.scene import Scene
+from calibray.settings import Antenna, TraceSettings
+
+VARIABLE: Final = "CALIBRAY_CACHE"
+
+
+def trace_digest(
+    scene: Scene,
+    frequency: float,
+    settings: TraceSettings,
+    antennas: tuple[Antenna, Antenna],
+    tx: np.ndarray,
+    rx: np.ndarray,
+) -> str:
+    """What a trace depends on, as a fingerprint.
+
+    Args:
+        scene: The scene; its materials count, because they steer which rays are followed.
+        frequency: Carrier frequency [Hz].
+        settings: The tracer's switches.
+        antennas: Transmit and receive antenna.
+        tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+
+    Returns:
+        SHA-256 in hexadecimal.
+    """
+    record = {
+        "versions": [version("calibray"), version("sionna-rt"), version("mitsuba"), version("drjit"), SCHEMA_VERSION],
+        "frequency": frequency,
+        "settings": settings.record(),
+        "antennas": [asdict(antenna) for antenna in antennas],
+        "materials": {name: asdict(material) for name, material in scene.materials.items()},
+        "objects": [asdict(entry) for entry in scene.objects],
+    }
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
+    digest.update(scene.xml.encode())
+    for mesh in _meshes(scene):
+        digest.update(mesh.read_bytes())
+    for position in (tx, rx):
+        digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def find(digest: str) -> Paths | None:
+    """The trace with a fingerprint, or None if there is none that can be read.
+
+    Args:
+        digest: The fingerprint.
+
+    Returns:
+        The path program, or None.
+    """
+    path = _path(digest)
+    if path is None or not path.is_file():
+        return None
+    try:
+        return Paths.load(path)
+    except InputError:  # left by another version, or damaged: trace again
+        path.unlink(missing_ok=True)
+        return None
+
+
+def keep(digest: str, paths: Paths) -> None:
+    """Keep a trace; where the folder cannot be written, it is simply not kept.
+
+    Args:
+        digest: Its fingerprint.
+        paths: The path program.
+    """
+    path = _path(digest)
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        paths.save(path)
+    except (OSError, InputError):
+        return
+
+
+def _path(digest: str) -> Path | None:
+    folder = os.environ.get(VARIABLE)
+    if folder == "":
+        return None
+    if folder is None:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "calibray"
+    return Path(folder) / f"{digest}.h5"
+
+
+def _meshes(scene: Scene) -> Iterator[Path]:
+    for shape in ElementTree.fromstring(scene.xml).findall("shape"):
+        filename = shape.find("string[@name='filename']")
+        if filename is not None:
+            yield scene.path.parent / filename.get("value", "")
