@@ -14,6 +14,8 @@ _HOME = {
     "Measurements": "calibray.measurements",
     "read_measurements": "calibray.measurements",
     "Paths": "calibray.paths",
+    "channel_statistics": "calibray.channel",
+    "power_delay_profile": "calibray.channel",
     "trace": "calibray.tracing",
     "path_gains": "calibray.fields",
     "path_loss": "calibray.fields",

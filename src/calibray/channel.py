@@ -1,0 +1,149 @@
+"""What else stored paths tell about a link, for any materials: delays, angles and power delay profiles.
+
+All are weighted means over a link's paths with the paths' powers as weights, so they follow the materials as smoothly
+as path loss does and are differentiable by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibray import fields
+from calibray.errors import InputError
+from calibray.fields import Program
+from calibray.materials import Material
+from calibray.paths import Paths
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["mean_delay", "delay_spread", "k_factor_db", "departure_spread", "arrival_spread"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class ChannelStatistics:
+    """Second-order statistics of every link; NaN where a link has no path.
+
+    Attributes:
+        mean_delay: Mean delay [L], [s].
+        delay_spread: Root mean square delay spread [L], [s] (ITU-R P.1407-8 eq. 3).
+        k_factor_db: Power of the strongest path over that of all others [L], [dB]; +inf for a single path.
+        departure_spread: Azimuth spread of departure [L], [rad] (3GPP TR 38.901 annex A.1).
+        arrival_spread: Azimuth spread of arrival [L], [rad].
+    """
+
+    mean_delay: jax.Array
+    delay_spread: jax.Array
+    k_factor_db: jax.Array
+    departure_spread: jax.Array
+    arrival_spread: jax.Array
+
+
+def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = None) -> ChannelStatistics:
+    """Delay spread, K-factor and angular spreads of every link for any materials.
+
+    Args:
+        paths: The path program.
+        materials: Constants by name; materials not named keep those of the trace.
+
+    Returns:
+        The statistics, as NumPy arrays.
+
+    Raises:
+        InputError: A material is unknown.
+    """
+    plan = fields.layout(paths)
+    azimuth = jnp.asarray(paths.departure[plan.order, 1]), jnp.asarray(paths.arrival[plan.order, 1])
+    found = _statistics(plan.program, jnp.asarray(fields.constants(paths, materials)), *azimuth)
+    return jax.tree.map(np.asarray, found)
+
+
+@jax.jit
+def _statistics(program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array) -> ChannelStatistics:
+    return statistics(program, path_power(program, table), departure, arrival)
+
+
+def path_power(program: Program, table: jax.Array) -> jax.Array:
+    """Power gain of every path, summed over receive ports and averaged over transmit ports.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+
+    Returns:
+        Power gains in the order of the program [P].
+    """
+    real, imaginary = fields.gains(program, fields.local_values(program, table))
+    return (real**2 + imaginary**2).sum(axis=(0, 1)) / real.shape[1]
+
+
+def statistics(program: Program, power: jax.Array, departure: jax.Array, arrival: jax.Array) -> ChannelStatistics:
+    """Statistics of every link from its paths' powers.
+
+    Args:
+        program: The program.
+        power: Power gain of every path [P].
+        departure: Azimuth of departure of every path [P], [rad].
+        arrival: Azimuth of arrival of every path [P], [rad].
+
+    Returns:
+        The statistics.
+    """
+    total = partial(jax.ops.segment_sum, segment_ids=program.link, num_segments=program.num_links)
+    whole = total(power)
+    reached = whole > 0
+    divisor = jnp.where(reached, whole, 1.0)
+
+    def mean(value: jax.Array) -> jax.Array:
+        return jnp.where(reached, total(power * value) / divisor, jnp.nan)
+
+    mean_delay = mean(program.delay)
+    late = program.delay - jnp.nan_to_num(mean_delay)[program.link]
+    strongest = jax.ops.segment_max(power, program.link, program.num_links)
+    rest = whole - strongest
+    ratio = jnp.where(rest > 0, strongest / jnp.where(rest > 0, rest, 1.0), jnp.inf)
+
+    def spread(angle: jax.Array) -> jax.Array:
+        resultant = jnp.hypot(mean(jnp.cos(angle)), mean(jnp.sin(angle)))
+        return jnp.sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
+
+    return ChannelStatistics(
+        mean_delay=mean_delay,
+        delay_spread=jnp.sqrt(mean(late**2)),
+        k_factor_db=jnp.where(reached, 10 * jnp.log10(ratio), jnp.nan),
+        departure_spread=spread(departure),
+        arrival_spread=spread(arrival),
+    )
+
+
+def power_delay_profile(
+    paths: Paths, delays: np.ndarray, materials: Mapping[str, Material] | None = None
+) -> np.ndarray:
+    """Power gain of every link by delay.
+
+    Args:
+        paths: The path program.
+        delays: Edges of the delay bins, increasing [n + 1], [s].
+        materials: Constants by name; materials not named keep those of the trace.
+
+    Returns:
+        Power gains [L, n]; paths outside the edges are left out.
+
+    Raises:
+        InputError: The edges do not increase, or a material is unknown.
+    """
+    edges = np.asarray(delays, dtype=float)
+    if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
+        raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
+    program = fields.layout(paths).program
+    power = np.asarray(jax.jit(path_power)(program, jnp.asarray(fields.constants(paths, materials))))
+    place = np.searchsorted(edges, np.asarray(program.delay), side="right") - 1
+    inside = (place >= 0) & (place < len(edges) - 1)
+    bins = np.asarray(program.link)[inside] * (len(edges) - 1) + place[inside]
+    return np.bincount(bins, power[inside], paths.num_links * (len(edges) - 1)).reshape(paths.num_links, -1)
