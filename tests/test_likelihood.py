@@ -1,4 +1,4 @@
-"""The objective against numerical optima and finite differences, intervals against linear theory and simulation."""
+"""The objective against numerical optima and finite differences, intervals against theory and simulation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,11 @@ def objective(groups: bool = True, calibrated: np.ndarray | None = None, **optio
 def model(candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A smooth model of two parameters: path loss [n, L] and derivatives [n, L, 2]."""
     rng = np.random.default_rng(8)
-    base, a, b = campaign().path_loss_db + rng.normal(0, 4, LINKS), rng.normal(0, 3, LINKS), rng.uniform(0, 5, LINKS)
+    base, a, b = (
+        campaign().path_loss_db + rng.normal(0, 4, LINKS),
+        rng.normal(0, 3, LINKS),
+        rng.uniform(0, 5, LINKS),
+    )
     x, y = candidates[:, :1], candidates[:, 1:]
     return base + a * x + b * np.sin(y), np.stack([a + 0 * x, b * np.cos(y)], axis=-1)
 
@@ -77,7 +81,9 @@ def test_offsets_in_closed_form_are_the_numerical_optimum(groups, bounds):
     for k, name in enumerate(links.group_names):
         mine = links.group_index == k
         found = minimize_scalar(
-            lambda shift, mine=mine: np.sum(links.weight[mine] * (loss[0] + shift - links.path_loss_db)[mine] ** 2),
+            lambda shift, mine=mine: np.sum(
+                links.weight[mine] * (loss[0] + shift - links.path_loss_db)[mine] ** 2
+            ),
             bounds=bounds or (-50, 50),
             method="bounded",
             options={"xatol": 1e-9},
@@ -94,7 +100,9 @@ def test_an_offset_of_links_that_are_all_held_out_is_zero():
     assert (offset[[0, 2]] != 0.0).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"offset": True}, {"offset": True, "bounds": (-0.3, 0.3)}, {"ceiling_db": 101.0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"offset": True}, {"offset": True, "bounds": (-0.3, 0.3)}, {"ceiling_db": 101.0}]
+)
 def test_derivatives_with_offsets_eliminated_are_the_finite_differences(options):
     target = objective(calibrated=np.arange(LINKS) % 7 != 0, **options)
     at = np.array([[0.3, 0.9], [-1.0, 2.0]])
@@ -115,7 +123,9 @@ def test_fitting_with_offsets_eliminated_is_fitting_them_too():
         return weighted_rmse(gap, links.weight)
 
     joint = minimize(full, np.zeros(5), method="BFGS", options={"gtol": 1e-9})
-    reduced = minimize(lambda x: target.rmse(model(x[None])[0])[0], np.zeros(2), method="BFGS", options={"gtol": 1e-9})
+    reduced = minimize(
+        lambda x: target.rmse(model(x[None])[0])[0], np.zeros(2), method="BFGS", options={"gtol": 1e-9}
+    )
     assert reduced.fun == pytest.approx(joint.fun, abs=1e-8)
     assert reduced.x == pytest.approx(joint.x[:2], abs=1e-4)
     assert target.offsets(model(reduced.x[None])[0])[0] == pytest.approx(joint.x[2:], abs=1e-4)
@@ -134,13 +144,15 @@ def test_a_ceiling_censors_before_the_offset():
 
 def test_no_link_to_calibrate_on_is_refused():
     links, nothing = campaign(), np.zeros(LINKS, dtype=bool)
-    with pytest.raises(InputError, match=r"no path leads to any of 30 links to calibrate on; raise trace.max_depth"):
+    with pytest.raises(
+        InputError, match=r"no path leads to any of 30 links to calibrate on; raise trace.max_depth"
+    ):
         make_objective(links, nothing, ~nothing)
     assert make_objective(links, nothing, ~nothing, ceiling_db=120.0).weight.tolist() == links.weight.tolist()
 
 
 def linear_problem(noise: np.ndarray, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares of y = D theta (+ c) + noise: the optimum [d], residuals [m], and Jacobian with c eliminated."""
+    """Least squares of y = D theta (+ c) + noise: optimum [d], residuals [m], Jacobian without c [m, d]."""
     design = np.random.default_rng(2).normal(size=(len(noise), 2)) @ np.array([[3.0, 1.0], [0.0, 0.4]]) + 1.0
     slope = design - design.mean(axis=0) if offset else design
     y = design @ TRUTH + noise - (noise.mean() + (design @ TRUTH).mean() if offset else 0.0)
@@ -165,7 +177,7 @@ def test_intervals_of_a_linear_problem_are_the_textbook_ones(offset):
 
 
 def coverage(noise: np.ndarray, factor: float = 1.0) -> np.ndarray:
-    """How often the interval, its width scaled by a factor, holds the truth [d], over many campaigns [n, m]."""
+    """How often the interval, its width times a factor, holds the truth [d], over many campaigns [n, m]."""
     hits = np.zeros(2)
     for sample in noise:
         found = intervals(*linear_problem(sample, True), LOWER, UPPER, nuisances=1)
@@ -220,7 +232,10 @@ def test_a_log_distance_law_is_recovered_exactly():
     spoilt = np.where(np.arange(20) == 4, loss + 30, loss)
     left_out = LogDistance.fit(distance, spoilt, np.where(np.arange(20) == 4, 0.0, weight))
     assert left_out.slope_db == pytest.approx(27.0)
-    assert LogDistance.fit(distance, spoilt, weight).slope_db != pytest.approx(27.0, abs=0.1)
+    weighted = LogDistance.fit(distance, spoilt, weight)
+    reference = np.polyfit(np.log10(distance), spoilt, 1, w=np.sqrt(weight))
+    assert (weighted.slope_db, weighted.intercept_db) == pytest.approx(tuple(reference))
+    assert weighted.slope_db != pytest.approx(27.0, abs=0.1)
 
 
 def test_a_log_distance_law_needs_two_links():

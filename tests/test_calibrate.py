@@ -1,0 +1,258 @@
+"""The loop against planted truths: what every method must keep, and what the objective may not see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.optimize import minimize
+
+import planted
+from calibray.calibrate import calibrate, from_search, make_optimizer, search_slope, to_search
+from calibray.errors import InputError
+from calibray.optimizers import METHODS
+from calibray.parameters import Parameter, Parameters
+from calibray.result import Result
+
+PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}
+METHOD_NAMES = ("auto", *METHODS)
+
+
+def run(folder, table: pd.DataFrame, name: str = "auto", seed: int = 0, **sections) -> Result:
+    """Calibrate on some links, with the engine that was traced once."""
+    return calibrate(planted.study(folder, table, **sections), name, seed, engine=planted.engine())
+
+
+@pytest.fixture(scope="module")
+def exact() -> pd.DataFrame:
+    """The links with their exact path loss at the planted values."""
+    return planted.campaign()
+
+
+def test_the_planted_truth_is_not_the_start_and_matters(exact):
+    start = dict(zip(planted.engine().parameters.names, planted.engine().parameters.start, strict=True))
+    assert np.isfinite(exact.path_loss_db).all()
+    for name in planted.TRUTH:
+        moved = planted.path_loss(planted.TRUTH | {name: start[name]})
+        assert np.sqrt(np.mean((moved - exact.path_loss_db) ** 2)) > 0.1
+
+
+@pytest.mark.parametrize("method", ["auto", "least-squares"])
+def test_least_squares_recovers_planted_values(tmp_path, exact, method):
+    result = run(tmp_path, exact, method)
+    assert result.parameters == pytest.approx(planted.TRUTH, abs=1e-4)
+    assert result.rmse_db < 1e-5 < 0.5 < result.initial_rmse_db
+    assert {interval.verdict for interval in result.intervals.values()} == {"identified"}
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_every_method_keeps_the_contract(tmp_path, exact, method):
+    calls = planted.engine().calls
+    result = run(tmp_path, exact, method, seed=4)
+    again = run(tmp_path, exact, method, seed=4)
+    other = run(tmp_path, exact, method, seed=5)
+    # One call before and, for intervals, one after are the loop's and not the method's; see `rt_calls`.
+    overhead = 2
+    assert planted.engine().calls - calls == result.rt_calls + again.rt_calls + other.rt_calls + 3 * overhead
+    assert result.rt_calls == len(result.history) == PAPER_CALLS.get(method, result.rt_calls)
+    assert all(low <= value <= high for (low, high), value in zip(
+        [planted.BOUNDS] * 3, result.parameters.values(), strict=True))  # fmt: skip
+    assert result.rmse_db < 0.5 * result.initial_rmse_db
+    assert result.rmse_db == result.history.rmse_db.min() == result.history.best_db.iloc[-1]
+    assert (np.diff(result.history.best_db) <= 0).all()
+    loss = planted.path_loss(result.parameters)
+    assert np.sqrt(np.mean((loss - exact.path_loss_db) ** 2)) == pytest.approx(result.rmse_db, abs=1e-9)
+    assert again.history.rmse_db.tolist() == result.history.rmse_db.tolist()
+    assert other.history.rmse_db.tolist() != result.history.rmse_db.tolist()
+
+
+def test_auto_reaches_the_optimum_of_a_brute_force_scan(tmp_path):
+    noisy = planted.campaign(noise_db=1.0)
+    replay, measured = planted.engine(), noisy.path_loss_db.to_numpy()
+
+    def rmse(candidates: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.mean((replay.path_loss(candidates) - measured) ** 2, axis=1))
+
+    axis = np.linspace(*planted.BOUNDS, 22)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    scan = rmse(grid)
+    leaders = grid[np.argsort(scan)[:3]]
+    options = {"xatol": 1e-5, "fatol": 1e-9}
+    polished = [
+        minimize(
+            lambda x: rmse(x[None])[0],
+            leader,
+            method="Nelder-Mead",
+            bounds=[planted.BOUNDS] * 3,
+            options=options,
+        ).fun
+        for leader in leaders
+    ]
+    result = run(tmp_path, noisy)
+    assert result.rmse_db <= min(polished) + 1e-6
+    assert 0.3 < result.rmse_db < scan.min()  # with a noise floor, and finer than the scan
+
+
+def test_held_out_links_are_not_looked_at(tmp_path, exact):
+    held_out = exact.rx_x > 10
+    noisy = exact.assign(path_loss_db=exact.path_loss_db + 0.5 * np.random.default_rng(0).standard_normal(12))
+    shift = {
+        "held out": noisy.path_loss_db + 5.0 * held_out,
+        "calibrated on": noisy.path_loss_db + 5.0 * ~held_out * (exact.rx_x > 0),
+    }
+    results = {
+        name: run(tmp_path, noisy.assign(path_loss_db=values), holdout={"where": "rx_x > 10"})
+        for name, values in {"none": noisy.path_loss_db, **shift}.items()
+    }
+    assert results["held out"].parameters == results["none"].parameters
+    assert results["held out"].rmse_db == results["none"].rmse_db
+    assert results["held out"].holdout_rmse_db > results["none"].holdout_rmse_db + 3
+    assert results["calibrated on"].parameters != results["none"].parameters
+    table = results["none"].links
+    assert table.held_out.tolist() == held_out.tolist()
+    error = (table.after_db - table.measured_db)[table.held_out]
+    assert results["none"].holdout_rmse_db == pytest.approx(np.sqrt(np.mean(error**2)))
+
+
+def test_weights_act(tmp_path, exact):
+    wrong = exact.assign(path_loss_db=exact.path_loss_db + 10.0 * (exact.index == 4))
+    trusting = run(tmp_path, wrong, links=planted.content("links.csv")["links"] | {"weight": "weight"})
+    wary = run(
+        tmp_path,
+        wrong.assign(weight=np.where(exact.index == 4, 1e-9, 1.0)),
+        links=planted.content("links.csv")["links"] | {"weight": "weight"},
+    )
+    assert wary.parameters == pytest.approx(planted.TRUTH, abs=1e-3)
+    assert trusting.parameters != pytest.approx(planted.TRUTH, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("offset", "planted_db", "found"),
+    [
+        ({}, {"west": 4.0, "east": 4.0}, {"": 4.0}),
+        ({"per": "half"}, {"west": -3.0, "east": 6.0}, {"west": -3.0, "east": 6.0}),
+        ({"per": "half", "bounds": [-10.0, 10.0]}, {"west": -3.0, "east": 6.0}, {"west": -3.0, "east": 6.0}),
+    ],
+)
+def test_offsets_are_found_beside_the_materials(tmp_path, exact, offset, planted_db, found):
+    shifted = exact.assign(path_loss_db=exact.path_loss_db + exact.half.map(planted_db))
+    result = run(tmp_path, shifted, offset=offset)
+    assert result.offsets_db == pytest.approx(found, abs=1e-4)
+    assert result.parameters == pytest.approx(planted.TRUTH, abs=1e-3)
+    assert result.rmse_db < 1e-4
+    assert result.rmse_db <= result.offset_only_rmse_db <= result.initial_rmse_db
+
+
+def test_an_offset_stays_within_its_bounds(tmp_path, exact):
+    shifted = exact.assign(path_loss_db=exact.path_loss_db + 40.0)  # more than the materials can take up
+    assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).offsets_db == {"": 1.5}
+
+
+def test_without_a_section_there_is_no_offset(tmp_path, exact):
+    result = run(tmp_path, exact.assign(path_loss_db=exact.path_loss_db + 4.0))
+    assert (result.offsets_db, result.offset_only_rmse_db, result.offset_only_holdout_rmse_db) == (
+        {},
+        None,
+        None,
+    )
+    assert result.rmse_db > 0.5
+
+
+def test_a_group_held_out_as_a_whole_has_no_offset_to_be_judged_with(tmp_path, exact):
+    with pytest.raises(InputError, match="group 'east' is held out but has no link to calibrate"):
+        run(tmp_path, exact, offset={"per": "half"}, holdout={"where": "half == 'east'"})
+
+
+def test_the_log_distance_rival_is_fitted_to_the_calibration_links_alone(tmp_path, exact):
+    distance = np.linalg.norm(exact[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    law = exact.assign(path_loss_db=40 + 23 * np.log10(distance) + 9.0 * (exact.rx_x > 10))
+    result = run(tmp_path, law, holdout={"where": "rx_x > 10"})
+    assert result.log_distance_rmse_db == pytest.approx(0, abs=1e-9)
+    assert result.log_distance_holdout_rmse_db == pytest.approx(9.0)
+
+
+@pytest.fixture(scope="module")
+def blocked(tmp_path_factory) -> dict[str, Result]:
+    """Calibrations on links of which one has no path, with that link's value as each of them needs it."""
+    assert np.isinf(planted.path_loss(blocked=True)[planted.INSIDE])
+    folder = tmp_path_factory.mktemp("blocked")
+    measured = planted.campaign(blocked=True)
+
+    def result(at_no_path_db: float, **sections) -> Result:
+        values = measured.path_loss_db.replace(np.inf, at_no_path_db)
+        study = planted.study(folder, measured.assign(path_loss_db=values), **sections)
+        return calibrate(study, engine=planted.engine(blocked=True))
+
+    censored = {"no_path": "censor", "ceiling_db": 120.0}
+    return {
+        "left out": result(75.0),
+        "censored": result(120.0, objective=censored),
+        "censored wrongly": result(75.0, objective=censored),
+        "held out": result(75.0, holdout={"where": "rx_y > 15 or rx_x > 20"}),
+    }
+
+
+def test_a_link_without_a_path_is_told_and_left_out(blocked):
+    result = blocked["left out"]
+    assert result.links.row[~result.links.has_path].tolist() == [planted.INSIDE + 2]
+    assert np.isinf(result.links.before_db[planted.INSIDE])
+    assert np.isinf(result.links.after_db[planted.INSIDE])
+    assert result.parameters == pytest.approx(planted.TRUTH, abs=1e-3)
+    assert result.rmse_db < 1e-4
+
+
+def test_a_censored_link_counts_as_lost_at_the_ceiling(blocked):
+    right, wrong = blocked["censored"], blocked["censored wrongly"]
+    assert right.parameters == pytest.approx(planted.TRUTH, abs=1e-3)
+    assert right.rmse_db < 1e-4
+    assert np.isinf(right.links.after_db[planted.INSIDE])  # the table still says that there is none
+    assert wrong.rmse_db == pytest.approx((120 - 75) / np.sqrt(planted.LINKS), rel=1e-3)
+
+
+def test_a_link_without_a_path_is_not_judged_either(blocked):
+    assert blocked["held out"].holdout_rmse_db < 1e-4
+
+
+def test_a_study_without_any_path_is_refused(tmp_path):
+    measured = planted.campaign(blocked=True).replace(np.inf, 75.0)
+    with pytest.raises(InputError, match="no path leads to any of 1 links to calibrate on; raise"):
+        calibrate(
+            planted.study(tmp_path, measured, holdout={"where": "rx_y < 15"}),
+            engine=planted.engine(blocked=True),
+        )
+
+
+def test_the_search_space_is_the_logarithm_where_asked_for():
+    parameters = Parameters(
+        (
+            Parameter("walls.relative_permittivity", 1.5, 12.0, 5.0),
+            Parameter("walls.conductivity", 1e-3, 1.0, 0.1, "log"),
+        )
+    )
+    values = np.array([[5.0, 0.1], [12.0, 1.0]])
+    points = to_search(parameters, values)
+    assert points.tolist() == [[5.0, np.log(0.1)], [12.0, 0.0]]
+    assert from_search(parameters, points) == pytest.approx(values)
+    step = 1e-6
+    slope = (from_search(parameters, points + step) - from_search(parameters, points - step)) / (2 * step)
+    assert search_slope(parameters, values)[0] == pytest.approx(slope[0])
+    assert make_optimizer("gwo", parameters, 0).ask()[:, 1].max() <= 0.0
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("sgwoim", "method 'sgwoim': there is no such method; did you mean 'sgwo-im'"),
+        ("zzz", "there are: auto"),
+    ],
+)
+def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, message):
+    calls = planted.engine().calls
+    with pytest.raises(InputError, match=message):
+        run(tmp_path, exact, method)
+    assert planted.engine().calls == calls
+
+
+def test_an_option_that_a_method_lacks_is_refused(tmp_path, exact):
+    with pytest.raises(InputError, match=r"method.options of 'gwo'.*wolfes"):
+        run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})
