@@ -47,7 +47,13 @@ def trace_digest(
         SHA-256 in hexadecimal.
     """
     record = {
-        "versions": [version("calibray"), version("sionna-rt"), version("mitsuba"), version("drjit"), SCHEMA_VERSION],
+        "versions": [
+            version("calibray"),
+            version("sionna-rt"),
+            version("mitsuba"),
+            version("drjit"),
+            SCHEMA_VERSION,
+        ],
         "frequency": frequency,
         "settings": settings.record(),
         "antennas": [asdict(antenna) for antenna in antennas],

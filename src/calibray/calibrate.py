@@ -160,7 +160,9 @@ class Run:
     best_rmse_db: float = np.inf
     rt_calls: int = 0
 
-    def add(self, candidates: np.ndarray, loss: np.ndarray, rmse_db: np.ndarray, iteration: int, now: float) -> None:
+    def add(
+        self, candidates: np.ndarray, loss: np.ndarray, rmse_db: np.ndarray, iteration: int, now: float
+    ) -> None:
         """Record one batch of RT calls."""
         self.candidates += list(candidates)
         self.rmse_db += rmse_db.tolist()
@@ -218,7 +220,9 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
             progress("calibrating", len(run.rmse_db), optimizer.budget)
     run.rt_calls = engine.calls - calls
     if not np.isfinite(run.best_rmse_db):
-        raise InputError("every candidate lost the path of some link; exclude those links or use no_path = 'censor'")
+        raise InputError(
+            "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
+        )
     return run
 
 

@@ -65,7 +65,9 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
 
 
 @jax.jit
-def _statistics(program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array) -> ChannelStatistics:
+def _statistics(
+    program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array
+) -> ChannelStatistics:
     return statistics(program, path_power(program, table), departure, arrival)
 
 
@@ -83,7 +85,9 @@ def path_power(program: Program, table: jax.Array) -> jax.Array:
     return (real**2 + imaginary**2).sum(axis=(0, 1)) / real.shape[1]
 
 
-def statistics(program: Program, power: jax.Array, departure: jax.Array, arrival: jax.Array) -> ChannelStatistics:
+def statistics(
+    program: Program, power: jax.Array, departure: jax.Array, arrival: jax.Array
+) -> ChannelStatistics:
     """Statistics of every link from its paths' powers.
 
     Args:

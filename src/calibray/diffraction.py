@@ -64,7 +64,9 @@ def transition(x: np.ndarray) -> np.ndarray:
     return 2j * root * np.exp(1j * x) * modfresnelm(root)[0]
 
 
-def _cotangent_times_transition(psi: np.ndarray, x: np.ndarray, n: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _cotangent_times_transition(
+    psi: np.ndarray, x: np.ndarray, n: np.ndarray, size: np.ndarray
+) -> np.ndarray:
     """cot(psi) F(x), finite where the cotangent's pole meets F's zero, on shadow and reflection boundaries."""
     sine = np.sin(psi)
     pole = np.abs(sine) < 1e-9

@@ -157,14 +157,17 @@ class Replay:
     def _refine(self, tables: jax.Array) -> None:
         """Make the tables of coefficients fine enough for these candidates, and for all that follow."""
         while self._intervals is not None and (
-            float(_table_error(self._program.lookup, tables, self._program.wavelength).max()) > TABLE_TOLERANCE
+            float(_table_error(self._program.lookup, tables, self._program.wavelength).max())
+            > TABLE_TOLERANCE
         ):
             self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
             self._program = fields.layout(self.paths, self._dtype, self._intervals).program
 
 
 # Stages compiled apart, each over a batch of candidates; see `calibray.fields`.
-_tables = jax.jit(lambda base, rows, columns, values: jax.vmap(lambda value: base.at[rows, columns].set(value))(values))
+_tables = jax.jit(
+    lambda base, rows, columns, values: jax.vmap(lambda value: base.at[rows, columns].set(value))(values)
+)
 _local_values = jax.jit(jax.vmap(fields.local_values, in_axes=(None, 0)))
 _table_error = jax.jit(jax.vmap(tabulation.table_error, in_axes=(None, 0, None)))
 
@@ -175,7 +178,9 @@ def _local_tangents(program: fields.Program, tables: jax.Array, columns: tuple[i
 
 
 @partial(jax.jit, static_argnames="combining")
-def _power(program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None) -> jax.Array:
+def _power(
+    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
+) -> jax.Array:
     return jax.vmap(lambda one: fields.program_power(program, one, combining, offsets))(local)
 
 

@@ -78,7 +78,17 @@ class Group:
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
-        "groups", "link", "delay", "wavelength", "material", "cosine", "transmitted", "raw", "diffuse", "owner", "lookup",
+        "groups",
+        "link",
+        "delay",
+        "wavelength",
+        "material",
+        "cosine",
+        "transmitted",
+        "raw",
+        "diffuse",
+        "owner",
+        "lookup",
     ],
     meta_fields=["num_links", "patterns", "any_transmitted"],
 )
@@ -146,7 +156,9 @@ def layout(paths: Paths, dtype: type = np.float64, intervals: int | None = None)
         The grouped program, on JAX's default device.
     """
     depth = np.diff(paths.first)
-    letter = np.select([paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], 1).astype(np.int64)
+    letter = np.select([paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], 1).astype(
+        np.int64
+    )
     code = np.zeros(paths.num_paths, dtype=np.int64)
     for step in range(int(depth.max(initial=0))):
         deep = depth > step
@@ -164,7 +176,9 @@ def layout(paths: Paths, dtype: type = np.float64, intervals: int | None = None)
     kind = paths.kind[interaction]
     lookup = None
     if intervals is not None:
-        mode = np.select([kind == Kind.REFRACTION, kind == Kind.DIFFUSE], [tabulation.TRANSMITTED, tabulation.RAW], 0)
+        mode = np.select(
+            [kind == Kind.REFRACTION, kind == Kind.DIFFUSE], [tabulation.TRANSMITTED, tabulation.RAW], 0
+        )
         lookup = tabulation.make_lookup(paths.material[interaction], mode, cosine, intervals, dtype)
     program = Program(
         groups=groups,
@@ -175,7 +189,10 @@ def layout(paths: Paths, dtype: type = np.float64, intervals: int | None = None)
         cosine=jnp.asarray((cosine if lookup is None else cosine[:0]).astype(dtype)),
         transmitted=jnp.asarray(kind == Kind.REFRACTION),
         raw=jnp.asarray(kind == Kind.DIFFUSE),
-        diffuse=(jnp.asarray(paths.material[rows]), *(jnp.asarray(column.astype(dtype)) for column in columns)),
+        diffuse=(
+            jnp.asarray(paths.material[rows]),
+            *(jnp.asarray(column.astype(dtype)) for column in columns),
+        ),
         owner=(jnp.asarray(owner[interaction]), jnp.asarray(owner[rows])),
         num_links=paths.num_links,
         patterns=tuple(material.scattering_pattern for material in paths.materials.values()),
@@ -236,7 +253,9 @@ def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type
         start.append(first)
         scatter.append(row)
         rows = flat.table_row[interaction]
-        turn.append(jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if kind == Kind.DIFFUSE else None)
+        turn.append(
+            jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if kind == Kind.DIFFUSE else None
+        )
         form = affine_form(paths.diffraction, rows, paths.frequency) if kind == Kind.DIFFRACTION else None
         wedge.append(None if form is None else _parts(form, dtype))
     scale = paths.spreading[index] * speed_of_light / paths.frequency / (4 * np.pi)
@@ -274,7 +293,9 @@ def constants(paths: Paths, materials: Mapping[str, Material] | None = None) -> 
     materials = materials or {}
     unknown = set(materials) - set(paths.materials)
     if unknown:
-        raise InputError(f"no material {sorted(unknown)[0]!r} in the traced scene; it has {', '.join(paths.materials)}")
+        raise InputError(
+            f"no material {sorted(unknown)[0]!r} in the traced scene; it has {', '.join(paths.materials)}"
+        )
     for name, material in materials.items():
         traced = paths.materials[name].scattering_pattern
         if material.scattering_pattern != traced:
@@ -348,7 +369,9 @@ def _group_gains(group: Group, local: Local) -> slab.Pair:
             amplitude, xpd = (value[first : first + group.size] for value in (local.amplitude, local.xpd))
             te, tm = _scatter(te, tm, c_te, c_tm, amplitude, xpd, group.turn[step])
         else:
-            n_te, n_tm = (_slice(pair, group.start[step] + group.size, group.size) for pair in (local.te, local.tm))
+            n_te, n_tm = (
+                _slice(pair, group.start[step] + group.size, group.size) for pair in (local.te, local.tm)
+            )
             te, tm = _diffract(te, tm, (c_te, c_tm, n_te, n_tm), group.wedge[step])
     real = imaginary = 0.0
     for component, field in enumerate((te, tm)):  # E_rx^H E
@@ -360,7 +383,10 @@ def _group_gains(group: Group, local: Local) -> slab.Pair:
 
 def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
     cos, sin = rotation
-    return (cos * a[0] + sin * b[0], cos * a[1] + sin * b[1]), (cos * b[0] - sin * a[0], cos * b[1] - sin * a[1])
+    return (cos * a[0] + sin * b[0], cos * a[1] + sin * b[1]), (
+        cos * b[0] - sin * a[0],
+        cos * b[1] - sin * a[1],
+    )
 
 
 def _times(a: slab.Pair, b: slab.Pair) -> slab.Pair:
@@ -383,7 +409,9 @@ def _scatter(
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
     incident = _power(te) + _power(tm)
     reflected = _power(r_te) * _power(te) + _power(r_tm) * _power(tm)
-    strength = amplitude * slab.safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0))  # Gamma = |R E| / |E|
+    strength = amplitude * slab.safe_sqrt(
+        reflected / jnp.where(incident > 0, incident, 1.0)
+    )  # Gamma = |R E| / |E|
     theta, phi = _turn(turn, te, tm)  # the XPD matrix acts in the basis (theta, phi)
     straight, crossed = strength * slab.safe_sqrt(1 - xpd), strength * slab.safe_sqrt(xpd)
     return (
@@ -446,7 +474,9 @@ def program_path_loss(
     return decibel(program_power(program, local, combining, offsets))
 
 
-def local_tangents(program: Program, table: jax.Array, columns: tuple[int, ...]) -> tuple[Local, tuple[Local, ...]]:
+def local_tangents(
+    program: Program, table: jax.Array, columns: tuple[int, ...]
+) -> tuple[Local, tuple[Local, ...]]:
     """What the materials contribute, and its derivatives by each interaction's own material.
 
     Args:
@@ -508,7 +538,9 @@ def decibel_slope(
     parts = []
     for tangent in tangents:
         rise = sum(
-            a * b for side in ("te", "tm") for a, b in zip(getattr(slope, side), getattr(tangent, side), strict=True)
+            a * b
+            for side in ("te", "tm")
+            for a, b in zip(getattr(slope, side), getattr(tangent, side), strict=True)
         )
         total = jax.ops.segment_sum(rise, by_coefficient, bins)
         if program.owner[1].shape[0]:

@@ -102,7 +102,9 @@ def compile_chains(chains: Chains) -> Program:
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
 
-    out_of = np.tile([1.0, 0.0], (count, 1))  # rotation from the last interaction's frame into the basis (theta, phi)
+    out_of = np.tile(
+        [1.0, 0.0], (count, 1)
+    )  # rotation from the last interaction's frame into the basis (theta, phi)
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[np.ndarray, ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
@@ -127,7 +129,12 @@ def compile_chains(chains: Chains) -> Program:
         if diffuse.any():
             some, k_in, k_out = row[diffuse], incident[diffuse], leaving[diffuse]
             tables[Kind.DIFFUSE].append(
-                (some, np.full(len(some), step), *_diffuse(k_in, k_out, normal[diffuse], entering[diffuse]), solid_angle[some])
+                (
+                    some,
+                    np.full(len(some), step),
+                    *_diffuse(k_in, k_out, normal[diffuse], entering[diffuse]),
+                    solid_angle[some],
+                )
             )
             exiting[diffuse], onward[diffuse] = spherical_basis(k_out, pole_reference=False), k_out
             solid_angle[some] = 2 * np.pi
@@ -184,13 +191,18 @@ def spherical_basis(direction: np.ndarray, pole_reference: bool = True) -> np.nd
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
     pole = rho < 1e-6
-    cos_phi, sin_phi = np.where(pole, 1.0, x / np.where(pole, 1.0, rho)), np.where(pole, 0.0, y / np.where(pole, 1.0, rho))
+    cos_phi, sin_phi = (
+        np.where(pole, 1.0, x / np.where(pole, 1.0, rho)),
+        np.where(pole, 0.0, y / np.where(pole, 1.0, rho)),
+    )
     theta = np.stack([z * cos_phi, z * sin_phi, -rho], axis=-1)
     if not pole_reference:
         return theta
     reference = np.array([-1.0, 0.0, 0.0])
     fallback = reference - _dot(direction, reference)[..., None] * direction
-    near = np.abs(np.float32(z)) > np.float32(1 - 5e-7)  # the bound is met in single precision, as Sionna computes it
+    near = np.abs(np.float32(z)) > np.float32(
+        1 - 5e-7
+    )  # the bound is met in single precision, as Sionna computes it
     return np.where(near[..., None], _unit(np.where(near[..., None], fallback, reference)), theta)
 
 
@@ -243,7 +255,9 @@ def zenith_azimuth(direction: np.ndarray) -> np.ndarray:
     return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=-1)
 
 
-def _diffuse(incident: np.ndarray, leaving: np.ndarray, normal: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, ...]:
+def _diffuse(
+    incident: np.ndarray, leaving: np.ndarray, normal: np.ndarray, frame: np.ndarray
+) -> tuple[np.ndarray, ...]:
     mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
     return (
         rotate(incident, frame, spherical_basis(incident, pole_reference=False)),
@@ -262,7 +276,7 @@ def _wedge(
     before: np.ndarray,
     after: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Constants of a wedge diffraction (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5), as Sionna RT has them."""
+    """Constants of a wedge diffraction as Sionna RT has them (Kouyoumjian and Pathak 1974; ITU-R P.526-15, 4.5)."""
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
     cos_edge = np.abs(_dot(incident, edge))
     tangent = _unit(np.cross(normal_0, edge))
@@ -273,7 +287,9 @@ def _wedge(
     phi_in = _unit(np.cross(incident, edge))
     turns = []
     for normal in (normal_0, normal_n):
-        mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal  # direction of the reflection boundary
+        mirrored = (
+            incident - 2 * _dot(incident, normal)[:, None] * normal
+        )  # direction of the reflection boundary
         face = transverse_electric(incident, normal)
         boundary = -_unit(np.cross(mirrored, edge))
         turns += [rotate(incident, phi_in, face), rotate(mirrored, face, boundary)]

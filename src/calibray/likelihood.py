@@ -94,7 +94,9 @@ class Objective:
             offset = self.offsets(path_loss)
             free = (offset > self.bounds[0]) & (offset < self.bounds[1])
             total = self._per_group(self.weight[None])
-            mean = np.stack([self._per_group(self.weight * slope[..., k]) for k in range(slope.shape[2])], axis=-1)
+            mean = np.stack(
+                [self._per_group(self.weight * slope[..., k]) for k in range(slope.shape[2])], axis=-1
+            )
             mean = mean / np.where(total > 0, total, 1.0)[..., None] * free[..., None]
             slope = slope - mean[:, self.group]
         return slope[:, counted] * self._scale()[counted][:, None]
@@ -181,7 +183,12 @@ class Interval:
 
 
 def intervals(
-    best: np.ndarray, residuals: np.ndarray, jacobian: np.ndarray, lower: np.ndarray, upper: np.ndarray, nuisances: int
+    best: np.ndarray,
+    residuals: np.ndarray,
+    jacobian: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    nuisances: int,
 ) -> list[Interval]:
     """Confidence intervals of the parameters from the curvature of the sum of squares at the optimum.
 

@@ -176,7 +176,9 @@ class Paths:
                 _write(self, file)
             partial.replace(target)
         except OSError as error:
-            raise InputError(f"{target}: cannot be written ({error}); name a file in a writable folder") from None
+            raise InputError(
+                f"{target}: cannot be written ({error}); name a file in a writable folder"
+            ) from None
 
     @classmethod
     def load(cls, path: str | Path) -> Paths:
@@ -197,10 +199,14 @@ class Paths:
         try:
             with h5py.File(source, "r") as file:
                 if file.attrs.get("schema") != SCHEMA:
-                    raise InputError(f"{source}: is no Calibray path file (schema {file.attrs.get('schema')!r})")
+                    raise InputError(
+                        f"{source}: is no Calibray path file (schema {file.attrs.get('schema')!r})"
+                    )
                 version = int(file.attrs["version"])
                 if version != SCHEMA_VERSION:
-                    raise InputError(f"{source}: has schema version {version}, need {SCHEMA_VERSION}; trace again")
+                    raise InputError(
+                        f"{source}: has schema version {version}, need {SCHEMA_VERSION}; trace again"
+                    )
                 return _read(file)
         except (OSError, KeyError) as error:
             raise InputError(f"{source}: is damaged or no path file ({error}); trace again") from None
@@ -219,9 +225,13 @@ def concatenate(parts: list[Paths]) -> Paths:
     offsets = np.cumsum([0, *(part.num_interactions for part in parts)])
     joined = replace(
         head,
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PATH_ARRAYS + _INTERACTION_ARRAYS},
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in _PATH_ARRAYS + _INTERACTION_ARRAYS
+        },
         first=np.concatenate(
-            [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)] + [offsets[-1:]]
+            [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
+            + [offsets[-1:]]
         ),
         diffuse=_join([part.diffuse for part in parts]),
         diffraction=_join([part.diffraction for part in parts]),

@@ -142,9 +142,13 @@ class Result:
             content = json.loads(source.read_text(encoding="utf-8"))
             links, history = (pd.read_csv(source.with_name(name)) for name in (LINKS_FILE, HISTORY_FILE))
         except (OSError, ValueError) as error:
-            raise InputError(f"{source}: is no result of `calibray run` ({error}); name its --out folder") from None
+            raise InputError(
+                f"{source}: is no result of `calibray run` ({error}); name its --out folder"
+            ) from None
         if content.get("version") != VERSION:
-            raise InputError(f"{source}: has version {content.get('version')}, need {VERSION}; run the study again")
+            raise InputError(
+                f"{source}: has version {content.get('version')}, need {VERSION}; run the study again"
+            )
         study = Study.from_content(content.pop("study"), content.pop("study_file"))
         del content["version"]
         content["intervals"] = {name: Interval(**entry) for name, entry in content["intervals"].items()}

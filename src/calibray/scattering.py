@@ -70,6 +70,9 @@ def _whole_normalizations(cosine: jax.Array) -> jax.Array:
             series = series + binom(2 * k, k) / 4.0**k * sine_squared**k
             moments.append(cosine * series * 2 * np.pi / (j + 1))
     weights = np.array(
-        [[binom(alpha, j) / 2.0**alpha for j in range(LARGEST_EXPONENT + 1)] for alpha in range(LARGEST_EXPONENT + 1)]
+        [
+            [binom(alpha, j) / 2.0**alpha for j in range(LARGEST_EXPONENT + 1)]
+            for alpha in range(LARGEST_EXPONENT + 1)
+        ]
     )
     return jnp.asarray(weights, dtype=cosine.dtype) @ jnp.stack(moments)

@@ -126,12 +126,16 @@ def _scene_path(source: str) -> Path:
         folder = Path(next(iter(spec.submodule_search_locations))) / "rt" / "scenes"
         path = folder / name / f"{name}.xml"
         if not path.is_file():
-            known = sorted(entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file())
+            known = sorted(
+                entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file()
+            )
             raise InputError(f"scene {source!r}: Sionna RT bundles no such scene; it has {', '.join(known)}")
         return path
     path = Path(source)
     if not path.is_file():
-        raise InputError(f"scene file {source}: does not exist; check the path (or name a bundled one, sionna:munich)")
+        raise InputError(
+            f"scene file {source}: does not exist; check the path (or name a bundled one, sionna:munich)"
+        )
     return path
 
 
@@ -141,7 +145,9 @@ def _parse(path: Path, source: str) -> ElementTree.Element:
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise InputError(f"scene file {source}: is not well-formed XML ({error}); export it again") from None
     if root.tag != "scene":
-        raise InputError(f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>")
+        raise InputError(
+            f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>"
+        )
     return root
 
 
@@ -154,7 +160,9 @@ def _material_name(bsdf: ElementTree.Element) -> str:
     return (bsdf.get("id") or bsdf.get("name") or "").removeprefix("mat-")
 
 
-def _shape_material(shape: ElementTree.Element, definitions: dict[str, ElementTree.Element], path: Path) -> str:
+def _shape_material(
+    shape: ElementTree.Element, definitions: dict[str, ElementTree.Element], path: Path
+) -> str:
     name = shape.get("id") or "?"
     nested = shape.find("bsdf")
     if nested is not None:
@@ -189,7 +197,9 @@ def _material(
     itu, revision = given.pop("itu", None), given.pop("revision", DEFAULT_REVISION)
     unknown = set(given) - _MATERIAL_FIELDS
     if unknown:
-        raise InputError(f"[materials] {name}: unknown key {sorted(unknown)[0]!r}; known: {sorted(_MATERIAL_FIELDS)}")
+        raise InputError(
+            f"[materials] {name}: unknown key {sorted(unknown)[0]!r}; known: {sorted(_MATERIAL_FIELDS)}"
+        )
     try:
         if itu is not None:
             thickness = given.get("thickness", _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
@@ -209,7 +219,12 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
         return replace(base, **_slab(bsdf))
     if kind == "radio-material":
         return Material(
-            **{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": DEFAULT_THICKNESS, **_floats(bsdf)}
+            **{
+                "relative_permittivity": 1.0,
+                "conductivity": 0.0,
+                "thickness": DEFAULT_THICKNESS,
+                **_floats(bsdf),
+            }
         )
     raise InputError(
         f"its BSDF of type {kind!r} has no radio constants; give relative_permittivity and conductivity (or itu) "
@@ -220,7 +235,9 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
     """The ITU name that Sionna reads from a BSDF: its `type` string, or its own name after `itu_`."""
     declared = bsdf.find("string[@name='type']") if bsdf is not None else None
-    if declared is not None and (bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-"))):
+    if declared is not None and (
+        bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-"))
+    ):
         return declared.get("value")
     return name[4:] if name.startswith(("itu_", "itu-")) else None
 
@@ -248,7 +265,13 @@ def _refer(shape: ElementTree.Element, index: int) -> None:
 
 def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
-    for name in ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient", "xpd_coefficient"):
+    for name in (
+        "relative_permittivity",
+        "conductivity",
+        "thickness",
+        "scattering_coefficient",
+        "xpd_coefficient",
+    ):
         ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
     return bsdf
 

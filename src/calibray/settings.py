@@ -74,10 +74,14 @@ class Antenna:
     def __post_init__(self) -> None:
         for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS)):
             if getattr(self, name) not in known:
-                raise InputError(f"antenna {name} = {getattr(self, name)!r}: must be one of {', '.join(known)}")
+                raise InputError(
+                    f"antenna {name} = {getattr(self, name)!r}: must be one of {', '.join(known)}"
+                )
         object.__setattr__(self, "orientation", tuple(float(angle) for angle in self.orientation))
         if len(self.orientation) != 3:
-            raise InputError(f"antenna orientation = {self.orientation}: must be three angles [rad]: yaw, pitch, roll")
+            raise InputError(
+                f"antenna orientation = {self.orientation}: must be three angles [rad]: yaw, pitch, roll"
+            )
 
     @property
     def ports(self) -> int:
@@ -103,5 +107,7 @@ def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
         return value
     unknown = set(value) - {field.name for field in fields(Antenna)}
     if unknown:
-        raise InputError(f"antenna: unknown key {sorted(unknown)[0]!r}; known: pattern, polarization, orientation")
+        raise InputError(
+            f"antenna: unknown key {sorted(unknown)[0]!r}; known: pattern, polarization, orientation"
+        )
     return Antenna(**value)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ Values = TypeVar("Values")
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """sigma / (2 pi f eps_0), the negative imaginary part of eta (ITU-R P.2040-3 eq. 9).
+    """Sigma / (2 pi f eps_0), the negative imaginary part of eta (ITU-R P.2040-3 eq. 9).
 
     Args:
         conductivity: [S/m].
@@ -42,7 +42,9 @@ def keep(values: Values, positive: jax.Array) -> Values:
     Returns:
         The values.
     """
-    return jax.lax.cond(positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values)
+    return jax.lax.cond(
+        positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
+    )
 
 
 def coefficients(
@@ -75,7 +77,8 @@ def coefficients(
     half = (
         _divide((cosine - root[0], -root[1]), (cosine + root[0], root[1])),  # eq. 37a
         _divide(
-            (eta_cosine[0] - root[0], eta_cosine[1] - root[1]), (eta_cosine[0] + root[0], eta_cosine[1] + root[1])
+            (eta_cosine[0] - root[0], eta_cosine[1] - root[1]),
+            (eta_cosine[0] + root[0], eta_cosine[1] + root[1]),
         ),  # eq. 37b
     )
     return tuple(_slab(single, phase, across, transmitted) for single in keep(half, wavelength))

@@ -50,7 +50,9 @@ class Lookup:
     intervals: int
 
 
-def make_lookup(material: np.ndarray, mode: np.ndarray, cosine: np.ndarray, intervals: int, dtype: type) -> Lookup:
+def make_lookup(
+    material: np.ndarray, mode: np.ndarray, cosine: np.ndarray, intervals: int, dtype: type
+) -> Lookup:
     """Find every coefficient's place.
 
     Args:
@@ -145,7 +147,8 @@ def table_error(lookup: Lookup, table: jax.Array, wavelength: jax.Array) -> jax.
     half = jnp.linspace(0, 1, 2 * lookup.intervals + 1, dtype=lookup.fraction.dtype)
     values = _at(lookup, table, wavelength, half)
     gaps = [
-        jnp.abs(value[:, 1::2] - 0.5 * (value[:, :-1:2] + value[:, 2::2])).max() for value in jax.tree.leaves(values)
+        jnp.abs(value[:, 1::2] - 0.5 * (value[:, :-1:2] + value[:, 2::2])).max()
+        for value in jax.tree.leaves(values)
     ]
     return jnp.stack(gaps).max()
 
@@ -156,4 +159,6 @@ def _at(
     shape = (lookup.row_material.shape[0], cosine.shape[0])
     mode = jnp.broadcast_to(lookup.row_mode[:, None], shape)
     material = jnp.broadcast_to(lookup.row_material[:, None], shape)
-    return evaluate(jnp.broadcast_to(cosine, shape), table, material, wavelength, mode == TRANSMITTED, mode != 0)
+    return evaluate(
+        jnp.broadcast_to(cosine, shape), table, material, wavelength, mode == TRANSMITTED, mode != 0
+    )

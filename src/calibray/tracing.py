@@ -43,7 +43,13 @@ from calibray.settings import Antenna, TraceSettings, as_antenna  # noqa: E402
 LANES: Final = 20_000_000  # samples x depth x receivers of one chunk; about 45 bytes each
 BUFFER: Final = 1_000_000  # paths that the buffer of one chunk holds at first
 LARGEST_BUFFER: Final = 64_000_000
-FLOATS: Final = ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient", "xpd_coefficient")
+FLOATS: Final = (
+    "relative_permittivity",
+    "conductivity",
+    "thickness",
+    "scattering_coefficient",
+    "xpd_coefficient",
+)
 
 Progress = Callable[[int, int], None]
 
@@ -100,7 +106,9 @@ def trace(
 def _settings(settings: Mapping[str, int | bool]) -> TraceSettings:
     unknown = set(settings) - set(TraceSettings().record())
     if unknown:
-        raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(TraceSettings().record())}")
+        raise InputError(
+            f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(TraceSettings().record())}"
+        )
     return TraceSettings(**settings)  # type: ignore[arg-type]
 
 
@@ -129,7 +137,12 @@ class Tracer:
     """
 
     def __init__(
-        self, scene: Scene, frequency: float, settings: TraceSettings, tx_antenna: Antenna, rx_antenna: Antenna
+        self,
+        scene: Scene,
+        frequency: float,
+        settings: TraceSettings,
+        tx_antenna: Antenna,
+        rx_antenna: Antenna,
     ) -> None:
         self.scene, self.frequency, self.settings = scene, float(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
@@ -189,7 +202,9 @@ class Tracer:
             True where enclosed [n].
         """
         azimuth, elevation = np.meshgrid(np.linspace(0.1, 2 * np.pi, 6), np.radians([25.0, 50.0, 75.0]))
-        rise = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+        rise = np.stack(
+            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+        )
         rise = rise.reshape(3, -1)
         origin = np.repeat(np.asarray(points, dtype=float), rise.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(rise, len(points))))
@@ -238,7 +253,9 @@ class Tracer:
             if int(np.array(buffer.paths_counter).item()) < size - 1:
                 break
             if size >= LARGEST_BUFFER:
-                raise EngineError(f"more than {size:,} paths to {len(index)} receivers; lower trace.samples or max_depth")
+                raise EngineError(
+                    f"more than {size:,} paths to {len(index)} receivers; lower trace.samples or max_depth"
+                )
             size *= 4
         buffer.shrink()
         buffer.detach_geometry()
@@ -383,7 +400,10 @@ class Trace:
 
     def delay(self) -> np.ndarray:
         """Sionna's propagation delays in the order of `link` [P], [s]; known once `path_gains` has run."""
-        found = [np.array(chunk.buffer.tau, dtype=float) if len(chunk.link) else np.zeros(0) for chunk in self.chunks]
+        found = [
+            np.array(chunk.buffer.tau, dtype=float) if len(chunk.link) else np.zeros(0)
+            for chunk in self.chunks
+        ]
         return np.concatenate(found)[self._order()]
 
     def path_gains(self) -> np.ndarray:
@@ -414,7 +434,9 @@ def _load(scene: Scene) -> rt.Scene:
 def _shape_materials(scene: rt.Scene) -> dict[int, int]:
     """Material index by the id under which Dr.Jit knows a shape."""
     return {
-        int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): int(shape.bsdf().name.split("-")[-1])
+        int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): int(
+            shape.bsdf().name.split("-")[-1]
+        )
         for shape in scene.mi_scene.shapes()
     }
 
@@ -440,7 +462,9 @@ def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
             raise InputError(f"link {bad[0]}: {name} position {position[bad[0]]} is not finite; give metres")
     same = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < 1e-3)
     if len(same):
-        raise InputError(f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns")
+        raise InputError(
+            f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns"
+        )
     return tx, rx
 
 
@@ -464,14 +488,18 @@ def _pattern(antenna: Antenna, direction: np.ndarray, way: str) -> np.ndarray:
         return np.zeros((0, antenna.ports, 2), dtype=complex)
     to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
     look = mi.Vector3f(*direction.T.astype(np.float32))
-    fields = [antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in _patterns(antenna)]
+    fields = [
+        antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in _patterns(antenna)
+    ]
     parts = np.array([np.array(field, dtype=float) for field in fields])  # [ports, (re, re, im, im), P]
     return np.moveaxis(parts[:, :2] + 1j * parts[:, 2:], 2, 0)
 
 
 def _turn(field: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     cos, sin = rotation[:, None, 0], rotation[:, None, 1]
-    return np.stack([cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1)
+    return np.stack(
+        [cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1
+    )
 
 
 def _complex(value: mi.Complex2f) -> np.ndarray:

@@ -1,0 +1,82 @@
+"""How much faster replay is than running the ray tracer again, with the agreement beside the time.
+
+Everything is measured in one run on one machine, so that only ratios matter:
+
+    python benchmarks/replay.py
+
+Rivals: Sionna RT traced anew for every candidate (what a loop around a ray tracer pays), and Sionna's own field stage
+on stored paths (what it would pay if its paths were kept).
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from calibray import engines
+from calibray.scenarios import demo_study_path
+from calibray.study import Study
+from calibray.tracing import Trace
+
+
+def seconds(function: Callable[[], object], repeats: int) -> float:
+    """Median time of a call after one warm-up call [s]."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def candidates(engine: engines.Replay, count: int) -> np.ndarray:
+    """Random candidates within the bounds [count, d]."""
+    parameters = engine.parameters
+    unit = np.random.default_rng(0).random((count, len(parameters)))
+    return parameters.lower + unit * (parameters.upper - parameters.lower)
+
+
+def field_stage(trace: Trace, engine: engines.Replay, points: np.ndarray) -> Callable[[], object]:
+    """A call that evaluates another candidate with Sionna's field stage each time."""
+    turn = iter(np.tile(points, (100, 1)))
+
+    def call() -> object:
+        trace.tracer.set_materials(engine.parameters.materials(next(turn), engine.materials))
+        return trace.path_gains()
+
+    return call
+
+
+def main() -> None:
+    """Measure and print the table."""
+    study = Study.load(demo_study_path())
+    replay, retrace = engines.make(study, "replay"), engines.make(study, "retrace")
+    points = candidates(replay, 30)
+    print(f"demo district: {replay.paths.num_links} links, {replay.paths.num_paths} paths, "
+          f"{replay.paths.num_interactions} interactions")  # fmt: skip
+    turn = iter(np.tile(points, (10, 1)))
+    stored = engines.make_tracer(study).trace(study.measurements())
+    rows = [
+        ("re-trace with Sionna RT", seconds(lambda: retrace.path_loss(next(turn)[None]), 3)),
+        ("Sionna's field stage on stored paths", seconds(field_stage(stored, replay, points), 9)),
+        ("replay, one candidate", seconds(lambda: replay.path_loss(points[:1]), 300)),
+        ("replay, batch of 30", seconds(lambda: replay.path_loss(points), 100) / 30),
+        (
+            "replay with derivatives, batch of 30",
+            seconds(lambda: replay.path_loss_and_jacobian(points), 50) / 30,
+        ),
+    ]
+    gap = np.abs(replay.path_loss(points[:3]) - retrace.path_loss(points[:3])).max()
+    slowest = rows[0][1]
+    print(f"\n{'engine':40} {'s per candidate':>16} {'times faster':>14}")
+    for name, value in rows:
+        print(f"{name:40} {value:16.3g} {slowest / value:14,.0f}")
+    print(f"\nlargest difference in path loss, replay against re-trace: {gap:.5f} dB")
+
+
+if __name__ == "__main__":
+    main()

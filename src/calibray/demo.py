@@ -1,0 +1,200 @@
+"""The paper's experiment: the embedded district calibrated by GWO, SGWO-IM and `auto`, with its tables and figures."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from calibray import engines
+from calibray.calibrate import Progress, calibrate
+from calibray.files import check_folder, write_text
+from calibray.report import figures
+from calibray.result import Result
+from calibray.scenarios import demo_study_path
+from calibray.study import Study
+
+METHODS: Final = ("gwo", "sgwo-im")
+AUTO: Final = "auto"
+
+PAPER: Final = {
+    "gwo": {
+        "rt_calls": 600,
+        "seconds": 831.68,
+        "rmse_db": 3.65,
+        "concrete": 6.45,
+        "glass": 4.12,
+        "soil": 3.88,
+    },
+    "sgwo-im": {
+        "rt_calls": 225,
+        "seconds": 336.51,
+        "rmse_db": 2.97,
+        "concrete": 5.82,
+        "glass": 4.65,
+        "soil": 4.21,
+    },
+}
+"""What the paper reports for its own site (its tables III and IV, and section IV-B)."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The finished experiment.
+
+    Attributes:
+        results: Results by method, `auto` last.
+        optimum_db: RMSE of the global optimum, [dB]: what `auto` found on stored paths.
+        truth: Planted mean permittivities by material.
+        engine: The engine that ran.
+        trace_seconds: Time to load and trace the district, which replay pays once, [s].
+    """
+
+    results: dict[str, Result]
+    optimum_db: float
+    truth: dict[str, float]
+    engine: str
+    trace_seconds: float
+
+    def content(self) -> dict[str, Any]:
+        """The experiment as plain values, the paper's figures beside."""
+        return {
+            "engine": self.engine,
+            "optimum_db": self.optimum_db,
+            "trace_seconds": self.trace_seconds,
+            "planted_relative_permittivity": self.truth,
+            "paper": PAPER,
+            "methods": {
+                method: {**result.content(), "excess_rmse_db": result.rmse_db - self.optimum_db}
+                for method, result in self.results.items()
+            },
+        }
+
+
+def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
+    """Run the experiment and write its figures and `result.json`.
+
+    Args:
+        out: Folder to write into; checked first.
+        engine: "replay" (trace once), or "retrace" to pay for every RT call as the paper does.
+        seed: Seed of the methods.
+        progress: Called as the work goes on, with the method's name in front.
+
+    Returns:
+        The experiment.
+
+    Raises:
+        InputError: The folder cannot be written, or the engine is unknown.
+    """
+    check_folder(out)
+    study = Study.load(demo_study_path())
+    started = time.perf_counter()
+    replay = engines.make(study, "replay", progress=_staged(progress, "tracing"))
+    trace_seconds = time.perf_counter() - started
+    chosen = replay if engine == "replay" else engines.make(study, engine)
+    results = {
+        method: calibrate(
+            study, method, seed, engine=chosen, progress=_named(progress, figures.label(method))
+        )
+        for method in METHODS
+    }
+    results[AUTO] = calibrate(
+        study, AUTO, seed, engine=replay, progress=_named(progress, figures.label(AUTO))
+    )
+    truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
+    demo = Demo(
+        results=results,
+        optimum_db=results[AUTO].rmse_db,
+        truth={name: entry["relative_permittivity_mean"] for name, entry in truth.items()},
+        engine=engine,
+        trace_seconds=trace_seconds,
+    )
+    _write(demo, out)
+    return demo
+
+
+def _write(demo: Demo, out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    black_box = {method: demo.results[method] for method in METHODS}
+    figures.write(figures.cumulative_cost(black_box), out / "cumulative-cost.png")
+    figures.write(figures.convergence(black_box, demo.optimum_db), out / "convergence.png")
+    figures.write(figures.path_loss_by_receiver(demo.results), out / "path-loss.png")
+    for method, result in demo.results.items():
+        result.save(out / method)
+    write_text(out / "result.json", json.dumps(demo.content(), indent=2) + "\n")
+
+
+def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The paper's tables, our figures and the paper's side by side.
+
+    Args:
+        demo: The experiment.
+
+    Returns:
+        Title, header and rows of each table.
+    """
+    cost = [
+        [
+            figures.label(method),
+            str(result.rt_calls),
+            f"{result.seconds:.2f}",
+            *_paper(method, "rt_calls", "seconds"),
+        ]
+        for method, result in demo.results.items()
+    ]
+    first = next(iter(demo.results.values()))
+    names = [name.split(".")[0] for name in first.parameters]
+    before = [f"{value:.2f}" for value in first.initial_parameters.values()]
+    permittivity = [
+        [name, start, *(f"{list(result.parameters.values())[k]:.2f}" for result in demo.results.values()),
+         f"{demo.truth[name]:.2f}", *(f"{PAPER[method][name]:.2f}" for method in METHODS)]
+        for k, (name, start) in enumerate(zip(names, before, strict=True))
+    ]  # fmt: skip
+    error = [
+        [figures.label(method), f"{result.initial_rmse_db:.2f}", f"{result.rmse_db:.3f}",
+         f"{result.rmse_db - demo.optimum_db:.4f}", *_paper(method, "rmse_db")]
+        for method, result in demo.results.items()
+    ]  # fmt: skip
+    interval = demo.results[AUTO].intervals
+    trust = [
+        [
+            name,
+            f"{demo.results[AUTO].parameters[name]:.2f}",
+            f"{entry.lower:.2f} to {entry.upper:.2f}",
+            entry.verdict,
+        ]
+        for name, entry in interval.items()
+    ]
+    return [
+        ("Cost", ["method", "RT calls", "time [s]", "paper: calls", "paper: time [s]"], cost),
+        (
+            "Relative permittivity",
+            [
+                "material",
+                "before",
+                *map(figures.label, demo.results),
+                "planted mean",
+                "paper: GWO",
+                "paper: SGWO-IM",
+            ],
+            permittivity,
+        ),
+        ("RMSE [dB]", ["method", "before", "after", "excess", "paper: after"], error),
+        ("How far to trust auto's answer", ["parameter", "value", "95 % interval", "verdict"], trust),
+    ]
+
+
+def _paper(method: str, *keys: str) -> list[str]:
+    known: Mapping[str, float] = PAPER.get(method, {})
+    return [f"{known[key]:g}" if key in known else "-" for key in keys]
+
+
+def _named(progress: Progress | None, name: str) -> Progress | None:
+    return None if progress is None else lambda _, done, total: progress(name, done, total)
+
+
+def _staged(progress: Progress | None, name: str) -> engines.Progress | None:
+    return None if progress is None else lambda done, total: progress(name, done, total)
