@@ -92,6 +92,31 @@ def doctor() -> None:
         raise typer.Exit(1)
 
 
+@app.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write figures and result into.")
+    ] = Path("out/demo"),
+    engine: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="replay (trace once), or retrace: run the ray tracer for every candidate, as the paper does.",
+        ),
+    ] = "replay",
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
+) -> None:
+    """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
+    from calibray import terminal
+    from calibray.demo import FIGURES, run_demo, tables
+
+    with terminal.progress_bars(log) as progress:
+        finished = run_demo(out, engine, seed, progress)
+    for title, header, rows in tables(finished):
+        typer.echo(f"{title}\n{terminal.render_table(header, rows)}\n")
+    typer.echo(f"Written to {out}: result.json, {', '.join(FIGURES)}, and a folder for each method", err=True)
+
+
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]

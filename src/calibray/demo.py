@@ -20,6 +20,8 @@ from calibray.study import Study
 METHODS: Final = ("gwo", "sgwo-im")
 AUTO: Final = "auto"
 
+FIGURES: Final = ("cumulative-cost.png", "convergence.png", "path-loss.png")
+
 PAPER: Final = {
     "gwo": {
         "rt_calls": 600,
@@ -119,9 +121,13 @@ def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progres
 def _write(demo: Demo, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     black_box = {method: demo.results[method] for method in METHODS}
-    figures.write(figures.cumulative_cost(black_box), out / "cumulative-cost.png")
-    figures.write(figures.convergence(black_box, demo.optimum_db), out / "convergence.png")
-    figures.write(figures.path_loss_by_receiver(demo.results), out / "path-loss.png")
+    drawn = (
+        figures.cumulative_cost(black_box),
+        figures.convergence(black_box, demo.optimum_db),
+        figures.path_loss_by_receiver(demo.results),
+    )
+    for name, figure in zip(FIGURES, drawn, strict=True):
+        figures.write(figure, out / name)
     for method, result in demo.results.items():
         result.save(out / method)
     write_text(out / "result.json", json.dumps(demo.content(), indent=2) + "\n")
@@ -169,7 +175,7 @@ def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
         for name, entry in interval.items()
     ]
     return [
-        ("Cost", ["method", "RT calls", "time [s]", "paper: calls", "paper: time [s]"], cost),
+        ("Cost", ["method", ">RT calls", ">time [s]", ">paper: calls", ">paper: time [s]"], cost),
         (
             "Relative permittivity",
             [
@@ -182,8 +188,8 @@ def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
             ],
             permittivity,
         ),
-        ("RMSE [dB]", ["method", "before", "after", "excess", "paper: after"], error),
-        ("How far to trust auto's answer", ["parameter", "value", "95 % interval", "verdict"], trust),
+        ("RMSE [dB]", ["method", ">before", ">after", ">excess", ">paper: after"], error),
+        ("How far to trust auto's answer", ["parameter", ">value", ">95 % interval", "verdict"], trust),
     ]
 
 

@@ -120,7 +120,7 @@ def render_paths(paths: Paths, row: np.ndarray, enclosed: Enclosed) -> str:
         ("interactions", f"{paths.num_interactions:,}", ""),
         *_suspects(row[~reached].tolist(), "", enclosed),
     ]
-    return _table(("Trace", ">", ""), rows)
+    return render_table(("Trace", ">", ""), rows)
 
 
 def rows_text(rows: Sequence[int]) -> str:
@@ -189,7 +189,7 @@ def _links(result: Result, enclosed: Enclosed) -> str:
         ("held out", str(count["held_out"]), ""),
         *_suspects(count["rows_without_path"], f", {verdict}", enclosed),
     ]
-    return _table(("Links", ">", ""), rows)
+    return render_table(("Links", ">", ""), rows)
 
 
 def _suspects(
@@ -217,12 +217,12 @@ def _parameters(result: Result) -> str:
             else ("-", "not known")
         )
         rows.append((label, f"{before:.4g}", f"{after:.4g}", *ends))
-    return _table(("Parameters", ">before", ">after", ">95 % interval", "verdict"), rows)
+    return render_table(("Parameters", ">before", ">after", ">95 % interval", "verdict"), rows)
 
 
 def _offsets(result: Result) -> str:
     rows = [(name or "all links", f"{value:+.2f}") for name, value in result.offsets_db.items()]
-    return _table(("Offsets", ">[dB]"), rows) if rows else ""
+    return render_table(("Offsets", ">[dB]"), rows) if rows else ""
 
 
 def _accuracy(result: Result) -> str:
@@ -233,7 +233,7 @@ def _accuracy(result: Result) -> str:
         ("log-distance model", result.log_distance_rmse_db, result.log_distance_holdout_rmse_db),
     ]
     shown = [(name, _decibels(fit), _decibels(held)) for name, fit, held in rows if fit is not None]
-    return _table(("RMSE [dB]", ">calibrated on", ">held out"), shown)
+    return render_table(("RMSE [dB]", ">calibrated on", ">held out"), shown)
 
 
 def _costs(result: Result) -> str:
@@ -242,15 +242,23 @@ def _costs(result: Result) -> str:
         ("tracing", f"{result.trace_seconds:.1f} s"),
         ("calibrating", f"{result.seconds:.1f} s"),
     ]
-    return _table(("Cost", ">"), rows)
+    return render_table(("Cost", ">"), rows)
 
 
 def _decibels(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as plain text; a heading that begins with ">" is of a column aligned to the right."""
+def render_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as plain text.
+
+    Args:
+        header: Headings; one that begins with ">" stands over a column aligned to the right.
+        rows: Cells of every row.
+
+    Returns:
+        Lines of text, without a line break at the end.
+    """
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for heading in header:
         table.add_column(
