@@ -317,7 +317,8 @@ def make_scene(study: Study, materials: dict[str, Material] | None = None) -> Sc
     Raises:
         InputError: The scene or the parameters cannot be used.
     """
-    scene = read_scene(study.scene_source, study.scene.frequency, {**study.overrides, **(materials or {})})
+    overrides = {**study.overrides, **(materials or {})}
+    scene = read_scene(study.scene_source, study.scene.frequency, overrides, study.objects)
     if materials is None:  # what is sampled while tracing, as diffuse reflection is, follows the materials
         parameters = study.parameter_set(scene.materials)
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))

@@ -95,7 +95,7 @@ class Result:
             ) from None
 
     def _write(self, target: Path) -> None:
-        export_scene(self.study.scene_source, self.materials, target / SCENE_FILE)
+        export_scene(self.study.scene_source, self.materials, target / SCENE_FILE, self.study.objects)
         write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.6g"))
         write_text(target / HISTORY_FILE, self.history.to_csv(index=False, float_format="%.9g"))
         write_text(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")

@@ -12,6 +12,7 @@ import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -61,6 +62,7 @@ def read_scene(
     source: str | Path,
     frequency: float,
     overrides: Mapping[str, Material | Mapping[str, object]] | None = None,
+    split: Mapping[str, str] | None = None,
 ) -> Scene:
     """Read a Mitsuba XML scene and the constants of its materials.
 
@@ -69,31 +71,47 @@ def read_scene(
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
         overrides: Constants in place of the file's, by material name: a `Material`, or a mapping with any of its
             fields, or with `itu` (and `revision`) naming an ITU-R P.2040 material.
+        split: Materials to be made for some objects, by name: a pattern of the objects' names, with `*` for any
+            text. A name that ends in `*` makes one material for every object, `*` replaced by the object's name.
 
     Returns:
         The scene.
 
     Raises:
         InputError: The file does not exist or is no Mitsuba scene, a mesh is missing, a material has no radio
-            constants, an override names no material of the scene, or a frequency lies outside an ITU range.
+            constants, an override names no material of the scene, a pattern matches no object or objects of
+            different materials, or a frequency lies outside an ITU range.
     """
-    overrides = dict(overrides or {})
+    overrides, split = dict(overrides or {}), dict(split or {})
     path = _scene_path(str(source))
     root = _parse(path, str(source))
     definitions = _bsdf_definitions(root)
     objects: list[SceneObject] = []
     materials: dict[str, Material] = {}
+    origin: dict[str, str] = {}
     for shape in root.findall("shape"):
         _check_mesh(shape, path)
-        name = _shape_material(shape, definitions, path)
+        original, name = _materials_of(shape, definitions, split, path)
+        if origin.setdefault(name, original) != original:
+            raise InputError(
+                f"[objects] {name}: its objects have the materials {origin[name]!r} and {original!r}; "
+                "name one material for each"
+            )
         if name not in materials:
-            materials[name] = _material(name, definitions.get(name), overrides.get(name), frequency, path)
-        _refer(shape, list(materials).index(name))
-        objects.append(SceneObject((shape.get("id") or "").removeprefix("mesh-"), name))
+            constants = _merged(overrides.get(original), overrides.get(name) if name != original else None)
+            materials[name] = _material(name, original, definitions.get(original), constants, frequency, path)
+        _refer(shape, f"mat-calibray-{list(materials).index(name)}")
+        objects.append(SceneObject(_object_name(shape), name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
+    for name, pattern in split.items():
+        if not any(fnmatchcase(entry.name, pattern) for entry in objects):
+            known = [entry.name for entry in objects]
+            raise InputError(
+                f"[objects] {name} = {pattern!r}: matches no object; {did_you_mean(pattern, known)}"
+            )
     for name in overrides:
-        check_material_name(name, materials, f"[materials] {name}")
+        check_material_name(name, {**materials, **dict.fromkeys(origin.values())}, f"[materials] {name}")
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
     for index, material in enumerate(materials.values()):
@@ -174,6 +192,40 @@ def _shape_material(
     return material
 
 
+def _object_name(shape: ElementTree.Element) -> str:
+    return (shape.get("id") or "").removeprefix("mesh-")
+
+
+def _materials_of(
+    shape: ElementTree.Element,
+    definitions: dict[str, ElementTree.Element],
+    split: Mapping[str, str],
+    path: Path,
+) -> tuple[str, str]:
+    """Material of an object in the file, and the one it gets: the first of `split` that matches, else the same."""
+    original, name = _shape_material(shape, definitions, path), _object_name(shape)
+    own = next((own for own, pattern in split.items() if fnmatchcase(name, pattern)), None)
+    if own is None:
+        return original, original
+    own = own[:-1] + name if own.endswith("*") else own
+    if own in definitions:
+        raise InputError(
+            f"[objects] {own}: the scene has a material of that name already; choose another name"
+        )
+    return original, own
+
+
+def _merged(
+    base: Material | Mapping[str, object] | None, more: Material | Mapping[str, object] | None
+) -> Material | Mapping[str, object] | None:
+    """The constants given for a material, those for some of its objects put over those for all."""
+    if more is None or isinstance(more, Material) or base is None:
+        return base if more is None else more
+    if isinstance(base, Material):
+        return {**{name: getattr(base, name) for name in _MATERIAL_FIELDS}, **more}
+    return {**base, **more}
+
+
 def _check_mesh(shape: ElementTree.Element, path: Path) -> None:
     filename = shape.find("string[@name='filename']")
     if filename is not None and not (path.parent / filename.get("value", "")).is_file():
@@ -185,6 +237,7 @@ def _check_mesh(shape: ElementTree.Element, path: Path) -> None:
 
 def _material(
     name: str,
+    original: str,
     bsdf: ElementTree.Element | None,
     override: Material | Mapping[str, object] | None,
     frequency: float,
@@ -206,7 +259,7 @@ def _material(
             return replace(itu_material(str(itu), frequency, thickness, revision=str(revision)), **given)
         if {"relative_permittivity", "conductivity"} <= set(given):
             return Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **given})
-        return replace(_file_material(name, bsdf, frequency), **given)
+        return replace(_file_material(original, bsdf, frequency), **given)
     except InputError as error:
         raise InputError(f"{path}: material {name!r}: {error}") from None
 
@@ -257,10 +310,10 @@ def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
     return {key: constants[key] for key in constants if key not in ("relative_permittivity", "conductivity")}
 
 
-def _refer(shape: ElementTree.Element, index: int) -> None:
+def _refer(shape: ElementTree.Element, identifier: str) -> None:
     for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
         shape.remove(child)
-    ElementTree.SubElement(shape, "ref", {"id": f"mat-calibray-{index}", "name": "bsdf"})
+    ElementTree.SubElement(shape, "ref", {"id": identifier, "name": "bsdf"})
 
 
 def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
@@ -276,7 +329,12 @@ def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
     return bsdf
 
 
-def export_scene(source: str | Path, materials: Mapping[str, Material], target: Path) -> None:
+def export_scene(
+    source: str | Path,
+    materials: Mapping[str, Material],
+    target: Path,
+    split: Mapping[str, str] | None = None,
+) -> None:
     """Write a scene file with other constants; it refers to the meshes of the original.
 
     Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `NAME-calibrated`.
@@ -285,6 +343,7 @@ def export_scene(source: str | Path, materials: Mapping[str, Material], target: 
         source: The original: a path, or `sionna:NAME`.
         materials: Constants by material name.
         target: File to write.
+        split: Materials made for some objects, as in `read_scene`.
 
     Raises:
         InputError: The original cannot be read.
@@ -294,10 +353,8 @@ def export_scene(source: str | Path, materials: Mapping[str, Material], target: 
     definitions = _bsdf_definitions(root)
     names = {name: f"mat-{name}-calibrated" if _is_itu_name(name) else f"mat-{name}" for name in materials}
     for shape in root.findall("shape"):
-        name = _shape_material(shape, definitions, path)
-        for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
-            shape.remove(child)
-        ElementTree.SubElement(shape, "ref", {"id": names[name], "name": "bsdf"})
+        _, name = _materials_of(shape, definitions, split or {}, path)
+        _refer(shape, names[name])
         filename = shape.find("string[@name='filename']")
         if filename is not None:
             mesh = (path.parent / filename.get("value", "")).resolve()

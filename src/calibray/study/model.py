@@ -30,6 +30,7 @@ from calibray.study.sections import (
     ParameterSection,
     SceneSection,
     Section,
+    Text,
     TraceSection,
 )
 
@@ -46,6 +47,7 @@ class Study(Section):
     Attributes:
         version: Version of the file's format.
         scene: The scene and the carrier.
+        objects: Materials to be made for some objects, by name: a pattern of the objects' names.
         materials: Constants in place of the scene's, by material name.
         links: The measured links.
         antennas: The antennas.
@@ -60,6 +62,7 @@ class Study(Section):
 
     version: int
     scene: SceneSection
+    objects: dict[str, Text] = Field(default_factory=dict)
     materials: dict[str, MaterialSection] = Field(default_factory=dict)
     links: LinksSection
     antennas: AntennasSection = Field(default_factory=AntennasSection)
