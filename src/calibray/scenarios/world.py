@@ -1,0 +1,167 @@
+"""The planted truth behind the simulated campaign: what stands in the district, and where the antennas stood.
+
+The world is richer than the model that is calibrated. Every building has its own concrete and glass,
+surfaces scatter diffusely, lamp posts line the streets, and the recorded positions are off by about a
+metre. A calibration therefore finds means over the buildings at best, and leaves residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calibray.scenarios.district import Building, district, lamp_posts, scene_objects
+from calibray.scenarios.meshes import SceneObject
+
+SEED: Final = 1
+FREQUENCY: Final = 4e9  # [Hz]
+ANTENNA_HEIGHT: Final = 4.0  # [m]
+POSITION_ERROR: Final = 0.8  # [m], standard deviation of recorded positions, in x and in y
+LEVELS: Final = np.linspace(-2.0, 2.0, 8)
+"""The permittivities that buildings have, in standard deviations from the mean: two materials for each of 196
+buildings would slow the tracer down."""
+
+TRANSMITTERS: Final = ((-381.5, 140.0), (153.5, -330.0))
+"""Where the transmitter was planned to stand, x and y [m]."""
+
+RECEIVERS: Final = (
+    ((-380, 185), (-414, 262), (-466, 262), (-313, 261), (-380, 489), (-452, 495), (-483, 497), (-568, 498),
+     (-636, 496), (-653, 495), (-686, 497), (-648, 560), (-646, 611), (-646, 624), (-645, 644), (-647, 541),
+     (-648, 457), (-647, 403), (-645, 320), (-604, 261), (-536, 260), (-451, 262), (-380, 20), (-450, 26),
+     (-645, -123), (155, 184), (153, 202)),
+    ((155, -274), (110, -220), (59, -220), (25, -218), (348, 26), (417, 28), (484, 26), (535, 27), (424, -54),
+     (423, 65), (299, -457), (10, -458), (-8, -457)),
+)  # fmt: skip
+"""Where the receiver was planned to stop for either place of the transmitter, x and y [m]: 27 and 13 stops,
+as in the paper, with stretches of high loss at 10 to 16 and 25 to 27."""
+
+
+@dataclass(frozen=True)
+class Planted:
+    """Constants of a material of the true world.
+
+    Attributes:
+        relative_permittivity: Mean over the buildings [1].
+        spread: Standard deviation between buildings [1].
+        conductivity: [S/m].
+        thickness: [m].
+        scattering_coefficient: Scattering coefficient S [1].
+    """
+
+    relative_permittivity: float
+    spread: float
+    conductivity: float
+    thickness: float
+    scattering_coefficient: float
+
+    def constants(self, relative_permittivity: float) -> dict[str, float]:
+        """The constants as a scene file takes them.
+
+        Args:
+            relative_permittivity: The permittivity in place of the mean [1].
+
+        Returns:
+            Constants by name.
+        """
+        return {
+            "relative_permittivity": relative_permittivity,
+            "conductivity": self.conductivity,
+            "thickness": self.thickness,
+            "scattering_coefficient": self.scattering_coefficient,
+        }
+
+
+PLANTED: Final = {
+    "concrete": Planted(5.8, 1.2, 0.1, 0.3, 0.3),
+    "glass": Planted(4.65, 0.7, 0.022, 0.022, 0.15),
+    "soil": Planted(4.2, 0.0, 0.05, 2.0, 0.2),
+    "asphalt": Planted(4.83, 0.0, 0.075, 0.5, 0.1),
+    "steel": Planted(1.0, 0.0, 1e7, 0.01, 1.0),  # thin posts scatter all around, nothing like a mirror
+}
+"""The materials of the true world; the means of concrete, glass and soil are about what the paper found."""
+
+
+@dataclass(frozen=True)
+class World:
+    """The true world of a campaign.
+
+    Attributes:
+        buildings: The buildings.
+        level: Index into `LEVELS` of each building's concrete and glass [buildings, 2].
+        permittivity: Relative permittivity of each building's concrete and glass [buildings, 2], [1].
+        tx_recorded: Transmitter of every link as recorded [L, 3], [m].
+        rx_recorded: Receiver of every link as recorded [L, 3], [m].
+        tx: Where the transmitter of every link stood [L, 3], [m].
+        rx: Where its receiver stood [L, 3], [m].
+    """
+
+    buildings: tuple[Building, ...]
+    level: np.ndarray
+    permittivity: np.ndarray
+    tx_recorded: np.ndarray
+    rx_recorded: np.ndarray
+    tx: np.ndarray
+    rx: np.ndarray
+
+    def scene_objects(self) -> list[SceneObject]:
+        """The objects of the true world: buildings joined by level, and the lamp posts."""
+        level = {building.name: pair for building, pair in zip(self.buildings, self.level, strict=True)}
+        objects = scene_objects(
+            self.buildings,
+            lambda building: f"concrete_{level[building.name][0]}",
+            lambda building: f"glass_{level[building.name][1]}",
+        )
+        return [*objects, SceneObject("lamp_posts", "steel", lamp_posts())]
+
+    def materials(self) -> dict[str, dict[str, float]]:
+        """Constants of the materials of `scene_objects`, by name."""
+        found = {
+            name: PLANTED[name].constants(PLANTED[name].relative_permittivity)
+            for name in ("soil", "asphalt", "steel")
+        }
+        for column, name in enumerate(("concrete", "glass")):
+            for level, value in zip(self.level[:, column], self.permittivity[:, column], strict=True):
+                found[f"{name}_{level}"] = PLANTED[name].constants(float(value))
+        return found
+
+
+def world(seed: int = SEED) -> World:
+    """Plant a world.
+
+    Args:
+        seed: Seed of the permittivities and of the position errors; streets and buildings do not depend on
+            it.
+
+    Returns:
+        The world.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, 1]))
+    buildings = district()
+    level = np.empty((len(buildings), 2), dtype=np.int64)
+    permittivity = np.empty((len(buildings), 2))
+    for column, planted in enumerate((PLANTED["concrete"], PLANTED["glass"])):
+        drawn = rng.standard_normal(len(buildings))
+        level[:, column] = np.abs(drawn[:, None] - LEVELS).argmin(axis=1)
+        permittivity[:, column] = planted.relative_permittivity + planted.spread * LEVELS[level[:, column]]
+    stops = [len(places) for places in RECEIVERS]
+    tx = np.repeat([[*place, ANTENNA_HEIGHT] for place in TRANSMITTERS], stops, axis=0)
+    rx = np.array([[*place, ANTENNA_HEIGHT] for places in RECEIVERS for place in places], dtype=float)
+    rx[:, :2] = np.round(rx[:, :2] + rng.uniform(-0.5, 0.5, (len(rx), 2)), 2)  # nobody stops on a full metre
+    tx_error = np.repeat(rng.standard_normal((len(stops), 2)), stops, axis=0)
+    rx_error = rng.standard_normal((len(rx), 2))
+    return World(
+        buildings=buildings,
+        level=level,
+        permittivity=np.round(permittivity, 3),
+        tx_recorded=tx,
+        rx_recorded=rx,
+        tx=_moved(tx, tx_error),
+        rx=_moved(rx, rx_error),
+    )
+
+
+def _moved(recorded: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """True positions [L, 3], [m], of recorded ones and standard normal errors in the plan [L, 2]."""
+    return recorded - np.pad(np.round(POSITION_ERROR * error, 3), [(0, 0), (0, 1)])
