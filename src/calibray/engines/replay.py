@@ -1,0 +1,160 @@
+"""Replay: stored paths, evaluated for any candidate, with derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibray import fields, tabulation
+from calibray.engines.protocol import check_candidates
+from calibray.parameters import Parameters
+from calibray.paths import Paths
+
+BLOCK_INTERACTIONS: Final = 2_000_000  # interactions x candidates evaluated at once, which bounds the memory
+TABULATED: Final = 50_000  # interactions beyond which coefficients come from tables
+FIRST_INTERVALS: Final = 2048  # of a table over the cosine of incidence
+LAST_INTERVALS: Final = 65536
+TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
+BLOCK_SIZES: Final = (1, 8, 32)  # candidates a call; every size is compiled once
+
+
+class Replay:
+    """Stored paths, evaluated for any candidate.
+
+    Args:
+        paths: The path program.
+        parameters: What the candidates' components stand for.
+        combining: How a link's paths combine: "power", "coherent" or "band".
+        bandwidth: Bandwidth [Hz], for "band".
+        dtype: Precision, `numpy.float64` or `numpy.float32`.
+
+    Raises:
+        InputError: A parameter's material is not in the paths, or the combining cannot be used.
+    """
+
+    def __init__(
+        self,
+        paths: Paths,
+        parameters: Parameters,
+        combining: str = "power",
+        bandwidth: float | None = None,
+        dtype: type = np.float64,
+    ) -> None:
+        self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
+        self._dtype = dtype
+        self._offsets = fields.check_combining(paths, combining, bandwidth)
+        self._combining = combining
+        self._rows, columns = parameters.indices(list(paths.materials))
+        used, self._places = np.unique(columns, return_inverse=True)
+        self._columns = columns
+        self._base = jnp.asarray(fields.constants(paths).astype(dtype))
+        self._fields = tuple(int(column) for column in used)
+        self._intervals = FIRST_INTERVALS if paths.num_interactions > TABULATED else None
+        self._program = fields.layout(paths, dtype, self._intervals).program
+        room = max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
+        self._sizes = [size for size in BLOCK_SIZES if size <= room]
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        """Path loss of every link for candidates.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB]; +inf where a link has no path.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite.
+        """
+        (loss,) = self._run(self._value, candidates)
+        return loss
+
+    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Path loss of every link, and its derivatives by the parameters.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite.
+        """
+        loss, jacobian = self._run(self._jacobian, candidates)
+        return loss, jacobian
+
+    def _value(self, tables: jax.Array) -> tuple[jax.Array]:
+        local = _local_values(self._program, tables)
+        power = _power(self._program, local, self._combining, self._offsets)
+        return (fields.decibel(power),)
+
+    def _jacobian(self, tables: jax.Array) -> tuple[jax.Array, jax.Array]:
+        local, tangents = _local_tangents(self._program, tables, self._fields)
+        power, slope = _power_and_slope(self._program, local, self._combining, self._offsets)
+        derivative = _decibel_slope(self._program, power, slope, tangents, tables.shape[1])
+        return fields.decibel(power), derivative[:, :, self._rows, self._places]
+
+    def _run(self, function: Callable, candidates: np.ndarray) -> tuple[np.ndarray, ...]:
+        values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
+        parts, start = [], 0
+        while start < len(values):
+            left = len(values) - start
+            size = next((size for size in self._sizes if size >= left), self._sizes[-1])
+            block = values[start : start + size]
+            padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
+            tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
+            self._refine(tables)
+            parts.append([np.asarray(part)[: len(block)] for part in function(tables)])
+            start += len(block)
+        self.calls += len(values)
+        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+    def _refine(self, tables: jax.Array) -> None:
+        """Make the tables of coefficients fine enough for these candidates, and for all that follow."""
+        while self._intervals is not None and (
+            float(_table_error(self._program.lookup, tables, self._program.wavelength).max())
+            > TABLE_TOLERANCE
+        ):
+            self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
+            self._program = fields.layout(self.paths, self._dtype, self._intervals).program
+
+
+# Stages compiled apart, each over a batch of candidates; see `calibray.fields`.
+_tables = jax.jit(
+    lambda base, rows, columns, values: jax.vmap(lambda value: base.at[rows, columns].set(value))(values)
+)
+_local_values = jax.jit(jax.vmap(fields.local_values, in_axes=(None, 0)))
+_table_error = jax.jit(jax.vmap(tabulation.table_error, in_axes=(None, 0, None)))
+
+
+@partial(jax.jit, static_argnames="columns")
+def _local_tangents(program: fields.Program, tables: jax.Array, columns: tuple[int, ...]) -> tuple:
+    return jax.vmap(lambda table: fields.local_tangents(program, table, columns))(tables)
+
+
+@partial(jax.jit, static_argnames="combining")
+def _power(
+    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
+) -> jax.Array:
+    return jax.vmap(lambda one: fields.program_power(program, one, combining, offsets))(local)
+
+
+@partial(jax.jit, static_argnames="combining")
+def _power_and_slope(
+    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
+) -> tuple[jax.Array, fields.Local]:
+    return jax.vmap(lambda one: fields.power_and_slope(program, one, combining, offsets))(local)
+
+
+@partial(jax.jit, static_argnames="materials")
+def _decibel_slope(
+    program: fields.Program, power: jax.Array, slope: fields.Local, tangents: tuple, materials: int
+) -> jax.Array:
+    one = partial(fields.decibel_slope, program, num_materials=materials)
+    return jax.vmap(lambda power, slope, tangents: one(power, slope, tangents))(power, slope, tangents)
