@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -67,7 +67,8 @@ def calibrate(
     problem = Problem.of(study, links, engine)
     traced = time.perf_counter()
     run = search(problem, _optimizer(problem), progress)
-    result = _result(problem, run, time.perf_counter() - traced, traced - started)
+    problem, run, gap = settle(problem, run, progress)
+    result = _result(problem, run, gap, time.perf_counter() - traced, traced - started)
     if out is not None:
         result.save(out)
     return result
@@ -226,6 +227,48 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     return run
 
 
+def settle(
+    problem: Problem, run: Run, progress: Progress | None = None
+) -> tuple[Problem, Run, np.ndarray | None]:
+    """Trace again with the materials found, and calibrate again while that changes the path loss too much.
+
+    Refraction and diffuse reflection are sampled by the materials of the trace, so the set of paths can change with
+    them. Where a trace follows neither, there is nothing to check. Only `auto` calibrates again: the other methods
+    have a budget of RT calls to keep to.
+
+    Args:
+        problem: The problem.
+        run: Its first search.
+        progress: Called as the work goes on.
+
+    Returns:
+        The problem on the last trace calibrated on, its search, and the gap of every link, path loss on paths traced
+        with the materials found minus path loss on those calibrated on [L], [dB]; None where nothing was checked.
+    """
+    study, engine = problem.study, problem.engine
+    sampled = study.trace.refraction or study.trace.diffuse_reflection
+    if not sampled or not study.fidelity.rounds or not isinstance(engine, Replay):
+        return problem, run, None
+    for turn in range(study.fidelity.rounds):
+        scene = engines.make_scene(study, engine.parameters.materials(run.best, engine.materials))
+        paths = engines.traced_paths(study, scene, problem.links, _stage(progress, "checking"))
+        again = Replay(paths, engine.parameters, study.objective.combining, study.scene.bandwidth)
+        gap = _gap(again.path_loss(run.best[None])[0], run.best_loss)
+        counted = problem.objective.weight > 0
+        settled = np.abs(gap[counted]).max() <= study.fidelity.tolerance_db
+        if settled or study.method.name != AUTO or turn == study.fidelity.rounds - 1:
+            break
+        moved = replace(problem, engine=again)
+        run, problem = search(moved, _optimizer(moved), progress), moved
+    return problem, run, gap
+
+
+def _gap(after: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Difference of path losses; 0 where neither has a path."""
+    lost = np.isinf(after) & np.isinf(before)
+    return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
+
+
 def to_search(parameters: Parameters, values: np.ndarray) -> np.ndarray:
     """Candidates [..., d] as the optimizers see them: the logarithm of what is searched on a logarithmic scale.
 
@@ -280,7 +323,9 @@ def _optimizer(problem: Problem) -> Optimizer:
     return make_optimizer(name, parameters, section.seed, **options)
 
 
-def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) -> Result:
+def _result(
+    problem: Problem, run: Run, gap: np.ndarray | None, seconds: float, trace_seconds: float
+) -> Result:
     study, links, engine, objective = problem.study, problem.links, problem.engine, problem.objective
     names = engine.parameters.names
     before, best, counted = problem.before, run.best_loss, objective.weight > 0
@@ -304,6 +349,7 @@ def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) ->
             "log_distance_db": rival,
             "has_path": reached,
             "held_out": problem.held_out,
+            "retrace_gap_db": np.nan if gap is None else gap,
         }
     )
     return Result(
@@ -323,6 +369,7 @@ def _result(problem: Problem, run: Run, seconds: float, trace_seconds: float) ->
         offset_only_holdout_rmse_db=rmse(offset_only, judged) if objective.num_groups else None,
         log_distance_rmse_db=rmse(rival, counted),
         log_distance_holdout_rmse_db=rmse(rival, judged),
+        retrace_gap_db=None if gap is None else float(np.abs(gap[counted]).max()),
         rt_calls=run.rt_calls,
         seconds=seconds,
         trace_seconds=trace_seconds,

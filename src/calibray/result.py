@@ -46,11 +46,13 @@ class Result:
         offset_only_holdout_rmse_db: The same with only the offsets fitted, on the links calibrated on.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the links calibrated on.
         log_distance_holdout_rmse_db: Its RMSE over the links held out.
+        retrace_gap_db: Largest change of a calibrated link's path loss when the scene is traced again with the
+            materials found, [dB]; None where the paths do not depend on the materials.
         rt_calls: RT calls that the method spent.
         seconds: Time that the method took, tracing not included.
         trace_seconds: Time that tracing and loading took before.
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
-            whether a path leads there, whether it was held out.
+            whether a path leads there, whether it was held out, and its own change on tracing again.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
     """
 
@@ -68,6 +70,7 @@ class Result:
     offset_only_holdout_rmse_db: float | None
     log_distance_rmse_db: float
     log_distance_holdout_rmse_db: float | None
+    retrace_gap_db: float | None
     rt_calls: int
     seconds: float
     trace_seconds: float
@@ -114,6 +117,7 @@ class Result:
             "offset_only_holdout_rmse_db": self.offset_only_holdout_rmse_db,
             "log_distance_rmse_db": self.log_distance_rmse_db,
             "log_distance_holdout_rmse_db": self.log_distance_holdout_rmse_db,
+            "retrace_gap_db": self.retrace_gap_db,
             "rt_calls": self.rt_calls,
             "seconds": self.seconds,
             "trace_seconds": self.trace_seconds,

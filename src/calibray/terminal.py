@@ -239,6 +239,11 @@ def _accuracy(result: Result) -> str:
 def _costs(result: Result) -> str:
     rows = [
         ("RT calls", f"{result.rt_calls:,}"),
+        *(
+            []
+            if result.retrace_gap_db is None
+            else [("change on tracing again", f"{result.retrace_gap_db:.2f} dB")]
+        ),
         ("tracing", f"{result.trace_seconds:.1f} s"),
         ("calibrating", f"{result.seconds:.1f} s"),
     ]

@@ -21,6 +21,7 @@ from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
     AntennasSection,
     EngineSection,
+    FidelitySection,
     HoldoutSection,
     LinksSection,
     MaterialSection,
@@ -56,6 +57,7 @@ class Study(Section):
         parameters: The free parameters by name, in the order of a candidate's components.
         offset: The nuisance offset, or None.
         holdout: The links held out, or None.
+        fidelity: When to trace again.
         method: The optimizer.
         engine: The engine.
     """
@@ -71,6 +73,7 @@ class Study(Section):
     parameters: dict[str, ParameterSection]
     offset: OffsetSection | None = None
     holdout: HoldoutSection | None = None
+    fidelity: FidelitySection = Field(default_factory=FidelitySection)
     method: MethodSection = Field(default_factory=MethodSection)
     engine: EngineSection = Field(default_factory=EngineSection)
 

@@ -201,6 +201,18 @@ class HoldoutSection(Section):
     where: Text
 
 
+class FidelitySection(Section):
+    """``[fidelity]``: tracing again with the materials found, where the paths depend on them.
+
+    Attributes:
+        tolerance_db: Largest change of a link's path loss [dB] that is let stand.
+        rounds: How often to trace again at most, 0 for never.
+    """
+
+    tolerance_db: Annotated[float, Field(gt=0)] = 0.5
+    rounds: Annotated[int, Field(ge=0)] = 3
+
+
 class MethodSection(Section):
     """``[method]``: the optimizer.
 
