@@ -1,0 +1,87 @@
+"""The paper's experiment in the embedded district: RT calls, the global optimum, files and figures."""
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from scipy.optimize import minimize
+
+from calibray import engines
+from calibray.calibrate import Problem
+from calibray.demo import FIGURES, METHODS, run_demo, tables
+from calibray.errors import InputError
+from calibray.scenarios import demo_study_path
+from calibray.study import Study
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    return run_demo(out), out
+
+
+@pytest.fixture(scope="module")
+def problem():
+    study = Study.load(demo_study_path())
+    return Problem.of(study, study.measurements(), engines.make(study, "replay"))
+
+
+def test_rt_calls_are_the_papers(demo):
+    finished, _ = demo
+    assert {method: finished.results[method].rt_calls for method in METHODS} == {"gwo": 600, "sgwo-im": 225}
+    assert [len(finished.results[method].history) for method in METHODS] == [600, 225]
+
+
+def test_auto_reaches_the_global_optimum_of_an_exhaustive_scan(demo, problem):
+    engine = problem.engine
+    axes = [
+        np.linspace(low, high, 24)
+        for low, high in zip(engine.parameters.lower, engine.parameters.upper, strict=True)
+    ]
+    grid = np.array(list(product(*axes)))
+    rmse = problem.objective.rmse(engine.path_loss(grid))
+    best = demo[0].results["auto"].rmse_db
+
+    def objective(point):
+        return float(problem.objective.rmse(engine.path_loss(point[None]))[0])
+
+    bounds = list(zip(engine.parameters.lower, engine.parameters.upper, strict=True))
+    polished = [
+        minimize(objective, grid[k], bounds=bounds, method="Nelder-Mead").fun for k in np.argsort(rmse)[:8]
+    ]
+    assert best <= min(polished) + 1e-3
+    assert min(polished) <= best + 1e-2  # the scan finds the same valley
+    assert np.median(rmse) > best + 0.5  # and a random guess does not
+
+
+def test_methods_of_the_paper_improve_on_the_start_and_not_on_the_optimum(demo):
+    finished, _ = demo
+    for method in METHODS:
+        result = finished.results[method]
+        assert finished.optimum_db - 1e-9 <= result.rmse_db < result.initial_rmse_db - 1
+
+
+def test_soil_is_called_not_identifiable_and_concrete_is(demo):
+    intervals = demo[0].results["auto"].intervals
+    assert intervals["soil.relative_permittivity"].verdict == "not identifiable"
+    assert intervals["concrete.relative_permittivity"].verdict == "identified"
+
+
+def test_files_exist_and_open(demo):
+    finished, out = demo
+    for name in FIGURES:
+        assert imread(out / name).shape[0] > 400
+    content = json.loads((out / "result.json").read_text())
+    assert content["methods"]["gwo"]["rt_calls"] == 600
+    assert content["methods"]["auto"]["excess_rmse_db"] == 0
+    for method in finished.results:
+        assert (out / method / "scene.xml").is_file()
+    assert all(len(row) == len(header) for _, header, rows in tables(finished) for row in rows)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="output folder"):
+        run_demo(tmp_path / "file" / "demo")
