@@ -315,7 +315,7 @@ class Tracer:
         kind = np.array(buffer.interaction_types, dtype=np.int64).reshape(count, depth)
         if count and kind.any():
             for step in range(depth):
-                active = mi.Bool(kind[:, step] != 0)
+                active = mi.Bool(_aligned(kind[:, step] != 0, np.bool_))
                 found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
                 normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
             if self.settings.diffraction:
@@ -469,9 +469,22 @@ def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points(position: np.ndarray) -> mi.Point3f:
-    points = mi.Point3f(*np.asarray(position, dtype=np.float32).T)
+    points = mi.Point3f(*(_aligned(axis, np.float32) for axis in position.T))
     dr.make_opaque(points)
     return points
+
+
+def _aligned(values: np.ndarray, dtype: type) -> np.ndarray:
+    """A copy that starts at a multiple of 64 bytes.
+
+    Dr.Jit takes over NumPy's memory as it lies and compiles another kernel for another alignment. With an alignment
+    left to chance its kernel cache is of little use, and every process compiles for seconds.
+    """
+    memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
+    start = -memory.ctypes.data % 64
+    copy = memory[start : start + memory.size - 64].view(dtype)
+    copy[:] = values
+    return copy
 
 
 def _gather(points: mi.Point3f, index: mi.UInt) -> mi.Point3f:
@@ -487,7 +500,7 @@ def _pattern(antenna: Antenna, direction: np.ndarray, way: str) -> np.ndarray:
     if not len(direction):
         return np.zeros((0, antenna.ports, 2), dtype=complex)
     to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
-    look = mi.Vector3f(*direction.T.astype(np.float32))
+    look = mi.Vector3f(*(_aligned(axis, np.float32) for axis in direction.T))
     fields = [
         antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in _patterns(antenna)
     ]
