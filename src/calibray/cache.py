@@ -62,7 +62,7 @@ def trace_digest(
     }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     digest.update(scene.xml.encode())
-    for mesh in _meshes(scene):
+    for mesh in meshes(scene):
         digest.update(mesh.read_bytes())
     for position in (tx, rx):
         digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
@@ -115,7 +115,15 @@ def _path(digest: str) -> Path | None:
     return Path(folder) / f"{digest}.h5"
 
 
-def _meshes(scene: Scene) -> Iterator[Path]:
+def meshes(scene: Scene) -> Iterator[Path]:
+    """The mesh files of a scene.
+
+    Args:
+        scene: The scene.
+
+    Yields:
+        Their paths, in the file's order.
+    """
     for shape in ElementTree.fromstring(scene.xml).findall("shape"):
         filename = shape.find("string[@name='filename']")
         if filename is not None:

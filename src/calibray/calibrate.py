@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import engines
-from calibray.engines import Engine, Replay
+from calibray.engines import Engine, Recorded, Replay
 from calibray.errors import InputError
 from calibray.files import check_folder
 from calibray.likelihood import Interval, LogDistance, Objective, intervals, make_objective
@@ -36,6 +37,7 @@ def calibrate(
     out: str | Path | None = None,
     *,
     engine: Engine | None = None,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Calibrate a scene's materials against measurements.
@@ -44,8 +46,10 @@ def calibrate(
         study: The study.
         method: Method in place of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed in place of the study's.
-        out: Folder to save the result in; checked before anything is computed.
-        engine: Engine to run on, over all links of the study; made from the study if None.
+        out: Folder to save the result in; checked before anything is computed. The ledger of RT calls lies there,
+            and a run that was killed repeats none of them when it is started again.
+        engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
+        executor: What runs the calls of a batch on the engine "command".
         progress: Called as the work goes on.
 
     Returns:
@@ -63,7 +67,8 @@ def calibrate(
     links = study.measurements()
     study.split(links)  # refuses a hold-out that leaves nothing, before anything is traced
     if engine is None:
-        engine = engines.make(study, progress=_stage(progress, "tracing"))
+        ledger = None if out is None else Path(out) / engines.LEDGER_FILE
+        engine = engines.make(study, None, _stage(progress, "tracing"), ledger, executor)
     problem = Problem.of(study, links, engine)
     traced = time.perf_counter()
     run = search(problem, _optimizer(problem), progress)
@@ -160,6 +165,7 @@ class Run:
     best_loss: np.ndarray = field(default_factory=lambda: np.zeros(0))
     best_rmse_db: float = np.inf
     rt_calls: int = 0
+    ledger_hits: int = 0
 
     def add(
         self, candidates: np.ndarray, loss: np.ndarray, rmse_db: np.ndarray, iteration: int, now: float
@@ -203,7 +209,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     """
     engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
     derivatives = "jacobian" in optimizer.uses and isinstance(engine, Replay)
-    started, iteration, calls = time.perf_counter(), 0, engine.calls
+    started, iteration, calls, hits = time.perf_counter(), 0, engine.calls, _hits(engine)
     while not optimizer.done:
         points = optimizer.ask()
         candidates = from_search(parameters, points)
@@ -219,7 +225,9 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         run.add(candidates, loss, rmse, iteration, time.perf_counter() - started)
         if progress is not None:
             progress("calibrating", len(run.rmse_db), optimizer.budget)
-    run.rt_calls = engine.calls - calls
+    run.ledger_hits = _hits(engine) - hits
+    # What the ledger answered was paid for before, so that a run ends alike however often it was started again.
+    run.rt_calls = engine.calls - calls + run.ledger_hits
     if not np.isfinite(run.best_rmse_db):
         raise InputError(
             "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
@@ -267,6 +275,10 @@ def _gap(after: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Difference of path losses; 0 where neither has a path."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
+
+
+def _hits(engine: Engine) -> int:
+    return engine.hits if isinstance(engine, Recorded) else 0
 
 
 def to_search(parameters: Parameters, values: np.ndarray) -> np.ndarray:
@@ -371,6 +383,7 @@ def _result(
         log_distance_holdout_rmse_db=rmse(rival, judged),
         retrace_gap_db=None if gap is None else float(np.abs(gap[counted]).max()),
         rt_calls=run.rt_calls,
+        ledger_hits=run.ledger_hits,
         seconds=seconds,
         trace_seconds=trace_seconds,
         links=table,

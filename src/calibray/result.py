@@ -48,7 +48,8 @@ class Result:
         log_distance_holdout_rmse_db: Its RMSE over the links held out.
         retrace_gap_db: Largest change of a calibrated link's path loss when the scene is traced again with the
             materials found, [dB]; None where the paths do not depend on the materials.
-        rt_calls: RT calls that the method spent.
+        rt_calls: RT calls that the method spent, whether now or in an earlier run that left them in the ledger.
+        ledger_hits: How many of them the ledger answered.
         seconds: Time that the method took, tracing not included.
         trace_seconds: Time that tracing and loading took before.
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
@@ -72,6 +73,7 @@ class Result:
     log_distance_holdout_rmse_db: float | None
     retrace_gap_db: float | None
     rt_calls: int
+    ledger_hits: int
     seconds: float
     trace_seconds: float
     links: pd.DataFrame
@@ -119,6 +121,7 @@ class Result:
             "log_distance_holdout_rmse_db": self.log_distance_holdout_rmse_db,
             "retrace_gap_db": self.retrace_gap_db,
             "rt_calls": self.rt_calls,
+            "ledger_hits": self.ledger_hits,
             "seconds": self.seconds,
             "trace_seconds": self.trace_seconds,
             "parameters": self.parameters,

@@ -2,24 +2,37 @@
 
 - `Replay` evaluates stored paths: microseconds a candidate, with derivatives.
 - `Retrace` runs the ray tracer anew for every candidate: the cost model of the paper, and replay's rival.
+- `Command` asks any external program.
+- `Recorded` puts a `Ledger` before one of the latter two, so that no RT call is paid for twice.
 
 A run of one candidate over all links is an RT call. It is counted here, where the engine runs.
 """
 
 from calibray.engines.assembly import ENGINES, make, make_scene, make_tracer, traced_paths
-from calibray.engines.protocol import Engine, Progress, check_candidates
+from calibray.engines.command import Command
+from calibray.engines.ledger import LEDGER_FILE, Ledger
+from calibray.engines.pool import open_executor
+from calibray.engines.protocol import Answer, Answering, Engine, Progress, check_candidates
+from calibray.engines.recorded import Recorded
 from calibray.engines.replay import Replay
 from calibray.engines.retrace import Retrace
 
 __all__ = [
     "ENGINES",
+    "LEDGER_FILE",
+    "Answer",
+    "Answering",
+    "Command",
     "Engine",
+    "Ledger",
     "Progress",
+    "Recorded",
     "Replay",
     "Retrace",
     "check_candidates",
     "make",
     "make_scene",
     "make_tracer",
+    "open_executor",
     "traced_paths",
 ]

@@ -2,48 +2,107 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 from calibray import cache
+from calibray.engines.command import Command
+from calibray.engines.exchange import Surroundings
+from calibray.engines.fingerprint import fingerprint
+from calibray.engines.ledger import Ledger
+from calibray.engines.program import Program
 from calibray.engines.protocol import Progress
+from calibray.engines.recorded import Recorded
 from calibray.engines.replay import Replay
 from calibray.engines.retrace import Retrace
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements
+from calibray.parameters import Parameters
 from calibray.paths import Paths
 from calibray.scene import Scene, read_scene
 from calibray.study import Study
 from calibray.tracing import Tracer
 
-ENGINES: Final = ("replay", "retrace")
+ENGINES: Final = ("replay", "retrace", "command")
 
 
-def make(study: Study, name: str | None = None, progress: Progress | None = None) -> Replay | Retrace:
+def make(
+    study: Study,
+    name: str | None = None,
+    progress: Progress | None = None,
+    ledger: str | Path | None = None,
+    executor: Executor | None = None,
+) -> Replay | Retrace | Command | Recorded:
     """The engine of a study.
 
     Args:
         study: The study.
-        name: "replay" or "retrace"; the study's own if None.
-        progress: Called with (done, in all) after every chunk of receivers traced, or every candidate re-traced.
+        name: "replay", "retrace" or "command"; the study's own if None.
+        progress: Called with (done, in all) after every chunk of receivers traced, or every RT call of a batch.
+        ledger: SQLite file to keep RT calls in. Replay has no use for it: finding an answer there takes longer
+            than computing it.
+        executor: What runs the calls of a batch, for "command" only.
 
     Returns:
         The engine, over all links of the study, those held out included.
 
     Raises:
-        InputError: The engine is unknown, or the study's scene, links or parameters cannot be used.
+        InputError: The engine is unknown, or does not fit the study or the executor; the ledger cannot be used; or
+            the study's scene, links or parameters cannot be used.
     """
     name = name or study.engine.name
     if name not in ENGINES:
         raise InputError(f"engine {name!r}: must be one of {', '.join(ENGINES)}")
+    if executor is not None and name != "command":
+        raise InputError(
+            f"engine {name!r} runs in this process; --workers and --scheduler need engine 'command'"
+        )
     links = study.measurements()
     scene = make_scene(study)
     parameters = study.parameter_set(scene.materials)
     options = study.objective.combining, study.scene.bandwidth
+    if name == "replay":
+        return Replay(traced_paths(study, scene, links, progress), parameters, *options)
     if name == "retrace":
-        return Retrace(_tracer(study, scene), links, parameters, *options, progress)
-    return Replay(traced_paths(study, scene, links, progress), parameters, *options)
+        engine = Retrace(_tracer(study, scene), links, parameters, *options, progress)
+    else:
+        engine = _command(study, scene, links, parameters, executor, progress)
+    if ledger is None:
+        return engine
+    problem = fingerprint(study, scene, links, parameters, name)
+    return Recorded(engine, Ledger(ledger), problem, name)
+
+
+def _command(
+    study: Study,
+    scene: Scene,
+    links: Measurements,
+    parameters: Parameters,
+    executor: Executor | None,
+    progress: Progress | None,
+) -> Command:
+    section = study.engine
+    if section.command is None:
+        raise InputError(
+            f"{study.path}: engine 'command' needs engine.command, the program and its arguments, "
+            'as ["octave-cli", "model.m"]'
+        )
+    folder = study.path.resolve().parent
+    program = Program(section.command, folder, section.timeout, section.retries, section.format)
+    surroundings = Surroundings(
+        frequency=study.scene.frequency,
+        bandwidth=study.scene.bandwidth,
+        combining=study.objective.combining,
+        antennas=(study.antennas.tx, study.antennas.rx),
+        tx=links.tx,
+        rx=links.rx,
+    )
+    return Command(
+        program, surroundings, scene.materials, parameters, executor, progress, source=str(study.path)
+    )
 
 
 def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Progress | None = None) -> Paths:

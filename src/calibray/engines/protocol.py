@@ -1,13 +1,14 @@
-"""What every engine offers, and what no engine accepts."""
+"""What every engine offers, what no engine accepts, and answers as they arrive."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.parameters import Parameters
 
@@ -36,6 +37,62 @@ class Engine(Protocol):
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         """Path loss of every link for candidates [n, d] in the fields' units; [n, L], [dB], +inf without a path."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What an engine answered to one candidate.
+
+    Attributes:
+        index: Place of the candidate in the batch.
+        path_loss_db: Path loss [L], [dB]; +inf where a link has no path, and for all links of a failed call.
+        seconds: Time that the engine took [s].
+        failure: What went wrong, with the place; empty if nothing did.
+    """
+
+    index: int
+    path_loss_db: np.ndarray
+    seconds: float
+    failure: str = ""
+
+
+@runtime_checkable
+class Answering(Engine, Protocol):
+    """An engine whose calls are dear: it gives each answer of a batch as soon as it is there."""
+
+    @property
+    def num_links(self) -> int:
+        """Number of links L."""
+        ...
+
+    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+        """The answers to candidates [n, d] in the fields' units, in the order in which they arrive."""
+        ...
+
+
+def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> np.ndarray:
+    """The path loss of a batch from its answers, in whatever order they arrive.
+
+    Args:
+        answers: One answer per candidate.
+        shape: Number of candidates n and of links L.
+        first: Whether this is the first batch; if all of it fails, the engine is taken to be at fault.
+
+    Returns:
+        Path loss [n, L], [dB]; +inf for all links of a candidate that failed.
+
+    Raises:
+        EngineError: Every candidate of the first batch failed.
+    """
+    losses, failures = np.full(shape, np.inf), []
+    for answer in answers:
+        losses[answer.index] = answer.path_loss_db
+        if answer.failure:
+            failures.append(answer.failure)
+    if first and len(failures) == shape[0]:
+        more = f"; so did all {len(failures)} candidates of the first batch" if len(failures) > 1 else ""
+        raise EngineError(f"{failures[0]}{more}")
+    return losses
 
 
 def check_candidates(candidates: np.ndarray, width: int) -> np.ndarray:

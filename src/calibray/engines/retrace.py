@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 
 from calibray import fields
-from calibray.engines.protocol import Progress, check_candidates
+from calibray.engines.protocol import Answer, Progress, check_candidates
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
@@ -35,6 +38,7 @@ class Retrace:
         progress: Progress | None = None,
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(tracer.scene.materials), 0
+        self.num_links = len(links)
         self._tracer, self._links, self._progress = tracer, links, progress
         self._combining, self._bandwidth = combining, bandwidth
 
@@ -51,13 +55,27 @@ class Retrace:
             InputError: The candidates have another width, or a value is outside physics.
         """
         values = check_candidates(candidates, len(self.parameters))
-        losses = []
-        for done, candidate in enumerate(values):
-            losses.append(self._one(self.parameters.materials(candidate, self.materials)))
+        return np.stack([answer.path_loss_db for answer in self.answers(values)])
+
+    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+        """The answers to candidates, each as soon as it is there.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Yields:
+            The answers, in the order of the candidates.
+
+        Raises:
+            InputError: A value is outside physics.
+        """
+        for index, candidate in enumerate(candidates):
+            started = time.perf_counter()
+            loss = self._one(self.parameters.materials(candidate, self.materials))
             self.calls += 1
             if self._progress is not None:
-                self._progress(done + 1, len(values))
-        return np.array(losses).reshape(len(values), len(self._links))
+                self._progress(index + 1, len(candidates))
+            yield Answer(index, loss, time.perf_counter() - started)
 
     def _one(self, materials: dict[str, Material]) -> np.ndarray:
         self._tracer.set_materials(materials)

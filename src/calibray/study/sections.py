@@ -232,6 +232,29 @@ class EngineSection(Section):
 
     Attributes:
         name: "replay", "retrace" or "command".
+        command: The program that "command" calls, and its arguments.
+        timeout: Time that one attempt of the program may take [s].
+        retries: How often the program is tried again after a failure.
+        format: Format of the files exchanged with the program: "json" or "hdf5".
     """
 
     name: Literal["replay", "retrace", "command"] = "replay"
+    command: tuple[Text, ...] | None = None
+    timeout: Annotated[float, Field(gt=0)] = 3600.0
+    retries: Annotated[int, Field(ge=0)] = 2
+    format: Literal["json", "hdf5"] = "json"
+
+    @field_validator("command")
+    @classmethod
+    def _named(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if value is not None and not value:
+            raise InputError("must name the program to call")
+        return value
+
+    @model_validator(mode="after")
+    def _command_where_called(self) -> Self:
+        if self.name == "command" and self.command is None:
+            raise InputError(
+                "name = 'command' needs command, the program and its arguments, as [\"octave-cli\", \"model.m\"]"
+            )
+        return self

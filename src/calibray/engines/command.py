@@ -1,0 +1,122 @@
+"""Command: any external program, asked for every candidate with a file and answering with one."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from threading import Event
+
+import numpy as np
+
+from calibray.engines.exchange import Request, Surroundings
+from calibray.engines.program import Outcome, Program
+from calibray.engines.protocol import Answer, Progress, check_candidates, gather
+from calibray.materials import Material
+from calibray.parameters import Parameters
+
+
+class Command:
+    """An external program, called once for every candidate.
+
+    A call that fails in all its attempts costs that candidate alone: its links count as without a path. If every
+    candidate of the first batch fails, the program is taken to be at fault and the run ends.
+
+    Args:
+        program: How the program is called.
+        surroundings: What is the same for all candidates.
+        materials: The scene's materials before calibration.
+        parameters: What the candidates' components stand for.
+        executor: What runs the calls of a batch; one after the other if None.
+        progress: Called with (candidates run, candidates asked for) after every one.
+        source: The study file, for messages.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        surroundings: Surroundings,
+        materials: dict[str, Material],
+        parameters: Parameters,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+        source: str = "study",
+    ) -> None:
+        self.parameters, self.materials, self.calls = parameters, dict(materials), 0
+        self.num_links = len(surroundings.tx)
+        self._program, self._surroundings = program, surroundings
+        self._executor, self._progress, self._source = executor, progress, source
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        """Path loss of every link for candidates, as the program answers.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
+
+        Raises:
+            InputError: The candidates have another width, or a value is outside physics.
+            EngineError: Every candidate of the first batch failed.
+        """
+        first = not self.calls
+        values = check_candidates(candidates, len(self.parameters))
+        return gather(self.answers(values), (len(values), self.num_links), first)
+
+    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+        """The answers to candidates, each as soon as it is there.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Yields:
+            The answers, in the order in which they arrive.
+
+        Raises:
+            InputError: A value is outside physics.
+        """
+        requests = [self._request(candidate) for candidate in candidates]
+        if self._executor is None:
+            outcomes = ((index, self._program.run(request)) for index, request in enumerate(requests))
+        else:
+            outcomes = self._in_parallel(requests)
+        for done, (index, outcome) in enumerate(outcomes, start=1):
+            self.calls += 1
+            if self._progress is not None:
+                self._progress(done, len(requests))
+            failure = self._place(requests[index], outcome.failure) if outcome.failure else ""
+            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure)
+
+    def _in_parallel(self, requests: list[Request]) -> Iterator[tuple[int, Outcome]]:
+        # An event reaches threads only; programs on other machines run on until their time is up.
+        stop = Event() if isinstance(self._executor, ThreadPoolExecutor) else None
+        futures = {
+            self._executor.submit(self._program.run, request, stop): k for k, request in enumerate(requests)
+        }
+        try:
+            for future in as_completed(futures):
+                yield futures[future], self._outcome(future)
+        finally:
+            if stop is not None:
+                stop.set()
+            for future in futures:
+                future.cancel()
+
+    def _outcome(self, future: Future[Outcome]) -> Outcome:
+        try:
+            return future.result()
+        except Exception as error:  # a worker that died costs the candidates it was on, not the batch
+            lost = np.full(self.num_links, np.inf)
+            return Outcome(lost, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
+
+    def _request(self, candidate: np.ndarray) -> Request:
+        return Request(
+            self._surroundings,
+            self.parameters.materials(candidate, self.materials),
+            dict(zip(self.parameters.names, candidate.tolist(), strict=True)),
+        )
+
+    def _place(self, request: Request, failure: str) -> str:
+        values = ", ".join(f"{name} = {value:.6g}" for name, value in request.parameters.items())
+        return f"{self._source}: engine.command `{shlex.join(self._program.words)}` at {values}: {failure}"

@@ -1,0 +1,178 @@
+"""What an external program is asked and what it answers: the files of the command engine, in JSON or HDF5.
+
+The formats are documented for programs' authors in `docs/command-engine.md`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+
+from calibray.materials import Material
+from calibray.settings import Antenna
+
+SCHEMA: Final = "calibray.request"
+VERSION: Final = 1
+FORMATS: Final = ("json", "hdf5")
+ANSWER: Final = "path_loss_db"
+_WITHOUT_PATH: Final = (None, "inf", "Infinity")
+
+
+class Unusable(ValueError):
+    """An answer that is missing, malformed, of the wrong length, or no number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is the same for all candidates of a study.
+
+    Attributes:
+        frequency: Carrier frequency [Hz].
+        bandwidth: Bandwidth [Hz], or None.
+        combining: How a link's paths combine: "power", "coherent" or "band".
+        antennas: Transmit and receive antenna.
+        tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+    """
+
+    frequency: float
+    bandwidth: float | None
+    combining: str
+    antennas: tuple[Antenna, Antenna]
+    tx: np.ndarray
+    rx: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """One RT call asked of a program.
+
+    Attributes:
+        surroundings: What is the same for all candidates.
+        materials: All materials of the scene with the candidate's values, by name.
+        parameters: The candidate's values by parameter name, in the fields' units.
+    """
+
+    surroundings: Surroundings
+    materials: Mapping[str, Material]
+    parameters: Mapping[str, float]
+
+    def write(self, path: Path, file_format: str) -> None:
+        """Write the request.
+
+        Args:
+            path: The file.
+            file_format: "json" or "hdf5".
+        """
+        if file_format == "json":
+            path.write_text(json.dumps(self._content()) + "\n", encoding="utf-8")
+        else:
+            self._write_hdf5(path)
+
+    def _head(self) -> dict[str, Any]:
+        around = self.surroundings
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "frequency": around.frequency,
+            "bandwidth": around.bandwidth,
+            "combining": around.combining,
+        }
+
+    def _content(self) -> dict[str, Any]:
+        # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and so would
+        # garble names such as "walls.relative_permittivity".
+        around = self.surroundings
+        return self._head() | {
+            "antennas": {
+                end: asdict(antenna) for end, antenna in zip(("tx", "rx"), around.antennas, strict=True)
+            },
+            "links": {"tx": around.tx.tolist(), "rx": around.rx.tolist()},
+            "materials": [{"name": name, **asdict(material)} for name, material in self.materials.items()],
+            "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
+        }
+
+    def _write_hdf5(self, path: Path) -> None:
+        around = self.surroundings
+        with h5py.File(path, "w") as file:
+            file.attrs.update({key: value for key, value in self._head().items() if value is not None})
+            for end, antenna in zip(("tx", "rx"), around.antennas, strict=True):
+                file.create_group(f"antennas/{end}").attrs.update(asdict(antenna))
+            file["links/tx"], file["links/rx"] = around.tx, around.rx
+            materials = file.create_group("materials", track_order=True)
+            for name, material in self.materials.items():
+                materials.create_group(name.replace("/", "_")).attrs.update(
+                    {"name": name, **asdict(material)}
+                )
+            file["parameters/names"] = list(self.parameters)
+            file["parameters/values"] = list(self.parameters.values())
+
+
+def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:
+    """Read the path loss that a program answered.
+
+    Args:
+        path: The file.
+        file_format: "json" or "hdf5".
+        num_links: Number of links L.
+
+    Returns:
+        Path loss [L], [dB]; +inf where a link has no path.
+
+    Raises:
+        Unusable: The file is missing or malformed, or its values are not one path loss per link.
+    """
+    if not path.is_file():
+        raise Unusable("it wrote no response file")
+    values = _read_json(path) if file_format == "json" else _read_hdf5(path)
+    if values.shape != (num_links,):
+        raise Unusable(
+            f"its response holds {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
+        )
+    wrong = np.isnan(values) | np.isneginf(values)
+    if wrong.any():
+        link = int(np.argmax(wrong))
+        raise Unusable(
+            f"its response holds {ANSWER}[{link}] = {values[link]}; must be a number, or infinite without a path"
+        )
+    return values
+
+
+def _read_json(path: Path) -> np.ndarray:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise Unusable(f"its response is no JSON ({error})") from None
+    if not isinstance(content, dict) or ANSWER not in content:
+        raise Unusable(f"its response has no key {ANSWER!r}")
+    entries = content[ANSWER]
+    # MATLAB writes a list of one number as that number.
+    return np.array([_number(entry) for entry in (entries if isinstance(entries, list) else [entries])])
+
+
+def _number(entry: Any) -> float:
+    if entry in _WITHOUT_PATH:
+        return np.inf
+    if isinstance(entry, bool) or not isinstance(entry, int | float):
+        raise Unusable(f"its response holds {json.dumps(entry)[:80]} in {ANSWER}, which is no number")
+    try:
+        return float(entry)
+    except OverflowError:
+        raise Unusable(f"its response holds a number in {ANSWER} that is too large") from None
+
+
+def _read_hdf5(path: Path) -> np.ndarray:
+    try:
+        with h5py.File(path, "r") as file:
+            values = np.asarray(file[ANSWER][()], dtype=float)
+    except KeyError:
+        raise Unusable(f"its response has no dataset {ANSWER!r}") from None
+    except (OSError, TypeError, ValueError, AttributeError) as error:
+        raise Unusable(f"its response is no HDF5 file with the numbers {ANSWER!r} ({error})") from None
+    return values.reshape(-1) if values.size == max(values.shape, default=1) else values

@@ -1,0 +1,61 @@
+"""What an engine's answers depend on besides the candidate, as a fingerprint."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from importlib.metadata import version
+
+from calibray.cache import meshes
+from calibray.measurements import Measurements
+from calibray.parameters import Parameters
+from calibray.scene import Scene
+from calibray.study import Study
+
+TRACER: tuple[str, ...] = ("sionna-rt", "mitsuba", "drjit")
+
+
+def fingerprint(study: Study, scene: Scene, links: Measurements, parameters: Parameters, engine: str) -> str:
+    """The problem that an engine solves for each candidate.
+
+    Method and seed do not count, nor do measured values, bounds and starts: calls are shared by all that vary them.
+    For re-tracing the versions of the tracer count; a program's own version cannot be known, its words count.
+
+    Args:
+        study: The study.
+        scene: Its scene.
+        links: Its links.
+        parameters: What the candidates' components stand for.
+        engine: Name of the engine.
+
+    Returns:
+        SHA-256 in hexadecimal.
+    """
+    free = set(parameters.names)
+    record = {
+        "engine": engine,
+        "made by": [version(name) for name in TRACER] if engine == "retrace" else study.engine.command,
+        "frequency": study.scene.frequency,
+        "bandwidth": study.scene.bandwidth,
+        "combining": study.objective.combining,
+        "antennas": [asdict(study.antennas.tx), asdict(study.antennas.rx)],
+        "trace": study.trace.record(),
+        "parameters": list(parameters.names),
+        "materials": {
+            name: {
+                constant: value
+                for constant, value in asdict(material).items()
+                if f"{name}.{constant}" not in free
+            }
+            for name, material in scene.materials.items()
+        },
+        "objects": [asdict(entry) for entry in scene.objects],
+    }
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
+    digest.update(scene.xml.encode())
+    for mesh in meshes(scene):
+        digest.update(mesh.read_bytes())
+    for positions in (links.tx, links.rx):
+        digest.update(positions.astype("<f8").tobytes())
+    return digest.hexdigest()
