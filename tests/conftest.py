@@ -1,0 +1,20 @@
+"""What all tests share: reproducible property tests, and the folder with measured data."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# Every run draws the same examples, and a busy machine fails no test.
+settings.register_profile("calibray", derandomize=True, deadline=None)
+settings.load_profile("calibray")
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder with measured data, which is no part of the repository."""
+    folder = Path(os.environ.get("CALIBRAY_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not (folder / "nist_boulder").is_dir():
+        pytest.skip(f"no measured data in {folder}; name their folder in CALIBRAY_DATA")
+    return folder
