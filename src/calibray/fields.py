@@ -16,7 +16,7 @@ Precision follows the program: float64 by default, as `jax_enable_x64` is switch
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -36,6 +36,9 @@ from calibray.scattering import pattern_value
 
 jax.config.update("jax_enable_x64", True)
 
+Fields = tuple[slab.Pair, slab.Pair]
+Pieces = tuple[tuple[Fields, ...], tuple[tuple[jax.Array, jax.Array], ...]]
+
 COMBINING: Final = ("power", "coherent", "band")
 _LETTER: Final = {Kind.SPECULAR: "c", Kind.REFRACTION: "c", Kind.DIFFUSE: "s", Kind.DIFFRACTION: "d"}
 _FIELD: Final = {name: column for column, name in enumerate(FIELDS)}
@@ -44,7 +47,7 @@ _FIELD: Final = {name: column for column, name in enumerate(FIELDS)}
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["scale", "tx", "rx", "rotation", "turn", "wedge"],
-    meta_fields=["signature", "size", "start", "scatter"],
+    meta_fields=["signature", "size"],
 )
 @dataclass(frozen=True)
 class Group:
@@ -59,8 +62,6 @@ class Group:
         wedge: Per position the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
         signature: One letter an interaction: c coefficient (reflection or transmission), s scattering, d diffraction.
         size: Number of paths n.
-        start: Per position the first of its n coefficients in the flat arrays; a diffraction has 2 n, face after face.
-        scatter: Per position the first of its n rows in the table of diffuse interactions, or None.
     """
 
     scale: jax.Array
@@ -71,8 +72,6 @@ class Group:
     wedge: tuple
     signature: str
     size: int
-    start: tuple[int, ...]
-    scatter: tuple[int | None, ...]
 
 
 @partial(
@@ -203,28 +202,23 @@ def layout(paths: Paths, dtype: type = np.float64, intervals: int | None = None)
 
 
 class _Flat:
-    """Collects, position by position, which interactions the flat arrays hold."""
+    """Collects, position by position, which interactions the flat arrays hold; a diffraction twice, face after face."""
 
     def __init__(self, paths: Paths) -> None:
         self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []
-        self._length, self._rows = 0, 0
         self.table_row = np.maximum(_row_of(paths.kind, Kind.DIFFUSE), _row_of(paths.kind, Kind.DIFFRACTION))
 
-    def add(self, interaction: np.ndarray, kind: int) -> tuple[int, int | None]:
-        """Append one position's interactions; where their coefficients and their diffuse rows begin."""
-        start, row = self._length, None
+    def add(self, interaction: np.ndarray, kind: int) -> None:
+        """Append one position's interactions."""
         self._append(interaction, self._paths.cos_incidence[interaction])
         if kind == Kind.DIFFRACTION:
             self._append(interaction, self._paths.diffraction.cos_incidence_n[self.table_row[interaction]])
         if kind == Kind.DIFFUSE:
-            row, self._rows = self._rows, self._rows + len(interaction)
             self._scattered.append(interaction)
-        return start, row
 
     def _append(self, interaction: np.ndarray, cosine: np.ndarray) -> None:
         self._interactions.append(interaction)
         self._cosines.append(cosine)
-        self._length += len(interaction)
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Interaction and cosine of every coefficient [J]."""
@@ -247,11 +241,9 @@ def _row_of(kind: np.ndarray, which: Kind) -> np.ndarray:
 def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type) -> Group:
     at = paths.first[index] + np.arange(depth)[:, None]  # interactions [k, n]
     kinds = [int(kind) for kind in paths.kind[at[:, 0]]] if depth else []
-    turn, wedge, start, scatter = [], [], [], []
+    turn, wedge = [], []
     for kind, interaction in zip(kinds, at, strict=True):
-        first, row = flat.add(interaction, kind)
-        start.append(first)
-        scatter.append(row)
+        flat.add(interaction, kind)
         rows = flat.table_row[interaction]
         turn.append(
             jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if kind == Kind.DIFFUSE else None
@@ -268,8 +260,6 @@ def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type
         wedge=tuple(wedge),
         signature="".join(_LETTER[Kind(kind)] for kind in kinds),
         size=len(index),
-        start=tuple(start),
-        scatter=tuple(scatter),
     )
 
 
@@ -356,23 +346,58 @@ def local_values(program: Program, table: jax.Array) -> Local:
     )
 
 
-def _group_gains(group: Group, local: Local) -> slab.Pair:
-    """Gains of one group's paths, real and imaginary part [R, T, n]."""
+def _split(program: Program, local: Local) -> tuple[Pieces, ...]:
+    """The contributions of the materials cut into what each position of each group takes, in the order of the program.
+
+    Derivatives are taken by these pieces: by the flat arrays, every piece would cost a pass over all of them.
+    """
+    pieces, at, row = [], 0, 0
+    for group in program.groups:
+        coefficients, diffuse = [], []
+        for letter in group.signature:
+            for _ in range(2 if letter == "d" else 1):
+                end = at + group.size
+                coefficients.append(
+                    tuple((pair[0][at:end], pair[1][at:end]) for pair in (local.te, local.tm))
+                )
+                at = end
+            if letter == "s":
+                diffuse.append((local.amplitude[row : row + group.size], local.xpd[row : row + group.size]))
+                row += group.size
+        pieces.append((tuple(coefficients), tuple(diffuse)))
+    return tuple(pieces)
+
+
+def _join(pieces: tuple[Pieces, ...], like: Local) -> Local:
+    """The inverse of `_split`."""
+    coefficients = [piece for group, _ in pieces for piece in group]
+    diffuse = [piece for _, group in pieces for piece in group]
+
+    def joined(parts: list[jax.Array], empty: jax.Array) -> jax.Array:
+        return jnp.concatenate(parts) if parts else empty
+
+    return Local(
+        te=tuple(joined([piece[0][part] for piece in coefficients], like.te[part]) for part in range(2)),
+        tm=tuple(joined([piece[1][part] for piece in coefficients], like.tm[part]) for part in range(2)),
+        amplitude=joined([piece[0] for piece in diffuse], like.amplitude),
+        xpd=joined([piece[1] for piece in diffuse], like.xpd),
+    )
+
+
+def _group_gains(group: Group, pieces: Pieces, keep: Callable[[Fields], Fields]) -> slab.Pair:
+    """Gains of one group's paths, real and imaginary part [R, T, n]; `keep` is applied to the field at every step."""
     te, tm = (group.tx[0, :, 0], group.tx[1, :, 0]), (group.tx[0, :, 1], group.tx[1, :, 1])  # [T, n]
+    coefficients, diffuse = (iter(part) for part in pieces)
     for step, letter in enumerate(group.signature):
         te, tm = _turn(group.rotation[step], te, tm)
-        c_te, c_tm = (_slice(pair, group.start[step], group.size) for pair in (local.te, local.tm))
+        c_te, c_tm = next(coefficients)
         if letter == "c":
             te, tm = _times(c_te, te), _times(c_tm, tm)
         elif letter == "s":
-            first = group.scatter[step]
-            amplitude, xpd = (value[first : first + group.size] for value in (local.amplitude, local.xpd))
-            te, tm = _scatter(te, tm, c_te, c_tm, amplitude, xpd, group.turn[step])
+            te, tm = _scatter(te, tm, c_te, c_tm, *next(diffuse), group.turn[step])
         else:
-            n_te, n_tm = (
-                _slice(pair, group.start[step] + group.size, group.size) for pair in (local.te, local.tm)
-            )
-            te, tm = _diffract(te, tm, (c_te, c_tm, n_te, n_tm), group.wedge[step])
+            te, tm = _diffract(te, tm, (c_te, c_tm, *next(coefficients)), group.wedge[step])
+        te, tm = keep((te, tm))
     real = imaginary = 0.0
     for component, field in enumerate((te, tm)):  # E_rx^H E
         rx_real, rx_imaginary = group.rx[:, :, component][:, :, None, :]  # [R, 1, n]
@@ -391,10 +416,6 @@ def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, s
 
 def _times(a: slab.Pair, b: slab.Pair) -> slab.Pair:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _slice(pair: slab.Pair, start: int, size: int) -> slab.Pair:
-    return pair[0][start : start + size], pair[1][start : start + size]
 
 
 def _scatter(
@@ -449,7 +470,11 @@ def gains(program: Program, local: Local) -> slab.Pair:
     Returns:
         Gains in the order of the groups, real and imaginary part [R, T, P].
     """
-    parts = [_group_gains(group, local) for group in program.groups]
+    return _gains_of(program, _split(program, local), lambda field: field)
+
+
+def _gains_of(program: Program, pieces: tuple[Pieces, ...], keep: Callable[[Fields], Fields]) -> slab.Pair:
+    parts = [_group_gains(group, piece, keep) for group, piece in zip(program.groups, pieces, strict=True)]
     if not parts:
         empty = jnp.zeros((1, 1, 0), dtype=program.wavelength.dtype)
         return empty, empty
@@ -507,9 +532,16 @@ def power_and_slope(
     Returns:
         Power gain [L], and the derivatives in the form of the contributions.
     """
-    power, pull = jax.vjp(lambda local: program_power(program, local, combining, offsets), local)
+    keep = partial(
+        slab.keep, positive=program.wavelength
+    )  # else fields are computed once more for each later use
+
+    def power_of(pieces: tuple[Pieces, ...]) -> jax.Array:
+        return _combined(program, _gains_of(program, pieces, keep), combining, offsets)
+
+    power, pull = jax.vjp(power_of, _split(program, local))
     (slope,) = pull(jnp.ones_like(power))
-    return power, slope
+    return power, _join(slope, local)
 
 
 def decibel_slope(
@@ -565,10 +597,12 @@ def program_power(
     Returns:
         Power gain [L]; 0 where a link has no path.
     """
+    return _combined(program, gains(program, local), combining, offsets)
+
+
+def _combined(program: Program, gain: slab.Pair, combining: str, offsets: jax.Array | None) -> jax.Array:
     frequency = speed_of_light / program.wavelength
-    return link_power(
-        gains(program, local), program.link, program.delay, program.num_links, frequency, combining, offsets
-    )
+    return link_power(gain, program.link, program.delay, program.num_links, frequency, combining, offsets)
 
 
 def link_power(
