@@ -132,7 +132,15 @@ def run(
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed in place of the study's.")] = None,
     engine: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Engine in place of the study's: replay or retrace.")
+        str | None,
+        typer.Option(metavar="NAME", help="Engine in place of the study's: replay, retrace or command."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", help="Programs of the engine 'command' that run at once here.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the engine 'command'."),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
@@ -141,13 +149,13 @@ def run(
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
     from calibray import terminal
     from calibray.calibrate import calibrate
-    from calibray.engines import make_tracer
+    from calibray.engines import make_tracer, open_executor
     from calibray.result import FILES
     from calibray.study import Study
 
     study = Study.load(study_file).replace(engine=engine)
-    with terminal.progress_bars(log) as progress:
-        result = calibrate(study, method, seed, out, progress=progress)
+    with open_executor(workers, scheduler) as executor, terminal.progress_bars(log) as progress:
+        result = calibrate(study, method, seed, out, executor=executor, progress=progress)
     enclosed = _enclosed(make_tracer(study), study.measurements())
     if as_json:
         typer.echo(json.dumps(result.content() | {"links": terminal.summary(result, enclosed)}, indent=2))
@@ -227,6 +235,42 @@ def predict(
             f"Warning: no path leads to {len(lost)} of {len(links)} links, {terminal.rows_text(lost)}",
             err=True,
         )
+
+
+@app.command()
+def ledger(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Folder that `calibray run` writes into.", show_default=False),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write, with every link's path loss."
+        ),
+    ] = None,
+    forget_failed: Annotated[
+        bool, typer.Option("--forget-failed", help="Take out failed calls, so that they are run again.")
+    ] = False,
+) -> None:
+    """List or export the RT calls that were paid for."""
+    from contextlib import closing
+
+    from calibray import terminal
+    from calibray.engines import open_ledger
+    from calibray.files import check_table, write_table
+
+    if out is not None:
+        check_table(out)
+    with closing(open_ledger(folder)) as store:
+        if forget_failed:
+            typer.echo(f"Taken out: {store.forget_failures()} failed calls", err=True)
+        table = store.table(path_loss=out is not None)
+    if out is not None:
+        write_table(out, table)
+        typer.echo(f"Written to {out}: {len(table)} calls", err=True)
+    else:
+        typer.echo(terminal.render_table(*terminal.calls_table(table)))
 
 
 def _enclosed(tracer: Tracer, links: Measurements) -> Enclosed:

@@ -9,6 +9,7 @@ from io import StringIO
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.progress import (
@@ -239,6 +240,7 @@ def _accuracy(result: Result) -> str:
 def _costs(result: Result) -> str:
     rows = [
         ("RT calls", f"{result.rt_calls:,}"),
+        *([("answered by the ledger", f"{result.ledger_hits:,}")] if result.ledger_hits else []),
         *(
             []
             if result.retrace_gap_db is None
@@ -252,6 +254,26 @@ def _costs(result: Result) -> str:
 
 def _decibels(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
+
+
+def calls_table(table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """RT calls for `render_table`.
+
+    Args:
+        table: A ledger's table, without the columns of links.
+
+    Returns:
+        The headings and the rows; of a message only the first line.
+    """
+    message = table.message.str.split("\n").str[0]
+    columns = [name for name in table.columns if name != "message"]
+    numbers = [name for name in columns if pd.api.types.is_numeric_dtype(table[name])]
+    rows = [
+        [f"{value:.6g}" if name in numbers else str(value) for name, value in zip(columns, row, strict=True)]
+        for row in table[columns].itertuples(index=False)
+    ]
+    headings = [f">{name}" if name in numbers else name for name in columns]
+    return [*headings, "message"], [[*row, text] for row, text in zip(rows, message, strict=True)]
 
 
 def render_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -10,7 +10,7 @@ A run of one candidate over all links is an RT call. It is counted here, where t
 
 from calibray.engines.assembly import ENGINES, make, make_scene, make_tracer, traced_paths
 from calibray.engines.command import Command
-from calibray.engines.ledger import LEDGER_FILE, Ledger
+from calibray.engines.ledger import LEDGER_FILE, Ledger, open_ledger
 from calibray.engines.pool import open_executor
 from calibray.engines.protocol import Answer, Answering, Engine, Progress, check_candidates
 from calibray.engines.recorded import Recorded
@@ -34,5 +34,6 @@ __all__ = [
     "make_scene",
     "make_tracer",
     "open_executor",
+    "open_ledger",
     "traced_paths",
 ]

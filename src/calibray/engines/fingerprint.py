@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict
 from importlib.metadata import version
+from xml.etree import ElementTree
 
 from calibray.cache import meshes
 from calibray.measurements import Measurements
@@ -53,9 +54,17 @@ def fingerprint(study: Study, scene: Scene, links: Measurements, parameters: Par
         "objects": [asdict(entry) for entry in scene.objects],
     }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
-    digest.update(scene.xml.encode())
+    digest.update(_geometry(scene))
     for mesh in meshes(scene):
         digest.update(mesh.read_bytes())
     for positions in (links.tx, links.rx):
         digest.update(positions.astype("<f8").tobytes())
     return digest.hexdigest()
+
+
+def _geometry(scene: Scene) -> bytes:
+    """The scene without its materials' constants, of which free parameters must not count."""
+    root = ElementTree.fromstring(scene.xml)
+    for constants in root.findall("bsdf"):
+        root.remove(constants)
+    return ElementTree.tostring(root)

@@ -23,6 +23,7 @@ from calibray.errors import InputError
 LEDGER_FILE: Final = "ledger.sqlite"
 VERSION: Final = 1
 PATIENCE: Final = 60.0  # how long to wait for others to finish writing [s]
+COLUMNS: Final = ("problem", "engine", "time", "seconds", "status", "message")
 _TABLES: Final = (
     """CREATE TABLE IF NOT EXISTS problems (
         problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID""",
@@ -165,19 +166,33 @@ class Ledger:
         )
         records = []
         for problem, engine, when, seconds, failure, parameters, candidate, loss in rows:
-            record = {
-                "problem": problem[:12],
-                "engine": engine,
-                "time": when,
-                "seconds": seconds,
-                "status": "failed" if failure else "ok",
-                "message": failure,
-            }
+            status = "failed" if failure else "ok"
+            record = dict(zip(COLUMNS, (problem[:12], engine, when, seconds, status, failure), strict=True))
             record |= zip(json.loads(parameters), np.frombuffer(candidate, "<f8").tolist(), strict=True)
             if path_loss:
                 record |= {f"link_{k}": value for k, value in enumerate(np.frombuffer(loss, "<f8"), start=1)}
             records.append(record)
-        return pd.DataFrame(records)
+        return pd.DataFrame(records, columns=None if records else COLUMNS)
+
+
+def open_ledger(folder: str | Path) -> Ledger:
+    """The ledger of a folder that `calibray run` writes into.
+
+    Args:
+        folder: The folder.
+
+    Returns:
+        Its ledger.
+
+    Raises:
+        InputError: There is none, or it cannot be read.
+    """
+    path = Path(folder) / LEDGER_FILE
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such ledger; name a folder that `calibray run` wrote with engine retrace or command"
+        )
+    return Ledger(path)
 
 
 def key(candidate: np.ndarray) -> bytes:
