@@ -25,6 +25,7 @@ from calibray.spelling import did_you_mean
 from calibray.study import Study
 
 AUTO: Final = "auto"
+FEW_STARTS: Final = 16  # local searches on a large program
 
 Progress = Callable[[str, int, int | None], None]
 """Called with what is done, how much of it, and out of how much (None if unknown)."""
@@ -332,6 +333,8 @@ def _optimizer(problem: Problem) -> Optimizer:
         if not isinstance(problem.engine, Replay):
             raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
         options.setdefault("x0", to_search(parameters, parameters.start))
+        if problem.engine.large:  # a candidate costs milliseconds there
+            options.setdefault("starts", FEW_STARTS)
     return make_optimizer(name, parameters, section.seed, **options)
 
 

@@ -31,7 +31,8 @@ class Replay:
         parameters: What the candidates' components stand for.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        dtype: Precision, `numpy.float64` or `numpy.float32`.
+        dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
+            combine by power.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -43,9 +44,11 @@ class Replay:
         parameters: Parameters,
         combining: str = "power",
         bandwidth: float | None = None,
-        dtype: type = np.float64,
+        dtype: type | None = None,
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
+        if dtype is None:
+            dtype = np.float32 if self.large and combining == "power" else np.float64
         self._dtype = dtype
         self._offsets = fields.check_combining(paths, combining, bandwidth)
         self._combining = combining
@@ -54,10 +57,15 @@ class Replay:
         self._columns = columns
         self._base = jnp.asarray(fields.constants(paths).astype(dtype))
         self._fields = tuple(int(column) for column in used)
-        self._intervals = FIRST_INTERVALS if paths.num_interactions > TABULATED else None
+        self._intervals = FIRST_INTERVALS if self.large else None
         self._program = fields.layout(paths, dtype, self._intervals).program
         room = max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
         self._sizes = [size for size in BLOCK_SIZES if size <= room]
+
+    @property
+    def large(self) -> bool:
+        """Whether there are so many interactions that coefficients come from tables."""
+        return self.paths.num_interactions > TABULATED
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         """Path loss of every link for candidates.
@@ -110,7 +118,7 @@ class Replay:
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
             tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
             self._refine(tables)
-            parts.append([np.asarray(part)[: len(block)] for part in function(tables)])
+            parts.append([np.asarray(part, dtype=float)[: len(block)] for part in function(tables)])
             start += len(block)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
