@@ -9,6 +9,7 @@ transmit field and the last one in the receive field.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from pathlib import Path
@@ -179,6 +180,9 @@ class Paths:
             raise InputError(
                 f"{target}: cannot be written ({error}); name a file in a writable folder"
             ) from None
+        finally:
+            with suppress(OSError):  # nothing half-written stays behind
+                partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | Path) -> Paths:
