@@ -1,0 +1,55 @@
+"""The example in MATLAB/Octave: a program that Calibray knows nothing of, against the ray tracer."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibray import engines
+from calibray.calibrate import calibrate
+from calibray.errors import EngineError
+from calibray.study import Study
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "octave_canyon"
+TRUTH = np.array([[6.4, 15.0]])
+pytestmark = pytest.mark.skipif(shutil.which("octave-cli") is None, reason="GNU Octave is not installed")
+
+
+def example(**sections) -> Study:
+    """The example's study; sections given replace its own."""
+    study = Study.load(EXAMPLE / "study.toml")
+    return Study.from_content(study.content() | sections, study.path)
+
+
+@pytest.mark.parametrize("combining", ["power", "coherent"])
+def test_the_program_agrees_with_the_ray_tracer(combining):
+    study = example(objective={"combining": combining})
+    candidates = np.vstack([TRUTH, [[1.8, 27.0]]])
+    program = engines.make(study).path_loss(candidates)
+    assert program == pytest.approx(engines.make(study, "replay").path_loss(candidates), abs=1e-3)
+    assert np.abs(program[0] - program[1]).max() > 1.0
+
+
+def test_the_links_are_simulated_with_the_values_that_the_readme_names():
+    study = example()
+    error = engines.make(study).path_loss(TRUTH)[0] - study.measurements().path_loss_db
+    assert 0.3 < np.sqrt(np.mean(error**2)) < 0.7
+
+
+def test_a_calibration_on_the_program_ends(tmp_path):
+    study = example(method={"name": "random", "options": {"budget": 6}})
+    with engines.open_executor(workers=2) as executor:
+        result = calibrate(study, out=tmp_path, executor=executor)
+    assert result.rt_calls == 6
+    assert result.rmse_db < result.initial_rmse_db
+
+
+def test_a_request_that_the_program_cannot_serve_is_refused_in_its_own_words():
+    study = example(
+        antennas={"tx": {"pattern": "dipole"}}, engine=example().content()["engine"] | {"retries": 0}
+    )
+    with pytest.raises(EngineError, match="only isotropic antennas are programmed"):
+        engines.make(study).path_loss(TRUTH)
