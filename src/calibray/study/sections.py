@@ -255,6 +255,6 @@ class EngineSection(Section):
     def _command_where_called(self) -> Self:
         if self.name == "command" and self.command is None:
             raise InputError(
-                "name = 'command' needs command, the program and its arguments, as [\"octave-cli\", \"model.m\"]"
+                'name = \'command\' needs command, the program and its arguments, as ["octave-cli", "model.m"]'
             )
         return self
