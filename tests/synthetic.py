@@ -13,15 +13,15 @@ from calibray.paths import Diffraction, Diffuse, Kind, Paths
 MATERIALS = {
     "walls": Material(4.3, 0.08, 0.18, 0.35, 0.2),
     "glass": Material(6.1, 0.02, 0.009, 0.5, 0.1, "directive", alpha_r=3.4),
-    "ground": Material(2.7, 0.3, 0.4, 0.6, 0.3, "backscattering", alpha_r=5.6, alpha_i=2.5, lambda_=0.6),
+    "ground": Material(2.7, 0.09, 0.05, 0.6, 0.3, "backscattering", alpha_r=5.6, alpha_i=2.5, lambda_=0.6),
 }
 EVERY_KIND = [
     (),
     (Kind.SPECULAR,),
     (Kind.REFRACTION, Kind.SPECULAR),
-    (Kind.DIFFUSE,),
     (Kind.SPECULAR, Kind.DIFFUSE, Kind.REFRACTION),
     (Kind.DIFFUSE, Kind.DIFFUSE),
+    (Kind.DIFFUSE,),
     (Kind.DIFFRACTION,),
     (Kind.SPECULAR, Kind.DIFFRACTION, Kind.SPECULAR),
 ]
@@ -72,7 +72,7 @@ def program(
         rotation=_rotations(random, (count,)),
         diffuse=Diffuse(
             rotation=_rotations(random, (diffuse,)),
-            solid_angle=random.uniform(0.1, 1, diffuse),
+            solid_angle=random.uniform(1, 6, diffuse),
             cos_scattered=random.uniform(0.2, 1, diffuse),
             cos_specular=random.uniform(-0.9, 0.9, diffuse),
             cos_backward=random.uniform(-0.9, 0.9, diffuse),
