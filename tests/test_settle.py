@@ -8,6 +8,7 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibrate import calibrate
+from calibray.paths import take
 
 
 def stronger(decibels):
@@ -75,3 +76,14 @@ def test_a_method_with_a_budget_keeps_to_it(tmp_path, retraced):
     assert result.rt_calls == 225
     assert retraced[1] == [0.8]
     assert result.retrace_gap_db == pytest.approx(0.8, abs=1e-9)
+
+
+def test_a_link_that_the_new_trace_loses_is_left_out_and_told(tmp_path, monkeypatch):
+    paths = stronger(0.8)
+    kept = take(paths, np.flatnonzero(paths.link != 3))
+    monkeypatch.setattr(engines, "traced_paths", lambda *_: kept)
+    result = run(tmp_path, offset={"bounds": [-5.0, 5.0]})
+    assert not result.links["has_path"][3]
+    assert result.links["has_path"].sum() == planted.LINKS - 1
+    assert np.isfinite(result.rmse_db)
+    assert np.isfinite(result.retrace_gap_db)

@@ -263,19 +263,28 @@ def settle(
         paths = engines.traced_paths(study, scene, problem.links, _stage(progress, "checking"))
         again = Replay(paths, engine.parameters, study.objective.combining, study.scene.bandwidth)
         gap = _gap(again.path_loss(run.best[None])[0], run.best_loss)
-        counted = problem.objective.weight > 0
-        settled = np.abs(gap[counted]).max() <= study.fidelity.tolerance_db
+        objective = problem.objective
+        settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
         if settled or study.method.name != AUTO or turn == study.fidelity.rounds - 1:
             break
-        moved = replace(problem, engine=again)
+        if objective.ceiling_db is None:  # a link that the new trace does not reach is left out from here on
+            objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
+        moved = replace(problem, engine=again, objective=objective)
         run, problem = search(moved, _optimizer(moved), progress), moved
     return problem, run, gap
 
 
 def _gap(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Difference of path losses; 0 where neither has a path."""
+    """Difference of path losses; 0 where neither has a path, infinite where one has none."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
+
+
+def _largest(gap: np.ndarray | None, counted: np.ndarray) -> float | None:
+    """Largest gap of the links that count and have a path on both traces."""
+    if gap is None:
+        return None
+    return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))
 
 
 def _hits(engine: Engine) -> int:
@@ -384,7 +393,7 @@ def _result(
         offset_only_holdout_rmse_db=rmse(offset_only, judged) if objective.num_groups else None,
         log_distance_rmse_db=rmse(rival, counted),
         log_distance_holdout_rmse_db=rmse(rival, judged),
-        retrace_gap_db=None if gap is None else float(np.abs(gap[counted]).max()),
+        retrace_gap_db=_largest(gap, counted),
         rt_calls=run.rt_calls,
         ledger_hits=run.ledger_hits,
         seconds=seconds,

@@ -46,11 +46,12 @@ class Objective:
             path_loss: Modelled path loss [n, L], [dB].
 
         Returns:
-            Offset of every group [n, num_groups], [dB]; 0 for a group without a link that counts.
+            Offset of every group [n, num_groups], [dB]; 0 for a group without a link that counts and has a path.
         """
-        gap = np.where(self.weight > 0, self.measured - self.capped(path_loss), 0.0)
-        total = self._per_group(np.broadcast_to(self.weight, gap.shape))
-        mean = self._per_group(self.weight * gap) / np.where(total > 0, total, 1.0)
+        gap = self.measured - self.capped(path_loss)
+        weight = np.where(np.isfinite(gap), self.weight, 0.0)
+        total = self._per_group(weight)
+        mean = self._per_group(weight * np.where(weight > 0, gap, 0.0)) / np.where(total > 0, total, 1.0)
         return np.clip(mean, *self.bounds)
 
     def model(self, path_loss: np.ndarray) -> np.ndarray:
