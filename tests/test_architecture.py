@@ -31,8 +31,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "study": {"measurements", "parameters"},
     "engines": {"fields", "tracing", "study"},
     "likelihood": {"measurements"},
-    "calibrate": {"engines", "likelihood", "optimizers"},
-    "report": {"calibrate"},
+    "calibration": {"engines", "likelihood", "optimizers"},
+    "report": {"calibration"},
     "doctor": {"llvm"},
 }
 TRACER = {"sionna", "mitsuba", "drjit"}

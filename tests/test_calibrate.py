@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
-from calibray.calibrate import calibrate, from_search, make_optimizer, search_slope, to_search
+from calibray.calibration import calibrate, from_search, make_optimizer, search_slope, to_search
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters

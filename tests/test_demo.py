@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from scipy.optimize import minimize
 
 from calibray import engines
-from calibray.calibrate import Problem
+from calibray.calibration import Problem
 from calibray.demo import FIGURES, METHODS, run_demo, tables
 from calibray.errors import InputError
 from calibray.scenarios import demo_study_path

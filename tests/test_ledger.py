@@ -17,7 +17,7 @@ import planted
 import programs
 import restarts
 from calibray import engines
-from calibray.calibrate import calibrate
+from calibray.calibration import calibrate
 from calibray.cli import app
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint

@@ -21,7 +21,7 @@ _HOME = {
     "path_loss": "calibray.fields",
     "Study": "calibray.study",
     "Result": "calibray.result",
-    "calibrate": "calibray.calibrate",
+    "calibrate": "calibray.calibration",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
 }
@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'calibray' has no attribute {name!r}")
     module = import_module(_HOME[name])
-    value = module if _HOME[name] == f"calibray.{name}" and name != "calibrate" else getattr(module, name)
+    value = module if _HOME[name] == f"calibray.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

@@ -148,7 +148,7 @@ def run(
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
     from calibray import terminal
-    from calibray.calibrate import calibrate
+    from calibray.calibration import calibrate
     from calibray.engines import make_tracer, open_executor
     from calibray.result import FILES
     from calibray.study import Study
@@ -187,6 +187,12 @@ def trace(
     typer.echo(f"Written to {out}", err=True)
 
 
+def _refuse_column(file: Path, frame: pd.DataFrame) -> None:
+    """Refuse a table that has the column of predictions already."""
+    if PREDICTED in frame:
+        raise InputError(f"{file}: has a column {PREDICTED!r} already; rename or remove it")
+
+
 @app.command()
 def predict(
     folder: Annotated[
@@ -218,8 +224,7 @@ def predict(
 
     result = Result.load(folder)
     links = read_links(links_file, group=result.study.offset.per if result.study.offset else None)
-    if PREDICTED in links.frame:
-        raise InputError(f"{links_file}: has a column {PREDICTED!r} already; rename or remove it")
+    _refuse_column(links_file, links.frame)
     if out is not None:
         check_table(out)
     with terminal.progress_bars(log) as progress:

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from calibray.calibrate import Progress as Report
+from calibray.calibration import Progress as Report
 from calibray.materials import BOUNDS
 from calibray.paths import Paths
 from calibray.result import Result

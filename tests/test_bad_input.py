@@ -1,0 +1,191 @@
+"""Bad input: exit code 2, one message that names the place and the remedy, no traceback, nothing written."""
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from calibray.cli import app
+
+SCENE = """<scene version="2.1.0">
+  <bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="brick"/></bsdf>
+  <shape type="ply" id="mesh-house"><string name="filename" value="house.ply"/><ref id="mat-walls" name="bsdf"/></shape>
+</scene>
+"""
+MESH = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+-50 5 0
+50 5 0
+0 5 40
+3 0 1 2
+"""
+LINKS = "x,y,loss,half\n10,0,70.0,a\n20,0,76.0,b\n30,1,80.0,b\n"
+STUDY = """version = 1
+[scene]
+file = "scene.xml"
+frequency = 3.5e9
+[links]
+file = "links.csv"
+tx = [0.0, 0.0, 2.0]
+rx = ["x", "y", 1.5]
+value = "loss"
+[trace]
+max_depth = 1
+samples = 1000
+[parameters]
+"walls.relative_permittivity" = { bounds = [1.5, 12.0] }
+"""
+
+CASES = {
+    "no scene": ("study.toml", ('"scene.xml"', '"absent.xml"'), ["absent.xml", "no such file"]),
+    "malformed scene": ("scene.xml", ("</scene>", "</scen"), ["scene.xml", "not well-formed XML", "export"]),
+    "not a scene": ("scene.xml", ("scene", "window"), ["scene.xml", "<window>", "<scene>"]),
+    "missing mesh": (
+        "scene.xml",
+        ("house.ply", "home.ply"),
+        ["home.ply", "house", "does not exist", "meshes"],
+    ),
+    "material without constants": ("scene.xml", ("itu-radio-material", "diffuse"), ["walls", "[materials]"]),
+    "unknown key": ("study.toml", ("max_depth", "max_deph"), ["trace.max_deph", "did you mean 'max_depth'?"]),
+    "unknown section": ("study.toml", ("[trace]", "[tracing]"), ["tracing", "did you mean 'trace'?"]),
+    "not TOML": ("study.toml", ("version = 1", "version = "), ["study.toml", "not valid TOML", "line 1"]),
+    "other version": ("study.toml", ("version = 1", "version = 7"), ["version", "7", "1"]),
+    "unknown material": (
+        "study.toml",
+        ("walls.", "wall."),
+        ["wall.relative_permittivity", "did you mean 'walls'?"],
+    ),
+    "unknown field": ("study.toml", ("relative_permittivity", "permittivity"), ["no field 'permittivity'"]),
+    "reversed bounds": (
+        "study.toml",
+        ("[1.5, 12.0]", "[12.0, 1.5]"),
+        ["walls.relative_permittivity", "reversed"],
+    ),
+    "unphysical bounds": ("study.toml", ("[1.5, 12.0]", "[0.5, 12.0]"), ["walls.relative_permittivity", "0.5", "1"]),
+    "start outside bounds": (
+        "study.toml",
+        ("[1.5, 12.0]", "[5.5, 12.0]"),
+        ["start = 3.91", "outside bounds"],
+    ),
+    "frequency outside ITU": ("study.toml", ("3.5e9", "60e9"), ["brick", "60 GHz", "1 to 40 GHz"]),
+    "frequency in GHz": ("study.toml", ("3.5e9", "3.5"), ["scene.frequency", "Hz"]),
+    "negative depth": (
+        "study.toml",
+        ("max_depth = 1", "max_depth = -1"),
+        ["trace.max_depth", "-1", "at least 0"],
+    ),
+    "no links file": ("study.toml", ("links.csv", "absent.csv"), ["absent.csv", "no such file"]),
+    "missing column": ("study.toml", ('"loss"', '"los"'), ["links.csv", "'los'", "did you mean 'loss'?"]),
+    "not a number": ("links.csv", ("76.0", "n/k"), ["links.csv", "row 3", "loss", "n/k"]),
+    "empty cell": ("links.csv", ("76.0", ""), ["links.csv", "row 3", "loss"]),
+    "duplicate link": ("links.csv", ("30,1,80.0,b", "20,0,76.0,b"), ["links.csv", "row 4", "row 3"]),
+    "negative path loss": ("links.csv", ("76.0", "-76.0"), ["links.csv", "row 3", "-76", "path_gain"]),
+    "empty after filter": ("study.toml", ('"loss"', '"loss"\nwhere = "x > 99"'), ["links.csv", "x > 99"]),
+    "bad filter": ("study.toml", ('"loss"', '"loss"\nwhere = "xx > 9"'), ["links.csv", "no column 'xx'", "did you mean 'x'?"]),
+    "hold-out of everything": (
+        "study.toml",
+        ("[trace]", '[holdout]\nwhere = "x > 0"\n[trace]'),
+        ["x > 0", "no link"],
+    ),
+    "unknown method": (
+        "study.toml",
+        ("[trace]", '[method]\nname = "sgwoim"\n[trace]'),
+        ["sgwoim", "sgwo-im"],
+    ),
+    "unknown option": (
+        "study.toml",
+        ("[trace]", '[method]\nname = "gwo"\noptions = { wolves = 3 }\n[trace]'),
+        ["method.options", "wolves"],
+    ),
+    "unknown engine": (
+        "study.toml",
+        ("[trace]", '[engine]\nname = "rerun"\n[trace]'),
+        ["engine.name", "rerun"],
+    ),
+    "link onto itself": ("links.csv", ("10,0,70.0,a", "0,0,70.0,a"), None),
+}
+
+
+def write(folder: Path) -> Path:
+    for name, text in {
+        "study.toml": STUDY,
+        "scene.xml": SCENE,
+        "house.ply": MESH,
+        "links.csv": LINKS,
+    }.items():
+        (folder / name).write_text(text)
+    return folder / "study.toml"
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    return write(tmp_path)
+
+
+def test_the_unspoilt_study_runs(study):
+    assert tomllib.loads(STUDY)["version"] == 1
+    outcome = run("run", study, "--out", study.parent / "out")
+    assert outcome.exit_code == 0, outcome.output
+    assert (study.parent / "out" / "result.json").is_file()
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case[2] is not None])
+def test_every_fault_is_one_message_that_names_place_and_remedy(study, name):
+    file, (old, new), words = CASES[name]
+    path = study.with_name(file)
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    before = sorted(study.parent.rglob("*"))
+    outcome = run("run", study, "--out", study.parent / "out")
+    assert outcome.exit_code == 2, outcome.output
+    assert outcome.stdout == ""
+    assert [word for word in words if word not in outcome.stderr] == [], outcome.stderr
+    assert outcome.stderr.startswith("Error: ")
+    assert "Traceback" not in outcome.stderr
+    assert sorted(study.parent.rglob("*")) == before
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(study):
+    outcome = run("run", study, "--out", study.parent / "links.csv" / "out")
+    assert outcome.exit_code == 2
+    assert "output folder" in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments", [("run", "{study}", "--out", "{out}", "--engine", "rerun"), ("predict", "{out}", "{study}")]
+)
+def test_bad_arguments(study, arguments):
+    places = {"study": study, "out": study.parent / "out"}
+    outcome = run(*(argument.format(**places) for argument in arguments))
+    assert outcome.exit_code == 2
+    assert outcome.stderr.startswith("Error: ")
+
+
+def test_the_installed_program_exits_with_2_and_no_traceback(study):
+    study.write_text(STUDY.replace("version = 1", "version = 2"))
+    program = [sys.executable, "-c", "from calibray.cli import main; main()"]
+    finished = subprocess.run(
+        [*program, "run", str(study), "--out", str(study.parent / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 2
+    assert finished.stdout == ""
+    assert finished.stderr.startswith("Error: ")
+    assert "Traceback" not in finished.stderr

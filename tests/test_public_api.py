@@ -1,0 +1,49 @@
+"""The public surface, frozen: a change here is a breaking change and belongs into the changelog."""
+
+import inspect
+
+import pytest
+
+import calibray as cb
+
+SIGNATURES = {
+    "Material": "relative_permittivity, conductivity, thickness, scattering_coefficient, xpd_coefficient, "
+    "scattering_pattern, alpha_r, alpha_i, lambda_",
+    "itu_material": "name, frequency, thickness, revision, scattering",
+    "read_measurements": "path, tx, rx, value, quantity, where, group, weight, std, tx_power_dbm",
+    "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
+    "path_gains": "paths, materials",
+    "path_loss": "paths, materials, combining, bandwidth",
+    "calibrate": "study, method, seed, out, engine, executor, progress",
+    "channel_statistics": "paths, materials",
+    "power_delay_profile": "paths, delays, materials",
+}
+NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Study", "engines", "optimizers"}
+
+
+def test_names_are_frozen():
+    assert set(cb.__all__) == NAMES
+    assert {name for name in NAMES if not hasattr(cb, name)} == set()
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+def test_signatures_are_frozen(name):
+    assert ", ".join(inspect.signature(getattr(cb, name)).parameters) == SIGNATURES[name]
+
+
+def test_parts_of_the_design_are_there():
+    assert callable(cb.engines.make)
+    assert {"GWO", "SGWOIM"} <= set(dir(cb.optimizers))
+    assert callable(cb.Paths.load)
+    assert callable(cb.Paths.save)
+    assert callable(cb.Study.load)
+    assert callable(cb.Result.predict)
+    fields = cb.Result.__dataclass_fields__
+    assert {"rmse_db", "initial_rmse_db", "holdout_rmse_db", "rt_calls", "materials", "parameters"} <= set(
+        fields
+    )
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(AttributeError, match="no attribute 'tracer'"):
+        cb.tracer  # noqa: B018
