@@ -20,6 +20,7 @@ from calibray import slab
 from calibray.fields import path_gains
 from calibray.materials import SCATTERING_PATTERNS, Material
 from calibray.paths import Kind, Paths
+from calibray.scenarios import demo_study_path
 from calibray.scene import read_scene
 from calibray.settings import Antenna, TraceSettings
 from calibray.tracing import Trace, Tracer
@@ -110,6 +111,10 @@ SCENES: dict[str, Case] = {
     "simple_wedge, in its shadow": Case(
         "sionna:simple_wedge", 1e9, (-5, -10, 0), (2, 1, -2), (15, 8, 2),
         {"max_depth": 1, "diffraction": True, "diffraction_lit_region": False}, frozenset({Kind.DIFFRACTION}),
+    ),
+    "coastal_district": Case(
+        str(demo_study_path().with_name("scene") / "scene.xml"), 4e9, (-381.5, 140, 4), (-384, 180, 4), (-376, 420, 4),
+        {"max_depth": 3, "diffuse_reflection": True}, _BOUNCES,
     ),
     "auckland_tower": Case(
         DATA + "auckland_tower/scene/scene.xml", 1.88e9, (5, 13.5, 11), (1, 1, 10.5), (17, 17, 11.5),
