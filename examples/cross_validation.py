@@ -27,7 +27,14 @@ BLOCKS = {
         "north-east": "rx_x_m >= 9.25 and rx_y_m >= 9.25",
     },
 }
-HEADER = ("RMSE [dB] of the block held out", ">links", ">before", ">offset only", ">after", ">log-distance model")
+HEADER = (
+    "RMSE [dB] of the block held out",
+    ">links",
+    ">before",
+    ">offset only",
+    ">after",
+    ">log-distance model",
+)
 
 
 def main(file: str) -> None:
@@ -49,7 +56,9 @@ def main(file: str) -> None:
             result.log_distance_holdout_rmse_db,
         )
         rows.append((name, str(result.links.held_out.sum()), *(f"{score:.2f}" for score in scores)))
-        found = ", ".join(f"{key} {value:.3g}" for key, value in (result.parameters | result.offsets_db).items())
+        found = ", ".join(
+            f"{key} {value:.3g}" for key, value in (result.parameters | result.offsets_db).items()
+        )
         sys.stderr.write(f"{name}: {found}\n")
     sys.stdout.write(render_table(HEADER, rows) + "\n")
 

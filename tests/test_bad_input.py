@@ -71,7 +71,11 @@ CASES = {
         ("[1.5, 12.0]", "[12.0, 1.5]"),
         ["walls.relative_permittivity", "reversed"],
     ),
-    "unphysical bounds": ("study.toml", ("[1.5, 12.0]", "[0.5, 12.0]"), ["walls.relative_permittivity", "0.5", "1"]),
+    "unphysical bounds": (
+        "study.toml",
+        ("[1.5, 12.0]", "[0.5, 12.0]"),
+        ["walls.relative_permittivity", "0.5", "1"],
+    ),
     "start outside bounds": (
         "study.toml",
         ("[1.5, 12.0]", "[5.5, 12.0]"),
@@ -91,7 +95,11 @@ CASES = {
     "duplicate link": ("links.csv", ("30,1,80.0,b", "20,0,76.0,b"), ["links.csv", "row 4", "row 3"]),
     "negative path loss": ("links.csv", ("76.0", "-76.0"), ["links.csv", "row 3", "-76", "path_gain"]),
     "empty after filter": ("study.toml", ('"loss"', '"loss"\nwhere = "x > 99"'), ["links.csv", "x > 99"]),
-    "bad filter": ("study.toml", ('"loss"', '"loss"\nwhere = "xx > 9"'), ["links.csv", "no column 'xx'", "did you mean 'x'?"]),
+    "bad filter": (
+        "study.toml",
+        ('"loss"', '"loss"\nwhere = "xx > 9"'),
+        ["links.csv", "no column 'xx'", "did you mean 'x'?"],
+    ),
     "hold-out of everything": (
         "study.toml",
         ("[trace]", '[holdout]\nwhere = "x > 0"\n[trace]'),
