@@ -18,6 +18,8 @@ from typer.core import TyperGroup
 from calibray.errors import EngineError, InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from calibray.measurements import Measurements
     from calibray.terminal import Enclosed
     from calibray.tracing import Tracer
