@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -77,6 +79,24 @@ def check_table(file: str | Path) -> Path:
     return target
 
 
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A place beside a file to write the new one into; it takes the file's place once it is complete.
+
+    Args:
+        path: The file.
+
+    Yields:
+        Where to write; removed again if the writing fails.
+    """
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file beside its place and move it there.
 
@@ -84,9 +104,8 @@ def write_text(path: Path, text: str) -> None:
         path: The file.
         text: Its content.
     """
-    partial = path.with_name(path.name + PARTIAL)
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
@@ -103,11 +122,10 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
     if target.suffix.lower() == ".csv":
         write_text(target, table.to_csv(index=False))
         return
-    partial = target.with_name(target.name + PARTIAL)
-    try:
-        table.to_parquet(partial, index=False)
-    except ImportError:
-        raise InputError(
-            f"{target}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
-        ) from None
-    partial.replace(target)
+    with replacing(target) as partial:
+        try:
+            table.to_parquet(partial, index=False)
+        except ImportError:
+            raise InputError(
+                f"{target}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
+            ) from None

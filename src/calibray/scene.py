@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from calibray.errors import InputError
+from calibray.files import write_text
 from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS, Material, itu_material
 from calibray.spelling import did_you_mean
 
@@ -364,9 +365,7 @@ def export_scene(
     for index, (name, material) in enumerate(materials.items()):
         root.insert(index, _bsdf(names[name], material))
     ElementTree.indent(root)
-    partial = target.with_name(target.name + ".part")
-    partial.write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-    partial.replace(target)
+    write_text(target, ElementTree.tostring(root, encoding="unicode") + "\n")
 
 
 def _is_itu_name(name: str) -> bool:
