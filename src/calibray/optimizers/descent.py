@@ -1,0 +1,216 @@
+"""Descent of many starts at once by projected Levenberg-Marquardt, for least squares in the unit cube.
+
+The step of a start minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and
+g = J^T r, subject to the box: components that would leave it are set on the face one group after the other
+and the rest is solved again. The damping mu follows the gain ratio after H. B. Nielsen (Damping Parameter in
+Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
+
+`descend` is a generator, so whoever holds it decides how points are evaluated: `least_squares.py` asks the
+engine, `vector_surrogate.py` its model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+INITIAL_DAMPING = 1e-3  # of the largest diagonal element of H
+MERGE_DISTANCE = 1e-3  # of the unit cube, below which two starts are taken to approach the same minimum
+
+Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite has failed."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Local searches in progress, with the quadratic model of each.
+
+    Attributes:
+        unit: Where they stand, in the unit cube [s, d].
+        cost: Half the mean square of the residuals there [s].
+        gradient: Its gradient g [s, d].
+        curvature: Its Gauss-Newton matrix H [s, d, d].
+        damping: mu [s].
+        growth: Factor on the damping at the next rejection [s].
+    """
+
+    unit: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    curvature: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    growth: NDArray[np.float64]
+
+    def rows(self, keep: NDArray[np.bool_]) -> Starts:
+        """The searches that go on.
+
+        Args:
+            keep: Which of them [s].
+
+        Returns:
+            Those searches.
+        """
+        return Starts(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
+    """Form the models at evaluated points.
+
+    Args:
+        unit: The points in the unit cube [s, d].
+        evaluated: Their residuals and Jacobian.
+
+    Returns:
+        The searches; one whose evaluation failed has infinite cost.
+    """
+    r, j = evaluated
+    failed = ~np.isfinite(r).all(axis=1)
+    r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
+    links = r.shape[1]
+    curvature = np.einsum("smi,smj->sij", j, j) / links
+    largest = np.diagonal(curvature, axis1=1, axis2=2).max(axis=1)
+    return Starts(
+        unit=unit,
+        cost=np.where(failed, np.inf, 0.5 * np.mean(r**2, axis=1)),
+        gradient=np.einsum("smi,sm->si", j, r) / links,
+        curvature=curvature,
+        damping=INITIAL_DAMPING * np.where(largest > 0.0, largest, 1.0),
+        growth=np.full(len(unit), 2.0),
+    )
+
+
+def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The step of every search inside the box, and the decrease of cost that its model predicts.
+
+    Args:
+        starts: The searches.
+
+    Returns:
+        Steps in the unit cube [s, d] and predicted decreases [s].
+    """
+    count, dimension = starts.unit.shape
+    # The floor keeps the matrix regular where two parameters act alike and damping has faded.
+    floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
+    damping = np.maximum(starts.damping, floor)
+    damped = starts.curvature + damping[:, None, None] * np.eye(dimension)
+    low, high = -starts.unit, 1.0 - starts.unit
+    step = np.zeros((count, dimension))
+    free = np.ones((count, dimension), dtype=bool)
+    for _ in range(dimension + 1):
+        # Fixed components keep their displacement: their rows become the identity.
+        matrix = np.where(free[:, :, None] & free[:, None, :], damped, np.eye(dimension))
+        fixed = np.where(free, 0.0, step)
+        side = np.where(free, -starts.gradient - np.einsum("sij,sj->si", damped, fixed), fixed)
+        step = np.linalg.solve(matrix, side[:, :, None])[:, :, 0]
+        outside = free & ((step < low) | (step > high))
+        step = np.clip(step, low, high)
+        if not outside.any():
+            break
+        free &= ~outside
+    # Fixing groups of components is a heuristic; the projected gradient step is a floor that always descends.
+    bound = np.trace(damped, axis1=1, axis2=2)[:, None]
+    gradient_step = np.clip(-starts.gradient / bound, low, high)
+    better = _decrease(starts, gradient_step) > _decrease(starts, step)
+    step = np.where(better[:, None], gradient_step, step)
+    return step, _decrease(starts, step)
+
+
+def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
+    slope = np.einsum("si,si->s", starts.gradient, step)
+    return -slope - 0.5 * np.einsum("si,sij,sj->s", step, starts.curvature, step)
+
+
+def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
+    """Accept or reject the trial points.
+
+    Args:
+        starts: The searches before the step.
+        trial: The models at their trial points.
+        predicted: Decrease of cost that was predicted [s].
+
+    Returns:
+        The searches after it, with their new damping.
+    """
+    ratio = (starts.cost - trial.cost) / predicted
+    better = ratio > 1e-4
+    gain = np.where(better, ratio, 0.0)
+    shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)  # Nielsen 1999, eq. 2.3
+    damping = starts.damping * np.where(better, shrink, starts.growth)
+    growth = np.where(better, 2.0, 2.0 * starts.growth)
+
+    def chosen(name: str) -> NDArray[np.float64]:
+        new, old = getattr(trial, name), getattr(starts, name)
+        return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    return Starts(*(chosen(name) for name in ("unit", "cost", "gradient", "curvature")), damping, growth)
+
+
+def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
+    """Which searches come close to a better one, and would only find the same minimum.
+
+    Args:
+        starts: The searches that move.
+        settled: Those that have converged.
+
+    Returns:
+        True for each moving search that can be dropped [s].
+    """
+    unit = np.concatenate([settled.unit, starts.unit])
+    rank = np.lexsort((np.arange(len(unit)), np.concatenate([settled.cost, starts.cost]))).argsort()
+    near = cdist(starts.unit, unit) < MERGE_DISTANCE
+    return (near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1)
+
+
+def descend(
+    unit: NDArray[np.float64], iterations: int, tolerance: float, catch_up: float = 1e30
+) -> Generator[NDArray[np.float64], Residuals, Starts]:
+    """Advance all starts until each has converged, merged with a better one, or been given up.
+
+    Args:
+        unit: Where to start, in the unit cube [s, d].
+        iterations: Largest number of steps.
+        tolerance: A search has converged when its model predicts less than this relative decrease of the
+            cost, or a step shorter than this.
+        catch_up: A search is given up when it lies more than this many of its predicted decreases behind
+            the best one.
+
+    Yields:
+        Points to evaluate [s, d].
+
+    Returns:
+        The searches that converged or were still moving at the end.
+    """
+    starts = begin(unit, (yield unit))
+    starts = starts.rows(np.isfinite(starts.cost))
+    settled = starts.rows(np.zeros(len(starts.cost), dtype=bool))
+    for _ in range(iterations):
+        step, predicted = damped_steps(starts)
+        still = (predicted <= tolerance * starts.cost) | (np.abs(step).max(axis=1) <= tolerance)
+        settled = joined(settled, starts.rows(still))
+        lowest = min(starts.cost.min(initial=np.inf), settled.cost.min(initial=np.inf))
+        hopeless = starts.cost - catch_up * predicted > lowest
+        moving = ~still & ~hopeless & ~redundant(starts, settled)
+        starts, step, predicted = starts.rows(moving), step[moving], predicted[moving]
+        if not moving.any():
+            break
+        unit = np.clip(starts.unit + step, 0.0, 1.0)
+        starts = advance(starts, begin(unit, (yield unit)), predicted)
+    return joined(settled, starts)
+
+
+def joined(first: Starts, second: Starts) -> Starts:
+    """Put searches one after the other.
+
+    Args:
+        first: Some searches.
+        second: More of them.
+
+    Returns:
+        All of them.
+    """
+    names = [field.name for field in fields(Starts)]
+    return Starts(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
