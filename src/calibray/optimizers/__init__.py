@@ -10,10 +10,12 @@ from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.vector_surrogate import VectorSurrogate
 
 METHODS: dict[str, type[Optimizer]] = {
     "gwo": GWO,
     "sgwo-im": SGWOIM,
+    "vector-surrogate": VectorSurrogate,
     "least-squares": LeastSquares,
     "random": RandomSearch,
     "latin-hypercube": LatinHypercube,
@@ -30,4 +32,5 @@ __all__ = [
     "Optimizer",
     "RandomSearch",
     "Sobol",
+    "VectorSurrogate",
 ]

@@ -14,6 +14,9 @@ OBJECTIVE_TOLERANCE = 1e-4
 """Largest relative difference of an objective from the root mean square of its residuals (float32
 engines)."""
 
+DECIMALS = 9
+"""Decimals of unit coordinates that agree in points taken for one."""
+
 
 @dataclass(frozen=True)
 class Best:
@@ -199,6 +202,23 @@ def checked_evaluations(
     return Evaluations(
         points, values, errors if "residuals" in uses else None, slopes if "jacobian" in uses else None
     )
+
+
+def merged(
+    unit: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Merge points that were told more than once.
+
+    Args:
+        unit: Points in the unit cube [n, d].
+        values: What was evaluated there [n, ...].
+
+    Returns:
+        The distinct points [k, d] and the means of their values [k, ...].
+    """
+    points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
+    share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]
+    return points, share @ values
 
 
 def read_only(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ def maximin_design(
     """Draw a Latin hypercube whose closest points are far apart.
 
     Args:
-        count: Number of points n >= 2.
+        count: Number of points n.
         dimension: Number of dimensions d.
         rng: Where the randomness comes from.
         tries: Latin hypercubes to choose from.
@@ -60,7 +60,7 @@ def maximin_design(
 
 def _smallest_distance(points: NDArray[np.float64]) -> float:
     square = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
-    return float(np.sqrt(square[~np.eye(len(points), dtype=bool)].min()))
+    return float(np.sqrt(square[~np.eye(len(points), dtype=bool)].min(initial=np.inf)))
 
 
 class Sampling(Optimizer):

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
 
-from calibray.optimizers.archive import Archive
+from calibray.optimizers.archive import Archive, merged
 
 KERNELS = ("cubic", "gaussian")
 SMOOTHING = 1e-6
-DECIMALS = 9  # of unit coordinates that agree in points taken for one
 
 
 def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cubic") -> NDArray[np.float64]:
@@ -40,8 +39,7 @@ def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cu
     if not good.any():
         return np.zeros(len(candidates))
     y = np.where(good, told.y, told.y[good].max())
-    x, group = np.unique(np.round(archive.box.to_unit(told.x), DECIMALS), axis=0, return_inverse=True)
-    y = np.bincount(group, weights=y) / np.bincount(group)
+    x, y = merged(archive.box.to_unit(told.x), y)
     if kernel == "gaussian":
         # phi(r) = exp(-(epsilon r)^2) with epsilon = 1 / (sqrt(2) sigma)
         settings = {"kernel": "gaussian", "epsilon": sqrt(len(x)) / pdist(x).max(), "degree": 0}

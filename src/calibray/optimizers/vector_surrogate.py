@@ -1,0 +1,254 @@
+"""The vector surrogate: a model of every residual instead of their root mean square, searched globally.
+
+The objective is a sum over links, and an evaluation that answers with every link's residual tells far more
+than their sum. Residuals are smoother than the objective formed from them, and tens of them share one
+dependence on the parameters (see `kriging.py` for the model).
+
+A run begins with a maximin Latin hypercube. Then two steps take turns on a model refitted after every batch:
+
+- *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by
+  many local searches with the model's exact derivatives;
+- *exploration*: the point of the largest expected improvement of the mean square Q. With prediction r, prior
+  covariance V of the residuals and the model's share of it s^2, which grows with the distance from evaluated
+  points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. For a normal
+  distribution the improvement follows in closed form: D. R. Jones, M. Schonlau, W. J. Welch, J. Global
+  Optim. 13 (1998) 455, eq. 15; of a composite objective: R. Astudillo, P. Frazier, ICML 2019. Errors of
+  different links are correlated, and taking them for independent stops exploration too soon.
+
+In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
+evaluation enters the model with the residuals of the worst successful one.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
+from scipy.stats import norm, spearmanr
+
+from calibray.errors import InputError
+from calibray.optimizers.archive import Archive, Evaluations, merged
+from calibray.optimizers.arguments import real, whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.descent import descend
+from calibray.optimizers.kriging import Kriging, fit
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.sampling import maximin_design
+from calibray.optimizers.session import Search, Session
+
+CANDIDATES = 600  # drawn over the box, and as many around the best points
+SEARCHES = 16  # local searches on the model
+SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
+PATIENCE = 4  # batches in a row that promise too little before the search stops
+
+
+@final
+class VectorSurrogate(Optimizer):
+    """Surrogate of the residual vector. Uses residuals; 20 d evaluations unless told otherwise.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the one random generator.
+        budget: Number of evaluations, 20 d if None.
+        initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
+        batch: Candidates asked for at once after the initial design, for engines that run in parallel.
+        logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
+        noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
+        tolerance: Stop before the budget is used when the predicted gain stays below this, in the objective's
+            unit; never if None.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> opt = VectorSurrogate([0.0, 0.0], [9.0, 9.0], budget=20)
+        >>> while not opt.done:
+        ...     x = opt.ask()
+        ...     r = np.sin(x) - 0.5 * x[:, ::-1]
+        ...     opt.tell(x, np.sqrt(np.mean(r**2, axis=1)), residuals=r)
+        >>> opt.evaluations, bool(opt.best.y < 1e-2)
+        (20, True)
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int | None = None,
+        initial: int | None = None,
+        batch: int = 1,
+        logarithmic: ArrayLike = False,
+        noisy: bool = False,
+        tolerance: float | None = None,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        d = self.box.dimension
+        self._budget = 20 * d if budget is None else whole("budget", budget, at_least=1)
+        self.initial = 2 * (d + 1) if initial is None else whole("initial", initial, at_least=d + 2)
+        self.batch = whole("batch", batch, at_least=1)
+        self.noisy = noisy
+        self.tolerance = None if tolerance is None else real("tolerance", tolerance, at_least=0.0)
+        self._logarithmic = _flags(logarithmic, self.box)
+        self._seen = Box.between(*(self._seen_by_model(x) for x in (self.box.lower, self.box.upper)))
+        self._model: Kriging | None = None
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Largest number of evaluations it will ask for."""
+        return self._budget
+
+    @property
+    def trust(self) -> float | None:
+        """How well the model ranks evaluated points by their objective when each is left out; None without a model.
+
+        Spearman's rank correlation: 1 is perfect, 0 useless, and then more initial points are in order.
+        """
+        if self._model is None:
+            return None
+        y = np.sqrt(np.mean(self._model.residuals**2, axis=1))
+        predicted = np.sqrt(np.mean(self._model.left_out() ** 2, axis=1))
+        return float(spearmanr(y, predicted).statistic)
+
+    def _search(self, archive: Archive) -> Search:
+        d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
+        missing = min(left, max(self.initial - len(archive), 0))
+        if missing:
+            yield self._from_unit(maximin_design(missing, d, self._rng))
+            left -= missing
+        while left > 0 and quiet < PATIENCE:
+            count = min(self.batch, left)
+            told = archive.all()
+            unit, good = self._to_unit(told.x), np.isfinite(told.y)
+            points, residuals = merged(unit, _imputed(told))
+            if (
+                np.linalg.matrix_rank(points - points.mean(axis=0)) < d
+                or good.sum() < 2
+                or len(points) < d + 2
+            ):
+                chosen = self._rng.random((count, d))  # nothing to model yet
+            else:
+                guess = None if self._model is None else self._model.hyper
+                self._model = fit(points, residuals, noisy=self.noisy, guess=guess)
+                best_first = unit[np.argsort(told.y, kind="stable")]
+                chosen, gain = self._choose(self._model, best_first, archive.best.y, turn, count)
+                quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
+            yield self._from_unit(chosen)
+            left, turn = left - count, turn + count
+
+    def _choose(
+        self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
+    ) -> tuple[NDArray[np.float64], float]:
+        """The next batch [count, d] and the gain it promises; `taken` are the points told, best first."""
+        d = self.box.dimension
+        starts = np.vstack([taken[: SEARCHES // 2], self._rng.random((SEARCHES, d))])[:SEARCHES]
+        minima = predicted_minima(model, starts)
+        chosen, gain = [], 0.0
+        for place in range(turn, turn + count):
+            fresh = minima[_separation(minima, taken) > SEPARATION]
+            if place % 2 and len(fresh):
+                x = fresh[0]
+                promised = best - float(np.sqrt(np.mean(model.predict(x[None])[0] ** 2)))
+            else:
+                near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
+                reach = 10.0 ** self._rng.uniform(-3.0, -0.5, (CANDIDATES, 1))
+                around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
+                candidates = np.vstack([self._rng.random((CANDIDATES, d)), around, fresh])
+                candidates = candidates[_separation(candidates, taken) > SEPARATION]
+                improvement = expected_improvement(model, candidates, best)
+                x = candidates[np.argmax(improvement)]
+                promised = best - np.sqrt(max(best**2 - improvement.max(), 0.0))
+            chosen.append(x)
+            gain = max(gain, promised)
+            if len(chosen) < count:
+                model, taken = model.with_point(x), np.vstack([taken, x])
+        return np.array(chosen), gain
+
+    def _seen_by_model(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, x, 1.0)), x)
+
+    def _to_unit(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._seen.to_unit(self._seen_by_model(x))
+
+    def _from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen = self._seen.from_unit(unit)
+        return self.box.clip(
+            np.where(self._logarithmic, np.exp(np.where(self._logarithmic, seen, 0.0)), seen)
+        )
+
+
+def expected_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
+    """Expected decrease of the mean square of the residuals below the best one.
+
+    Args:
+        model: The model of the residuals.
+        x: Points of the unit cube [k, d].
+        best: The best objective so far, the root of its mean square.
+
+    Returns:
+        Expected improvement [k].
+    """
+    mean, share = model.predict(x)
+    root, links = model.root, model.root.shape[1]
+    centre = np.mean(mean**2, axis=1) + share * np.sum(root**2) / links
+    along = np.sum((mean @ root.T) ** 2, axis=1)  # r^T V r
+    spread = np.sqrt(4.0 * share * along + 2.0 * share**2 * np.sum((root @ root.T) ** 2)) / links
+    spread = np.maximum(spread, 1e-300)
+    z = np.clip((best**2 - centre) / spread, -1e3, 1e3)
+    return spread * (z * norm.cdf(z) + norm.pdf(z))  # Jones et al. 1998, eq. 15
+
+
+def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Local minima of the predicted objective.
+
+    Args:
+        model: The model of the residuals.
+        starts: Where to search from, in the unit cube [s, d].
+
+    Returns:
+        The minima found, lowest first [k, d].
+    """
+    descent = descend(starts, iterations=30, tolerance=1e-8)
+    x = next(descent)
+    while True:
+        try:
+            x = descent.send((model.predict(x)[0], model.slope(x)))
+        except StopIteration as end:
+            return end.value.unit[np.argsort(end.value.cost, kind="stable")]
+
+
+def _separation(x: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of each point to the nearest one taken."""
+    return cdist(x, taken).min(axis=1)
+
+
+def _imputed(told: Evaluations) -> NDArray[np.float64]:
+    """Residuals, with the worst successful ones in place of the failed."""
+    good = np.isfinite(told.y)
+    if not good.any():
+        return np.zeros_like(told.residuals)
+    worst = told.residuals[np.argmax(np.where(good, told.y, -np.inf))]
+    return np.where(good[:, None], told.residuals, worst)
+
+
+def _flags(value: ArrayLike, box: Box) -> NDArray[np.bool_]:
+    flags = np.array(value)
+    if flags.dtype != bool or flags.shape not in ((), (box.dimension,)):
+        raise InputError(
+            f"logarithmic = {value!r}; it must be True, False, or one of them for each parameter"
+        )
+    flags = np.broadcast_to(flags, box.dimension)
+    for index in np.flatnonzero(flags & (box.lower <= 0.0)):
+        raise InputError(
+            f"lower[{index}] = {box.lower[index]:g} of a logarithmic parameter; raise it above 0 or scale linearly"
+        )
+    return flags

@@ -1,0 +1,165 @@
+"""The vector surrogate: what it finds within few evaluations, and how it behaves as an optimizer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from landscapes import rosenbrock, street
+
+from calibray.errors import InputError
+from calibray.optimizers import SGWOIM, LatinHypercube, VectorSurrogate
+from calibray.optimizers.kriging import fit
+from calibray.optimizers.vector_surrogate import expected_improvement, predicted_minima
+
+STREET = street()
+
+
+def excess(method, seeds: int, **settings) -> list[float]:
+    """Excess over the global minimum of the street, by seed."""
+    runs = [STREET.run(method(STREET.lower, STREET.upper, seed=seed, **settings)) for seed in range(seeds)]
+    return [run.best.y - STREET.minimum for run in runs]
+
+
+def test_30_evaluations_beat_the_papers_method_at_225():
+    mine = excess(VectorSurrogate, seeds=5, budget=30)
+    assert np.median(mine) < np.median(excess(SGWOIM, seeds=5))
+    assert np.median(mine) < 0.3 * np.median(excess(LatinHypercube, seeds=5, budget=30))
+
+
+def test_60_evaluations_come_close_to_the_global_minimum():
+    found = excess(VectorSurrogate, seeds=5, budget=60)
+    assert np.median(found) < 0.03
+    assert max(found) < 0.05
+
+
+def test_a_batch_of_four_costs_little():
+    assert np.median(excess(VectorSurrogate, seeds=3, budget=60, batch=4)) < 0.03
+
+
+def test_a_logarithmic_scale_is_seen_by_the_model_only():
+    optimizer = VectorSurrogate(STREET.lower, STREET.upper, logarithmic=[True, False, True], initial=40)
+    x = optimizer.ask()
+    share = np.mean(x < np.sqrt(STREET.lower * STREET.upper), axis=0)
+    assert share[[0, 2]] == pytest.approx(0.5, abs=0.05)
+    assert share[1] < 0.35
+    assert np.median(excess(VectorSurrogate, seeds=3, budget=50, logarithmic=True)) < 0.03
+
+
+def bent(dimension: int, optimizer: VectorSurrogate, noise: float = 0.0) -> VectorSurrogate:
+    """Minimise residuals that vanish at a planted point, bent by neighbouring parameters."""
+    rng = np.random.default_rng(9)
+    while not optimizer.done:
+        x = optimizer.ask()
+        away = x - np.linspace(0.2, 0.8, dimension)
+        r = np.hstack([away + 0.5 * np.roll(away, 1, axis=1) ** 2, np.sin(away)])
+        r = r + noise * rng.standard_normal(r.shape)
+        optimizer.tell(x, np.sqrt(np.mean(r**2, axis=1)), r)
+    return optimizer
+
+
+@pytest.mark.parametrize("dimension", [1, 12])
+def test_dimensions(dimension):
+    optimizer = VectorSurrogate(np.zeros(dimension), np.ones(dimension), budget=10 + 4 * dimension)
+    assert bent(dimension, optimizer).best.x == pytest.approx(np.linspace(0.2, 0.8, dimension), abs=5e-3)
+
+
+def test_budget_batches_and_initial_design():
+    optimizer = VectorSurrogate(STREET.lower, STREET.upper, budget=21, initial=10, batch=4)
+    sizes = []
+    while not optimizer.done:
+        x = optimizer.ask()
+        assert len(np.unique(x, axis=0)) == len(x)
+        sizes.append(len(x))
+        optimizer.tell(x, *STREET.evaluate(x)[:2])
+    assert sizes == [10, 4, 4, 3]
+    assert VectorSurrogate(STREET.lower, STREET.upper).budget == 60
+
+
+def test_points_told_before_count_as_initial_design():
+    x = np.random.default_rng(0).uniform(STREET.lower, STREET.upper, (20, 3))
+    warm = VectorSurrogate(STREET.lower, STREET.upper, budget=10)
+    warm.tell(x, *STREET.evaluate(x)[:2])
+    assert len(warm.ask()) == 1
+    partly = VectorSurrogate(STREET.lower, STREET.upper)
+    partly.tell(x[:3], *STREET.evaluate(x[:3])[:2])
+    assert len(partly.ask()) == 5
+    flat = VectorSurrogate(STREET.lower, STREET.upper, budget=12)
+    x[:, 1] = 4.0  # these points say nothing about the second parameter
+    flat.tell(x, *STREET.evaluate(x)[:2])
+    assert STREET.run(flat).evaluations == 32
+
+
+def test_stops_when_little_is_to_be_gained():
+    def evaluations(**settings):
+        optimizer = bent(5, VectorSurrogate(np.zeros(5), np.ones(5), **settings))
+        assert optimizer.best.y < 0.01
+        return optimizer.evaluations
+
+    assert 12 < evaluations(tolerance=1e-2) < evaluations(tolerance=1e-3) < 100
+    assert evaluations() == 100
+
+
+def test_noisy_answers_are_survived():
+    """The best value told is as lucky as it is good; the point itself must be near the planted one."""
+    optimizer = bent(3, VectorSurrogate(np.zeros(3), np.ones(3), noisy=True, seed=2), noise=0.02)
+    assert optimizer.best.x == pytest.approx(np.linspace(0.2, 0.8, 3), abs=0.03)
+
+
+def test_trust_tells_a_good_model_from_a_hopeless_one():
+    def shuffled(x):
+        """Residuals without rhyme or reason in x."""
+        draws = [np.random.default_rng(int(1e6 * row.sum())).standard_normal(40) for row in x]
+        return np.array(draws), np.zeros((len(x), 40, 3))
+
+    def trust(landscape):
+        optimizer = VectorSurrogate(landscape.lower, landscape.upper, initial=30, budget=31)
+        assert optimizer.trust is None
+        return landscape.run(optimizer).trust
+
+    assert trust(rosenbrock()) > 0.9
+    assert abs(trust(replace(STREET, model=shuffled))) < 0.6
+
+
+def test_expected_improvement_against_monte_carlo():
+    rng = np.random.default_rng(3)
+    points = rng.random((12, 2))
+    residuals = np.stack([np.sin(3.0 * points @ [1.0, k]) for k in np.linspace(-1.0, 1.0, 30)], axis=1)
+    model = fit(points, residuals)
+    x = rng.random((5, 2))
+    best = 0.9 * np.sqrt(np.mean(model.predict(x)[0] ** 2, axis=1)).mean()
+    mean, share = model.predict(x)
+    scatter = rng.standard_normal((20_000, 1, len(model.root))) @ model.root * np.sqrt(share[:, None])
+    sampled = np.maximum(best**2 - np.mean((mean + scatter) ** 2, axis=-1), 0.0).mean(axis=0)
+    assert expected_improvement(model, x, best) == pytest.approx(sampled, rel=0.35, abs=1e-4)  # normal tail
+
+
+def test_predicted_minima_are_minima_of_the_model():
+    rng = np.random.default_rng(3)
+    points = rng.random((20, 2))
+    model = fit(points, np.stack([np.sin(6.0 * points[:, 0]) - 0.5, points[:, 1] - 0.3], axis=1))
+    minima = predicted_minima(model, rng.random((16, 2)))
+    values = np.mean(model.predict(minima)[0] ** 2, axis=1)
+    assert (np.diff(values) >= 0.0).all()
+    around = np.clip(minima[:1] + 1e-3 * rng.standard_normal((200, 2)), 0.0, 1.0)
+    assert (np.mean(model.predict(around)[0] ** 2, axis=1) >= values[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"initial": 4}, r"initial = 4; it must be a whole number >= 5"),
+        ({"batch": 0}, r"batch = 0"),
+        ({"budget": 0}, r"budget = 0"),
+        ({"tolerance": -1.0}, r"tolerance = -1.0; it must be a finite number >= 0"),
+        ({"logarithmic": [True]}, r"logarithmic = \[True\]; it must be True, False, or one"),
+        ({"logarithmic": [1, 0, 1]}, r"logarithmic = \[1, 0, 1\]"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        VectorSurrogate(STREET.lower, STREET.upper, **settings)
+
+
+def test_a_logarithmic_parameter_is_positive():
+    with pytest.raises(InputError, match=r"lower\[1\] = 0 of a logarithmic parameter; raise it above 0"):
+        VectorSurrogate([1.0, 0.0], [2.0, 1.0], logarithmic=True)
