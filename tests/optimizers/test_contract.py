@@ -6,6 +6,7 @@ from landscapes import Landscape, rosenbrock
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, METHODS, LeastSquares, Optimizer
+from calibray.optimizers.archive import merged
 
 LANDSCAPE = rosenbrock()
 CASES = sorted(METHODS.items())
@@ -196,6 +197,13 @@ def test_of_equal_evaluations_the_first_is_the_best():
     optimizer.tell([[0.0, 1.0], [1.0, 0.0]], [2.0, 2.0])
     optimizer.tell([[1.0, 1.0]], [2.0])
     assert np.array_equal(optimizer.best.x, [0.0, 1.0])
+
+
+def test_points_told_twice_are_merged_with_the_mean_of_their_values():
+    x = np.array([[0.5, 0.1], [0.2, 0.2], [0.5, 0.1 + 1e-12]])
+    points, values = merged(x, np.array([[1.0, 2.0], [5.0, 6.0], [3.0, 4.0]]))
+    assert points == pytest.approx(np.array([[0.2, 0.2], [0.5, 0.1]]))
+    assert values == pytest.approx(np.array([[5.0, 6.0], [2.0, 3.0]]))
 
 
 def test_no_best_before_the_first_evaluation():

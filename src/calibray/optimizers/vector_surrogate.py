@@ -130,12 +130,9 @@ class VectorSurrogate(Optimizer):
             told = archive.all()
             unit, good = self._to_unit(told.x), np.isfinite(told.y)
             points, residuals = merged(unit, _imputed(told))
-            if (
-                np.linalg.matrix_rank(points - points.mean(axis=0)) < d
-                or good.sum() < 2
-                or len(points) < d + 2
-            ):
-                chosen = self._rng.random((count, d))  # nothing to model yet
+            spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
+            if spanned < d or len(points) < d + 2 or good.sum() < 2:  # nothing to model yet
+                chosen = self._rng.random((count, d))
             else:
                 guess = None if self._model is None else self._model.hyper
                 self._model = fit(points, residuals, noisy=self.noisy, guess=guess)
@@ -186,6 +183,23 @@ class VectorSurrogate(Optimizer):
         )
 
 
+def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The mean square of the residuals as the model sees it.
+
+    Args:
+        model: The model of the residuals.
+        x: Points of the unit cube [k, d].
+
+    Returns:
+        Its expectation and its standard deviation [k].
+    """
+    mean, share = model.predict(x)
+    root, links = model.root, model.root.shape[1]
+    centre = np.mean(mean**2, axis=1) + share * np.sum(root**2) / links
+    along = np.sum((mean @ root.T) ** 2, axis=1)  # r^T V r
+    return centre, np.sqrt(4.0 * share * along + 2.0 * share**2 * np.sum((root @ root.T) ** 2)) / links
+
+
 def expected_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
     """Expected decrease of the mean square of the residuals below the best one.
 
@@ -197,11 +211,7 @@ def expected_improvement(model: Kriging, x: NDArray[np.float64], best: float) ->
     Returns:
         Expected improvement [k].
     """
-    mean, share = model.predict(x)
-    root, links = model.root, model.root.shape[1]
-    centre = np.mean(mean**2, axis=1) + share * np.sum(root**2) / links
-    along = np.sum((mean @ root.T) ** 2, axis=1)  # r^T V r
-    spread = np.sqrt(4.0 * share * along + 2.0 * share**2 * np.sum((root @ root.T) ** 2)) / links
+    centre, spread = mean_square(model, x)
     spread = np.maximum(spread, 1e-300)
     z = np.clip((best**2 - centre) / spread, -1e3, 1e3)
     return spread * (z * norm.cdf(z) + norm.pdf(z))  # Jones et al. 1998, eq. 15
