@@ -256,8 +256,8 @@ def _material(
         )
     try:
         if itu is not None:
-            thickness = given.get("thickness", _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
-            return replace(itu_material(str(itu), frequency, thickness, revision=str(revision)), **given)
+            base = itu_material(str(itu), frequency, DEFAULT_THICKNESS, revision=str(revision))
+            return replace(base, **{**_slab(bsdf), **given})
         if {"relative_permittivity", "conductivity"} <= set(given):
             return Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **given})
         return replace(_file_material(original, bsdf, frequency), **given)
@@ -338,7 +338,8 @@ def export_scene(
 ) -> None:
     """Write a scene file with other constants; it refers to the meshes of the original.
 
-    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `NAME-calibrated`.
+    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `calibrated-NAME`. Its
+    scene files know no scattering pattern but the Lambertian one; another has to be set by who loads the scene.
 
     Args:
         source: The original: a path, or `sionna:NAME`.
@@ -352,7 +353,7 @@ def export_scene(
     path = _scene_path(str(source))
     root = _parse(path, str(source))
     definitions = _bsdf_definitions(root)
-    names = {name: f"mat-{name}-calibrated" if _is_itu_name(name) else f"mat-{name}" for name in materials}
+    names = {name: f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}" for name in materials}
     for shape in root.findall("shape"):
         _, name = _materials_of(shape, definitions, split or {}, path)
         _refer(shape, names[name])
