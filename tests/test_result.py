@@ -1,79 +1,150 @@
-"""What a calibration leaves behind: files that open again, predictions, and engines that agree."""
+"""A result's files hold all of it, predict where it was fitted, and are never half-written."""
+
+from __future__ import annotations
+
+import json
 
 import numpy as np
+import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 import planted
-from calibray import engines
 from calibray.calibration import calibrate
-from calibray.cli import app
 from calibray.errors import InputError
-from calibray.result import Result
+from calibray.result import FILES, Result
+from calibray.scene import read_scene
+
+OFFSETS = {"west": -3.0, "east": 6.0}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_cache():
+    """Nothing is taken from, or left in, the user's cache of traces."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", "")
+        yield
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    """A calibrated study with an offset for each group, 2 dB on one of them, saved."""
-    folder = tmp_path_factory.mktemp("saved")
-    table = planted.campaign()
-    table.loc[table["half"] == "west", "path_loss_db"] += 2.0
+def result(tmp_path_factory) -> Result:
+    """A calibration with noise, one offset per half, and a hold-out."""
+    table = planted.campaign(noise_db=0.3)
     study = planted.study(
-        folder, table, offset={"per": "half"}, method={"name": "auto", "options": {"starts": 16}}
+        tmp_path_factory.mktemp("study"),
+        table.assign(path_loss_db=table.path_loss_db + table.half.map(OFFSETS)),
+        offset={"per": "half"},
+        holdout={"where": "rx_x > 15"},
+        method={"name": "auto", "options": {"starts": 16}},
     )
-    result = calibrate(study, out=folder / "out", engine=planted.engine())
-    return result, folder / "out", table
+    return calibrate(study, engine=planted.engine())
 
 
-def test_a_saved_result_loads_equal(saved):
-    result, folder, _ = saved
-    again = Result.load(folder)
-    assert again.content() == result.content()
-    np.testing.assert_allclose(again.links["after_db"], result.links["after_db"], rtol=1e-5)
-    assert len(again.history) == result.rt_calls
+@pytest.fixture
+def folder(result, tmp_path):
+    """The folder it was saved into."""
+    result.save(tmp_path / "new" / "out")
+    return tmp_path / "new" / "out"
 
 
-def test_predictions_at_the_measured_links_are_what_was_fitted(saved, monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
-    result, folder, table = saved
-    predicted = Result.load(folder).predict(table[[*planted.COLUMNS, "half"]])
-    np.testing.assert_allclose(predicted, result.links["after_db"], atol=0.01)
-    wrong = Result.load(folder).predict(table[[*planted.COLUMNS]].assign(half="west"))
-    east = (table["half"] == "east").to_numpy()
-    assert np.abs(wrong - predicted)[east].min() > 1.0  # the offset of the group is in it
+def test_what_is_saved_is_what_is_loaded(result, folder):
+    loaded = Result.load(folder)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert loaded.content() == result.content()
+    assert loaded.materials == result.materials
+    assert loaded.intervals == result.intervals
+    assert loaded.study.digest() == result.study.digest()
+    pd.testing.assert_frame_equal(loaded.links, result.links, rtol=1e-5)
+    pd.testing.assert_frame_equal(loaded.history, result.history, rtol=1e-8)
+    assert len(loaded.history) == result.rt_calls
 
 
-def test_a_group_without_an_offset_is_refused(saved):
-    result, _, table = saved
-    with pytest.raises(InputError, match=r"'north'.*known: east, west"):
-        result.predict(table[list(planted.COLUMNS)].assign(half="north"))
+def test_the_file_is_strict_json(folder):
+    def refuse(constant: str) -> None:
+        raise ValueError(constant)
+
+    content = json.loads((folder / "result.json").read_text(), parse_constant=refuse)
+    assert content["version"] == 1
+    assert content["parameters"].keys() == planted.TRUTH.keys()
 
 
-def test_a_folder_without_a_result_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no result"):
+def test_prediction_at_the_measured_links_is_what_was_fitted(result, folder):
+    fitted = result.links.after_db.to_numpy()
+    for source in (result, Result.load(folder)):
+        assert source.predict(result.study.measurements()) == pytest.approx(fitted, abs=1e-6)
+    assert result.predict(planted.links()) == pytest.approx(fitted, abs=1e-6)
+    assert result.links.before_db.to_numpy() != pytest.approx(fitted, abs=0.5)
+
+
+def test_prediction_adds_the_offset_of_the_group(result):
+    links = planted.links().iloc[[2, 2]].assign(half=["west", "east"])
+    west, east = result.predict(links)
+    assert east - west == pytest.approx(result.offsets_db["east"] - result.offsets_db["west"])
+    assert east - west > 5
+
+
+def test_prediction_where_no_path_leads_is_infinite(result):
+    predicted = result.predict(planted.links(blocked=True))
+    assert np.flatnonzero(np.isinf(predicted)).tolist() == [planted.INSIDE]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda links: links.assign(half="north"),
+            "group 'north' has no calibrated offset; known: east, west",
+        ),
+        (lambda links: links.drop(columns="half"), "no column 'half'"),
+        (lambda links: links.drop(columns="rx_z"), "no column 'rx_z'"),
+        (lambda links: links.assign(rx_y=np.nan), "rx_y"),
+        (lambda links: links.iloc[:0], "no rows"),
+    ],
+)
+def test_links_that_cannot_be_predicted_are_refused(result, change, message):
+    with pytest.raises(InputError, match=message):
+        result.predict(change(planted.links()))
+
+
+def test_the_scene_written_is_the_calibrated_one(result, folder):
+    scene = read_scene(folder / "scene.xml", result.study.scene.frequency)
+    original = read_scene(result.study.scene_source, result.study.scene.frequency)
+    written = {entry.name: scene.materials[entry.material] for entry in scene.objects}
+    assert written == {entry.name: result.materials[entry.material] for entry in original.objects}
+    changed = {
+        entry.material
+        for entry in original.objects
+        if written[entry.name] != original.materials[entry.material]
+    }
+    assert changed == {"concrete", "marble", "wood"}
+
+
+@pytest.mark.parametrize("failing", FILES)
+def test_a_file_that_could_not_be_written_leaves_nothing_half_written(result, tmp_path, failing):
+    (tmp_path / failing / "in the way").mkdir(parents=True)
+    with pytest.raises(InputError, match=f"output folder {tmp_path}: cannot be written"):
+        result.save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
+
+
+def test_a_crash_while_saving_leaves_the_older_files(result, folder, monkeypatch):
+    before = {path.name: path.read_text() for path in folder.iterdir()}
+
+    def crash(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pd.DataFrame, "to_csv", crash)
+    with pytest.raises(KeyboardInterrupt):
+        result.save(folder)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == before
+
+
+def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
+    with pytest.raises(InputError, match="is no result of `calibray run`"):
         Result.load(tmp_path)
-
-
-def test_the_command_predicts_and_adds_a_column(saved, tmp_path, monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
-    result, folder, table = saved
-    table[[*planted.COLUMNS, "half"]].to_csv(tmp_path / "new.csv", index=False)
-    outcome = CliRunner().invoke(app, ["predict", str(folder), str(tmp_path / "new.csv")])
-    assert outcome.exit_code == 0, outcome.output
-    lines = outcome.stdout.splitlines()
-    assert lines[0].endswith(",path_loss_db")
-    values = [float(line.rsplit(",", 1)[1]) for line in lines[1:]]
-    np.testing.assert_allclose(values, result.links["after_db"], atol=0.01)
-
-
-def test_retrace_and_replay_give_the_same_path_loss_and_count_their_calls(tmp_path, monkeypatch):
-    monkeypatch.setenv("CALIBRAY_CACHE", "")
-    study = planted.study(tmp_path, planted.campaign())
-    replay, retrace = planted.engine(), engines.make(study, "retrace")
-    parameters = replay.parameters
-    candidates = parameters.lower + np.array([[0.2, 0.5, 0.8], [0.9, 0.1, 0.4]]) * (
-        parameters.upper - parameters.lower
-    )
-    before = replay.calls, retrace.calls
-    np.testing.assert_allclose(retrace.path_loss(candidates), replay.path_loss(candidates), atol=0.01)
-    assert (replay.calls - before[0], retrace.calls - before[1]) == (2, 2)
+    text = (folder / "result.json").read_text()
+    (folder / "result.json").write_text(text[:100])
+    with pytest.raises(InputError, match="is no result"):
+        Result.load(folder)
+    (folder / "result.json").write_text(text.replace('"version": 1,', '"version": 99,', 1))
+    with pytest.raises(InputError, match="version 99, need 1; run the study again"):
+        Result.load(folder)

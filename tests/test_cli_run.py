@@ -1,0 +1,237 @@
+"""`calibray run`, `trace` and `predict`: what stands on stdout, on stderr and in the files."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+import planted
+from calibray import terminal
+from calibray.cli import app
+from calibray.paths import Paths
+from calibray.result import FILES, Result
+from calibray.terminal import Enclosed, render_result, render_table, rows_text, summary
+
+LOST_ROW = planted.INSIDE + 2  # the header is row 1
+
+
+def calibray(*arguments: object):
+    """Runs a command in this process."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_cache():
+    """Nothing is taken from, or left in, the user's cache of traces."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", "")
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a study file whose links have one offset per half, one of them without a path."""
+    folder = tmp_path_factory.mktemp("study")
+    table = planted.campaign(blocked=True).replace(np.inf, 75.0)
+    study = planted.study(
+        folder,
+        table.assign(path_loss_db=table.path_loss_db + table.half.map({"west": 0.0, "east": 4.0})),
+        offset={"per": "half"},
+        holdout={"where": "rx_x > 20"},
+        method={"name": "auto", "seed": 3},
+    )
+    sections = study.content()
+    parameters = sections.pop("parameters")
+    lines = ["version = 1"]
+    for name, section in sections.items():
+        if isinstance(section, dict) and section:
+            lines += [f"[{name}]", *(f"{key} = {toml(value)}" for key, value in section.items())]
+    lines += ["[parameters]", *(f'"{key}" = {toml(value)}' for key, value in parameters.items())]
+    (folder / "study.toml").write_text("\n".join(lines))
+    return folder
+
+
+def toml(value: object) -> str:
+    """A value as TOML writes it."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml(each)}" for key, each in value.items()) + " }"
+    return json.dumps(value)
+
+
+@pytest.fixture(scope="module")
+def ran(folder):
+    """The outcome of `calibray run`."""
+    outcome = calibray("run", folder / "study.toml", "--out", folder / "out")
+    assert outcome.exit_code == 0, outcome.output
+    return outcome
+
+
+def test_run_writes_its_files_and_says_so_on_stderr(folder, ran):
+    assert sorted(path.name for path in (folder / "out").iterdir()) == sorted(FILES)
+    assert ran.stderr == f"Written to {folder / 'out'}: {', '.join(FILES)}\n"
+    assert Result.load(folder / "out").parameters == pytest.approx(planted.TRUTH, abs=1e-3)
+
+
+def test_run_prints_what_it_found(folder, ran):
+    result, lines = Result.load(folder / "out"), ran.stdout.splitlines()
+    cells = {line.split("  ")[0]: line.split() for line in lines if line}
+    assert lines[0] == "study.toml: method auto, engine replay, seed 3"
+    assert cells["calibrated on"][-1] == "9"
+    assert cells["held out"][-1] == "2"
+    assert cells["without a path"][-5:] == ["1", "row", f"{LOST_ROW},", "left", "out"]
+    assert f"row {LOST_ROW}: check the positions" in next(line for line in lines if "receiver inside" in line)
+    for name, value in result.parameters.items():
+        assert cells[name][2] == f"{value:.4g}"
+        assert cells[name][-1] == "identified"
+    assert cells["east"] == ["east", f"{result.offsets_db['east']:+.2f}"]
+    for name, scores in {
+        "before": (result.initial_rmse_db, result.initial_holdout_rmse_db),
+        "offset only": (result.offset_only_rmse_db, result.offset_only_holdout_rmse_db),
+        "after": (result.rmse_db, result.holdout_rmse_db),
+        "log-distance model": (result.log_distance_rmse_db, result.log_distance_holdout_rmse_db),
+    }.items():
+        assert cells[name][-2:] == [f"{score:.2f}" for score in scores]
+    assert cells["RT calls"][-1] == f"{result.rt_calls:,}"
+
+
+def test_output_is_plain_text(ran):
+    assert "\x1b" not in ran.stdout + ran.stderr
+    assert [line for line in ran.stdout.splitlines() if line != line.rstrip()] == []
+
+
+def test_run_prints_json_on_demand_and_takes_method_and_seed(folder):
+    arguments = ("--json", "--method", "sgwo-im", "--seed", 7)
+    outcome = calibray("run", folder / "study.toml", "--out", folder / "other", *arguments)
+    assert outcome.exit_code == 0, outcome.output
+    content = json.loads(outcome.stdout)
+    assert content["rt_calls"] == 225
+    assert content["study"]["method"] == {"name": "sgwo-im", "seed": 7, "options": {}}
+    assert content["links"] == {
+        "calibrated_on": 9,
+        "held_out": 2,
+        "rows_without_path": [LOST_ROW],
+        "rows_with_enclosed_tx": [],
+        "rows_with_enclosed_rx": [LOST_ROW],
+    } | {key: value for key, value in content["links"].items() if key.startswith("rows_lost")}
+    del content["links"]
+    assert content == json.loads((folder / "other" / "result.json").read_text())
+
+
+def test_trace_stores_a_path_program(folder):
+    outcome = calibray("trace", folder / "study.toml", "-o", folder / "paths.h5")
+    assert outcome.exit_code == 0, outcome.output
+    paths, engine = Paths.load(folder / "paths.h5"), planted.engine(blocked=True)
+    assert (paths.num_paths, paths.num_links) == (engine.paths.num_paths, planted.LINKS)
+    cells = {line.split("  ")[0]: line.split() for line in outcome.stdout.splitlines() if line}
+    assert cells["paths"] == ["paths", f"{paths.num_paths:,}"]
+    assert cells["without a path"][-3:] == ["1", "row", str(LOST_ROW)]
+    assert outcome.stderr == f"Written to {folder / 'paths.h5'}\n"
+
+
+def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
+    table = planted.links(blocked=True).assign(name=[f"link {k}" for k in range(planted.LINKS)])
+    table.to_csv(tmp_path / "new.csv", index=False)
+    outcome = calibray("predict", folder / "out", tmp_path / "new.csv")
+    assert outcome.exit_code == 0, outcome.output
+    predicted = pd.read_csv(io.StringIO(outcome.stdout))
+    assert predicted.columns.tolist() == [*table.columns, "path_loss_db"]
+    pd.testing.assert_frame_equal(predicted[table.columns], table)
+    expected = Result.load(folder / "out").links.after_db
+    assert predicted.path_loss_db.to_numpy() == pytest.approx(expected.to_numpy(), abs=1e-3)
+    assert outcome.stderr == f"Warning: no path leads to 1 of 12 links, row {LOST_ROW}\n"
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
+def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
+    planted.links().iloc[:3].to_parquet(tmp_path / "new.parquet")
+    outcome = calibray("predict", folder / "out", tmp_path / "new.parquet", "-o", tmp_path / name)
+    assert (outcome.exit_code, outcome.stdout) == (0, "")
+    read = pd.read_csv if name.endswith("csv") else pd.read_parquet
+    assert np.isfinite(read(tmp_path / name).path_loss_db).tolist() == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "{study}", "--out", "{file}"), "is a file; name another folder"),
+        (("run", "{study}", "--out", "{file}/deeper/still"), "is a file; name another folder"),
+        (("run", "{study}", "--out", "{out}", "--method", "sgwoim"), "did you mean 'sgwo-im'?"),
+        (("run", "{study}", "--out", "{out}", "--engine", "replya"), "engine"),
+        (("run", "{folder}/absent.toml", "--out", "{out}"), "absent.toml: no such study file"),
+        (("trace", "{study}", "-o", "{folder}/absent/paths.h5"), "there is no folder"),
+        (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
+        (("predict", "{folder}", "{file}"), "is no result of `calibray run`"),
+        (("predict", "{result}", "{file}"), "has a column 'path_loss_db' already; rename or remove it"),
+        (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
+        (("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"), "tables end in .csv or .parquet"),
+    ],
+)
+def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, arguments, message):
+    planted.links().to_csv(tmp_path / "bare.csv", index=False)
+    places = {
+        "study": folder / "study.toml",
+        "file": folder / "links.csv",
+        "folder": folder,
+        "out": folder / "never",
+        "result": folder / "out",
+        "bare": tmp_path / "bare.csv",
+    }
+    before = sorted(folder.rglob("*"))
+    outcome = calibray(*(argument.format(**places) for argument in arguments))
+    assert (outcome.exit_code, outcome.stdout) == (2, "")
+    assert outcome.stderr.startswith("Error: ")
+    assert message in outcome.stderr
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
+    result = Result.load(folder / "out")
+    row, none = np.arange(2, 14), np.zeros(12, dtype=bool)
+    few, most = np.arange(12) < 2, np.arange(12) < 11
+    told = render_result(result, Enclosed.of(row, none, few))
+    assert re.search(
+        r"transmitter inside a building +0\nreceiver inside a building +2 +rows 2, 3: check", told
+    )
+    indoors = render_result(result, Enclosed.of(row, most, most))
+    assert re.search(r"receiver inside a building +11 +as most are: taken for an indoor scene\n", indoors)
+    assert summary(result, Enclosed.of(row, none, few))["rows_with_enclosed_rx"] == [2, 3]
+
+
+def test_tables_fit_what_there_is(folder, ran):
+    result = Result.load(folder / "out")
+    bare = replace(result, offsets_db={}, offset_only_rmse_db=None, holdout_rmse_db=None, intervals={})
+    text = render_result(bare, Enclosed((), (), False))
+    assert "Offsets" not in text
+    assert "offset only" not in text
+    assert "not known" in text
+
+
+def test_a_table_aligns_its_columns_and_takes_text_as_it_is():
+    text = render_table(("Name", ">[dB]"), [("[red]walls[/red]", "1.0"), ("w", "-10.0")])
+    assert text.splitlines()[2:] == ["[red]walls[/red]     1.0", "w                  -10.0"]
+
+
+def test_rows_are_named_while_they_are_few():
+    assert rows_text([]) == ""
+    assert rows_text([7]) == "row 7"
+    assert rows_text(range(1, 15)).endswith("11, 12 and 2 more")
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_progress_is_drawn_only_where_somebody_watches(watched):
+    console = Console(file=io.StringIO(), force_terminal=watched, width=80)
+    with terminal.progress_bars(console) as progress:
+        progress("tracing", 5, 12)
+        progress("calibrating", 30, None)
+        progress("calibrating", 60, 225)
+    drawn = console.file.getvalue()
+    assert bool(drawn) == watched
+    assert ("calibrating" in drawn) == watched
