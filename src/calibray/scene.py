@@ -19,7 +19,7 @@ from typing import Final
 
 from calibray.errors import InputError
 from calibray.files import write_text
-from calibray.materials import DEFAULT_REVISION, ITU_MATERIALS, Material, itu_material
+from calibray.materials import BOUNDS, DEFAULT_REVISION, ITU_MATERIALS, Material, itu_material
 from calibray.spelling import did_you_mean
 
 BUNDLED_PREFIX: Final = "sionna:"
@@ -299,11 +299,15 @@ def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
 def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
     if bsdf is None:
         return {}
-    return {
-        element.get("name", ""): float(element.get("value", "nan"))
-        for element in bsdf.findall("float")
-        if element.get("name") in _MATERIAL_FIELDS
-    }
+    found = {}
+    for element in bsdf.findall("float"):
+        name, value = element.get("name", ""), element.get("value")
+        if name in _MATERIAL_FIELDS:
+            try:
+                found[name] = float(value)
+            except (TypeError, ValueError):
+                raise InputError(f"{name} = {value!r}: must be {BOUNDS[name]}") from None
+    return found
 
 
 def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
@@ -348,7 +352,7 @@ def export_scene(
         split: Materials made for some objects, as in `read_scene`.
 
     Raises:
-        InputError: The original cannot be read.
+        InputError: The original cannot be read, or a material of it is missing.
     """
     path = _scene_path(str(source))
     root = _parse(path, str(source))
@@ -356,6 +360,8 @@ def export_scene(
     names = {name: f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}" for name in materials}
     for shape in root.findall("shape"):
         _, name = _materials_of(shape, definitions, split or {}, path)
+        if name not in names:
+            raise InputError(f"{path}: there are no constants for the material {name!r}; export all of them")
         _refer(shape, names[name])
         filename = shape.find("string[@name='filename']")
         if filename is not None:

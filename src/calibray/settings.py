@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from math import isfinite
 from typing import Final
 
 from calibray.errors import InputError
@@ -29,7 +30,7 @@ class TraceSettings:
         seed: Seed of the tracer's random numbers, at least 0.
 
     Raises:
-        InputError: A number lies outside its bound.
+        InputError: A number lies outside its bound, or a switch is neither true nor false.
     """
 
     max_depth: int = 3
@@ -44,10 +45,15 @@ class TraceSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name, least in (("max_depth", 0), ("samples", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise InputError(f"trace.{name} = {value!r}: must be a whole number of at least {least}")
+        least = {"max_depth": 0, "samples": 1, "seed": 0}
+        for name, value in asdict(self).items():
+            if name not in least:
+                if not isinstance(value, bool):
+                    raise InputError(f"trace.{name} = {value!r}: must be true or false")
+            elif isinstance(value, bool) or not isinstance(value, int) or value < least[name]:
+                raise InputError(
+                    f"trace.{name} = {value!r}: must be a whole number of at least {least[name]}"
+                )
 
     def record(self) -> dict[str, int | bool]:
         """The settings by name, for files and digests."""
@@ -77,11 +83,15 @@ class Antenna:
                 raise InputError(
                     f"antenna {name} = {getattr(self, name)!r}: must be one of {', '.join(known)}"
                 )
-        object.__setattr__(self, "orientation", tuple(float(angle) for angle in self.orientation))
-        if len(self.orientation) != 3:
+        try:
+            angles = tuple(float(angle) for angle in self.orientation)
+        except (TypeError, ValueError):
+            angles = ()
+        if len(angles) != 3 or not all(isfinite(angle) for angle in angles):
             raise InputError(
-                f"antenna orientation = {self.orientation}: must be three angles [rad]: yaw, pitch, roll"
+                f"antenna orientation = {self.orientation!r}: must be three angles [rad]: yaw, pitch, roll"
             )
+        object.__setattr__(self, "orientation", angles)
 
     @property
     def ports(self) -> int:

@@ -37,7 +37,7 @@ from calibray.errors import EngineError, InputError  # noqa: E402
 from calibray.geometry import Chains, compile_chains, zenith_azimuth  # noqa: E402
 from calibray.materials import Material  # noqa: E402
 from calibray.paths import Paths, concatenate  # noqa: E402
-from calibray.scene import Scene, read_scene  # noqa: E402
+from calibray.scene import Scene, check_material_name, read_scene  # noqa: E402
 from calibray.settings import Antenna, TraceSettings, as_antenna  # noqa: E402
 
 LANES: Final = 20_000_000  # samples x depth x receivers of one chunk; about 45 bytes each
@@ -133,7 +133,7 @@ class Tracer:
         rx_antenna: Receive antenna.
 
     Raises:
-        InputError: Sionna cannot load the scene.
+        InputError: Sionna cannot load the scene, or the frequency is not a positive number.
     """
 
     def __init__(
@@ -144,6 +144,8 @@ class Tracer:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> None:
+        if not (np.isfinite(frequency) and frequency > 0):
+            raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
         self.scene, self.frequency, self.settings = scene, float(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
         self._scene = _load(scene)
@@ -158,9 +160,13 @@ class Tracer:
 
         Args:
             materials: Constants by material name; materials not named keep theirs.
+
+        Raises:
+            InputError: The scene has no material of a name.
         """
         names = list(self.scene.materials)
         for name, material in materials.items():
+            check_material_name(name, self.scene.materials, "materials")
             target = self._scene.radio_materials[f"calibray-{names.index(name)}"]
             for constant in FLOATS:  # opaque: a literal would be compiled into the kernels
                 setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
@@ -177,7 +183,7 @@ class Tracer:
             The paths in Sionna's buffers.
 
         Raises:
-            InputError: A position is not finite, or a link's ends coincide.
+            InputError: There is no link, a position is not finite, or a link's ends coincide.
             EngineError: There are more paths than the largest buffer holds.
         """
         tx, rx = _positions(links)
@@ -456,6 +462,10 @@ def _scattering_pattern(material: Material) -> rt.ScatteringPattern:
 
 def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
+    if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
+        raise InputError(
+            f"links: tx has the shape {tx.shape}, rx {rx.shape}; both must be [links, 3], with at least one link"
+        )
     for name, position in (("tx", tx), ("rx", rx)):
         bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
         if len(bad):
