@@ -1,0 +1,289 @@
+"""Scene files: materials as Sionna reads them, faults told with place and remedy, and scenes written again."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sionna.rt
+
+import calibray as cb
+from calibray.errors import InputError
+from calibray.materials import ITU_MATERIALS, Material, itu_material
+from calibray.scene import export_scene, read_scene
+from calibray.tracing import FLOATS
+from small_scenes import CONCRETE, block, write_scene
+
+SCENES = Path(sionna.rt.__file__).parent / "scenes"
+BUNDLED = sorted(folder.name for folder in SCENES.iterdir() if (folder / f"{folder.name}.xml").is_file())
+FLOOR = {"floor": [[(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.0, 0.0), (-9.0, 9.0, 0.0)]]}
+ITU = '<bsdf type="itu-radio-material" id="mat-stone"><string name="type" value="{}"/></bsdf>'
+
+
+def test_every_bundled_scene_is_known() -> None:
+    assert {"munich", "etoile", "florence", "san_francisco", "simple_street_canyon", "box"} <= set(BUNDLED)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_constants_equal_sionnas(name: str, tmp_path: Path) -> None:
+    """Against the materials that Sionna itself reads, with one mesh for each, as all meshes would take long."""
+    root = ElementTree.parse(SCENES / name / f"{name}.xml").getroot()
+    met = set()
+    for shape in root.findall("shape"):
+        material = shape.find("ref").get("id")
+        if material in met:
+            root.remove(shape)
+            continue
+        met.add(material)
+        filename = shape.find("string[@name='filename']")
+        filename.set("value", str(SCENES / name / filename.get("value")))
+    ElementTree.ElementTree(root).write(tmp_path / "bare.xml")
+    theirs = sionna.rt.load_scene(str(tmp_path / "bare.xml"), merge_shapes=False)
+    theirs.frequency = 3.5e9
+    ours = read_scene(f"sionna:{name}", 3.5e9).materials
+    assert set(ours) == set(theirs.radio_materials)
+    for key, material in ours.items():
+        for field in FLOATS:
+            value = getattr(theirs.radio_materials[key], field)[0]
+            assert getattr(material, field) == pytest.approx(value, rel=1e-6), (key, field)
+
+
+def test_objects_and_their_materials_in_the_files_order() -> None:
+    scene = read_scene("sionna:box_one_screen", 1e9)
+    assert [(entry.name, entry.material) for entry in scene.objects] == [
+        ("box", "box-mat"),
+        ("screen", "screen-mat"),
+    ]
+    assert list(scene.materials) == ["box-mat", "screen-mat"]
+
+
+# Materials from a file of one's own
+
+
+@pytest.mark.parametrize("bsdf", [
+    ITU.format("concrete"),
+    '<bsdf type="twosided" id="mat-itu_concrete"><bsdf type="diffuse"/></bsdf>',
+    '<bsdf type="radio-material" id="mat-itu_concrete"/>',
+])  # fmt: skip
+def test_itu_materials_by_type_and_by_name(tmp_path: Path, bsdf: str) -> None:
+    identifier = re.search('id="(.*?)"', bsdf)[1]
+    scene = read_scene(write_scene(tmp_path, FLOOR, bsdf, identifier), 2e9)
+    assert scene.materials == {identifier.removeprefix("mat-"): itu_material("concrete", 2e9, thickness=0.1)}
+
+
+def test_constants_in_the_file(tmp_path: Path) -> None:
+    bsdf = CONCRETE.replace("</bsdf>", '<float name="scattering_coefficient" value="0.3"/></bsdf>')
+    scene = read_scene(write_scene(tmp_path, FLOOR, bsdf), 2e9)
+    assert scene.materials == {"stone": Material(5.0, 0.05, 0.2, 0.3)}
+
+
+def test_overrides_replace_what_they_name(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR)
+
+    def stone(override: Material | dict[str, object]) -> Material:
+        return read_scene(file, 2e9, {"stone": override}).materials["stone"]
+
+    assert stone({"thickness": 0.4}) == Material(5.0, 0.05, 0.4)
+    assert stone({"itu": "glass"}) == itu_material("glass", 2e9, thickness=0.2)
+    assert stone({"itu": "glass", "revision": "P.2040-1", "thickness": 0.01}) == itu_material(
+        "glass", 2e9, thickness=0.01, revision="P.2040-1"
+    )
+    assert stone(Material(2.0, 0.0, 0.1)) == Material(2.0, 0.0, 0.1)
+    assert stone({"scattering_pattern": "directive", "alpha_r": 3}).scattering_pattern == "directive"
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("<scene><bsdf", r"is not well-formed XML \(.*line 1.*\); export it again"),
+        ("", r"is not well-formed XML"),
+        ("\x00\x01", r"is not well-formed XML"),
+        ("<html/>", r"the root element is <html>, a Mitsuba scene has <scene>"),
+        ("<scene/>", r"the scene has no <shape>"),
+    ],
+)
+def test_file_that_is_no_scene(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "scene.xml").write_text(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_scene(tmp_path / "scene.xml", 2e9)
+    assert str(tmp_path / "scene.xml") in str(caught.value)
+
+
+def test_binary_file(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="is not well-formed XML"):
+        read_scene(tmp_path / "scene.xml", 2e9)
+
+
+@pytest.mark.parametrize("name", ["absent.xml", "."])
+def test_missing_file(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="does not exist; check the path"):
+        read_scene(tmp_path / name, 2e9)
+
+
+def test_unknown_bundled_scene() -> None:
+    with pytest.raises(InputError, match=r"'sionna:munch'.*it has .*munich"):
+        read_scene("sionna:munch", 2e9)
+
+
+def test_missing_mesh(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR)
+    (tmp_path / "meshes" / "floor.ply").unlink()
+    with pytest.raises(
+        InputError, match=r"mesh 'meshes/floor.ply' of shape 'mesh-floor' does not exist in .*; copy"
+    ):
+        read_scene(file, 2e9)
+
+
+def test_damaged_mesh_is_told_by_the_tracer(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR)
+    (tmp_path / "meshes" / "floor.ply").write_text("ply\nformat ascii 1.0\nnonsense\n")
+    links = SimpleNamespace(tx=np.zeros((1, 3)), rx=np.ones((1, 3)))
+    with pytest.raises(InputError, match=r"scene\.xml: Sionna RT cannot load the scene"):
+        cb.trace(file, links, frequency=2e9, max_depth=0, samples=1)
+
+
+def test_shape_without_a_material(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR, material="mat-other")
+    with pytest.raises(
+        InputError, match=r"shape 'mesh-floor' refers to no <bsdf> of the scene; give it a material"
+    ):
+        read_scene(file, 2e9)
+
+
+def test_material_without_radio_constants(tmp_path: Path) -> None:
+    file = write_scene(tmp_path, FLOOR, '<bsdf type="diffuse" id="mat-stone"/>')
+    with pytest.raises(
+        InputError, match=r"material 'stone': its BSDF of type 'diffuse' has no radio constants; give"
+    ):
+        read_scene(file, 2e9)
+    given = {"stone": {"relative_permittivity": 3.0, "conductivity": 0.1}}
+    assert read_scene(file, 2e9, given).materials["stone"] == Material(3.0, 0.1, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("relative_permittivity", "0.5", r"relative_permittivity = 0\.5: must be"),
+        ("thickness", "0", r"thickness = 0\.0: must be"),
+        ("conductivity", "much", r"conductivity = 'much': must be a finite number"),
+        ("conductivity", "nan", r"conductivity = nan: must be"),
+    ],
+)
+def test_constant_outside_physics_in_the_file(tmp_path: Path, field: str, value: str, message: str) -> None:
+    bsdf = re.sub(rf'name="{field}" value="[^"]*"', f'name="{field}" value="{value}"', CONCRETE)
+    with pytest.raises(InputError, match=rf"material 'stone': {message}"):
+        read_scene(write_scene(tmp_path, FLOOR, bsdf), 2e9)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            {"stonne": {"thickness": 0.1}},
+            r"\[materials\] stonne: the scene has no material 'stonne'; did you mean 'stone'\?",
+        ),
+        ({"stone": {"tickness": 0.1}}, r"\[materials\] stone: unknown key 'tickness'"),
+        ({"stone": {"thickness": -1.0}}, r"material 'stone': thickness = -1\.0: must be"),
+        (
+            {"stone": {"itu": "concret"}},
+            r"material 'stone': 'concret' is no material .*did you mean 'concrete'\?",
+        ),
+        (
+            {"stone": {"itu": "glass", "revision": "P.2040-9"}},
+            r"material 'stone': revision = 'P\.2040-9': unknown",
+        ),
+    ],
+)
+def test_override_that_cannot_be_used(tmp_path: Path, overrides: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_scene(write_scene(tmp_path, FLOOR), 2e9, overrides)
+
+
+@pytest.mark.parametrize("frequency", [0.5e9, 150e9])
+def test_frequency_outside_the_itu_range_is_rescued_by_constants(tmp_path: Path, frequency: float) -> None:
+    """NVlabs/sionna-rt#71: Sionna itself refuses the scene before the constants can be given."""
+    file = write_scene(tmp_path, FLOOR, ITU.format("concrete"))
+    with pytest.raises(InputError, match=r"material 'stone': .*concrete.*1.*100 GHz"):
+        read_scene(file, frequency)
+    given = {"stone": {"relative_permittivity": 6.0, "conductivity": 0.2}}
+    scene = read_scene(file, frequency, given)
+    assert scene.materials["stone"] == Material(6.0, 0.2, 0.1)
+    links = SimpleNamespace(tx=np.array([[0.0, 0, 3]]), rx=np.array([[4.0, 0, 2]]))
+    paths = cb.trace(scene, links, frequency=frequency, max_depth=1, samples=1000)
+    assert paths.num_paths == 2
+
+
+# Scenes written again
+
+
+def links_in_the_canyon() -> SimpleNamespace:
+    rx = np.random.default_rng(4).uniform((-8, -8, 1.5), (8, 8, 2.5), (4, 3))
+    return SimpleNamespace(tx=np.tile([-20.0, 2, 15], (4, 1)), rx=rx)
+
+
+def test_exported_scene_traces_to_the_same_path_loss(tmp_path: Path) -> None:
+    """Calibrated constants, written into a scene: read back by us, and loaded by Sionna alone."""
+    source, frequency, options = "sionna:simple_street_canyon", 3.5e9, {"max_depth": 2, "samples": 20_000}
+    links = links_in_the_canyon()
+    original = cb.trace(source, links, frequency=frequency, **options)
+    new = {
+        name: replace(
+            material, relative_permittivity=2.0 + index, conductivity=0.1, thickness=0.15 + 0.02 * index
+        )
+        for index, (name, material) in enumerate(original.materials.items())
+    }
+    target = tmp_path / "deep" / "calibrated.xml"
+    target.parent.mkdir()
+    export_scene(source, new, target)
+    expected = cb.path_loss(original, new)
+
+    again = cb.trace(target, links, frequency=frequency, **options)
+    assert list(again.materials.values()) == list(new.values())
+    np.testing.assert_allclose(cb.path_loss(again), expected, atol=1e-3)
+
+    scene = sionna.rt.load_scene(str(target))
+    scene.frequency = frequency
+    scene.tx_array = scene.rx_array = sionna.rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
+    scene.add(sionna.rt.Transmitter("tx", links.tx[0].tolist()))
+    for index, position in enumerate(links.rx):
+        scene.add(sionna.rt.Receiver(f"rx-{index}", position.tolist()))
+    found = sionna.rt.PathSolver(deterministic=True)(
+        scene, max_depth=2, refraction=False, samples_per_src=20_000, seed=1
+    )
+    power = sum(part.numpy() ** 2 for part in found.a).sum(axis=(1, 2, 3, 4))
+    np.testing.assert_allclose(-10 * np.log10(power), expected, atol=0.01)
+    assert [path.name for path in target.parent.iterdir()] == ["calibrated.xml"]
+
+
+def test_exported_material_avoids_names_that_sionna_keeps_for_itu(tmp_path: Path) -> None:
+    target = tmp_path / "out.xml"
+    scene = read_scene("sionna:floor_wall", 3.5e9)
+    assert set(scene.materials) <= set(ITU_MATERIALS["P.2040-3"])
+    export_scene("sionna:floor_wall", scene.materials, target)
+    assert set(read_scene(target, 3.5e9).materials) == {f"calibrated-{name}" for name in scene.materials}
+
+
+def test_exported_scene_keeps_its_meshes_when_exported_from_a_folder_to_another(tmp_path: Path) -> None:
+    file = write_scene(tmp_path / "here", {"house": block((-1, -1, 0), (1, 1, 2)), **FLOOR})
+    (tmp_path / "there").mkdir()
+    export_scene(file, {"stone": Material(3.0, 0.2, 0.1)}, tmp_path / "there" / "scene.xml")
+    scene = read_scene(tmp_path / "there" / "scene.xml", 1e9)
+    assert scene.materials == {"stone": Material(3.0, 0.2, 0.1)}
+    assert [entry.name for entry in scene.objects] == ["house", "floor"]
+
+
+def test_export_needs_every_material(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no constants for the material 'brick'"):
+        export_scene("sionna:floor_wall", {"concrete": Material(3.0, 0.2, 0.1)}, tmp_path / "scene.xml")
+    assert not list(tmp_path.iterdir())
