@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +11,7 @@ from scipy.optimize import minimize
 
 import planted
 from calibray.calibration import calibrate, from_search, make_optimizer, search_slope, to_search
+from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
@@ -220,6 +223,22 @@ def test_a_study_without_any_path_is_refused(tmp_path):
             planted.study(tmp_path, measured, holdout={"where": "rx_y < 15"}),
             engine=planted.engine(blocked=True),
         )
+
+
+def test_of_a_parameter_on_a_logarithmic_scale_the_logarithm_is_uncertain(tmp_path):
+    replay, noisy = planted.engine(), planted.campaign(noise_db=0.02)
+    logarithmic = Parameters(tuple(replace(parameter, scale="log") for parameter in replay.parameters))
+    sections = {name: {"bounds": planted.BOUNDS, "scale": "log"} for name in planted.TRUTH}
+    study = planted.study(tmp_path, noisy, parameters=sections)
+    result = calibrate(study, engine=Replay(replay.paths, logarithmic))
+    linear = run(tmp_path, noisy)
+    assert result.parameters == pytest.approx(linear.parameters, rel=1e-4)
+    for name, value in result.parameters.items():
+        interval, other = result.intervals[name], linear.intervals[name]
+        assert interval.upper / value == pytest.approx(value / interval.lower)
+        assert other.upper - value == pytest.approx(value - other.lower, rel=1e-3)
+        assert interval.standard_error == pytest.approx(other.standard_error, rel=1e-2)
+        assert interval.lower < value < interval.upper
 
 
 def test_the_search_space_is_the_logarithm_where_asked_for():

@@ -404,19 +404,28 @@ def _result(
 
 
 def _intervals(problem: Problem, best: np.ndarray) -> dict[str, Interval]:
+    """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
     if not isinstance(problem.engine, Replay):
         return {}
     parameters, objective = problem.engine.parameters, problem.objective
     loss, slope = problem.engine.path_loss_and_jacobian(best[None])
+    unit = search_slope(parameters, best)
     found = intervals(
-        best,
+        to_search(parameters, best),
         objective.residuals(loss)[0],
-        objective.jacobian(loss, slope)[0],
-        parameters.lower,
-        parameters.upper,
+        objective.jacobian(loss, slope * unit)[0],
+        to_search(parameters, parameters.lower),
+        to_search(parameters, parameters.upper),
         objective.num_groups,
     )
-    return dict(zip(parameters.names, found, strict=True))
+    lower, upper = (
+        from_search(parameters, np.array(ends))
+        for ends in zip(*((each.lower, each.upper) for each in found), strict=True)
+    )
+    return {
+        name: Interval(each.standard_error * float(unit[k]), float(lower[k]), float(upper[k]), each.verdict)
+        for k, (name, each) in enumerate(zip(parameters.names, found, strict=True))
+    }
 
 
 def _stage(progress: Progress | None, name: str) -> engines.Progress | None:
