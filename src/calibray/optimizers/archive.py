@@ -146,6 +146,25 @@ class Archive:
                     break
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
+    def imputed(self, told: Evaluations) -> Evaluations:
+        """Give failed evaluations the values of the worst successful one; models then steer away from them.
+
+        Args:
+            told: Evaluations, some of them failed.
+
+        Returns:
+            The same with finite values; zero while every evaluation of the run has failed.
+        """
+        every = self.all()
+        failed, good = ~np.isfinite(told.y), np.flatnonzero(np.isfinite(every.y))
+        worst = good[np.argmax(every.y[good])] if good.size else None
+        y = np.where(failed, 0.0 if worst is None else every.y[worst], told.y)
+        residuals = told.residuals
+        if residuals is not None:
+            fill = np.zeros(residuals.shape[1]) if worst is None else every.residuals[worst]
+            residuals = np.where(failed[:, None], fill, residuals)
+        return Evaluations(told.x, y, residuals)
+
 
 def checked_evaluations(
     box: Box,

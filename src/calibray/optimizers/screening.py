@@ -34,12 +34,10 @@ def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cu
     Returns:
         Predicted objective [n]; all zero while every evaluation has failed.
     """
-    told = archive.all()
-    good = np.isfinite(told.y)
-    if not good.any():
+    if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))
-    y = np.where(good, told.y, told.y[good].max())
-    x, y = merged(archive.box.to_unit(told.x), y)
+    told = archive.imputed(archive.all())
+    x, y = merged(archive.box.to_unit(told.x), told.y)
     if kernel == "gaussian":
         # phi(r) = exp(-(epsilon r)^2) with epsilon = 1 / (sqrt(2) sigma)
         settings = {"kernel": "gaussian", "epsilon": sqrt(len(x)) / pdist(x).max(), "degree": 0}

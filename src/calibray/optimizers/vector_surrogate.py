@@ -29,7 +29,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import norm, spearmanr
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive, Evaluations, merged
+from calibray.optimizers.archive import Archive, merged
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import descend
@@ -109,7 +109,7 @@ class VectorSurrogate(Optimizer):
 
     @property
     def trust(self) -> float | None:
-        """How well the model ranks evaluated points by their objective when each is left out; None without a model.
+        """How well the model ranks points that are left out by their objective; None without a model.
 
         Spearman's rank correlation: 1 is perfect, 0 useless, and then more initial points are in order.
         """
@@ -129,7 +129,7 @@ class VectorSurrogate(Optimizer):
             count = min(self.batch, left)
             told = archive.all()
             unit, good = self._to_unit(told.x), np.isfinite(told.y)
-            points, residuals = merged(unit, _imputed(told))
+            points, residuals = merged(unit, archive.imputed(told).residuals)
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
             if spanned < d or len(points) < d + 2 or good.sum() < 2:  # nothing to model yet
                 chosen = self._rng.random((count, d))
@@ -239,15 +239,6 @@ def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.
 def _separation(x: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance of each point to the nearest one taken."""
     return cdist(x, taken).min(axis=1)
-
-
-def _imputed(told: Evaluations) -> NDArray[np.float64]:
-    """Residuals, with the worst successful ones in place of the failed."""
-    good = np.isfinite(told.y)
-    if not good.any():
-        return np.zeros_like(told.residuals)
-    worst = told.residuals[np.argmax(np.where(good, told.y, -np.inf))]
-    return np.where(good[:, None], told.residuals, worst)
 
 
 def _flags(value: ArrayLike, box: Box) -> NDArray[np.bool_]:
