@@ -56,7 +56,7 @@ def trace_digest(
         ],
         "frequency": frequency,
         "settings": settings.record(),
-        "antennas": [asdict(antenna) for antenna in antennas],
+        "antennas": [antenna.record() for antenna in antennas],
         "materials": {name: asdict(material) for name, material in scene.materials.items()},
         "objects": [asdict(entry) for entry in scene.objects],
     }

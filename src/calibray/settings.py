@@ -8,6 +8,7 @@ from math import isfinite
 from typing import Final
 
 from calibray.errors import InputError
+from calibray.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
@@ -62,11 +63,12 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class Antenna:
-    """An antenna as Sionna RT names them.
+    """An antenna as Sionna RT names them, or one whose gain was measured.
 
     Attributes:
-        pattern: "iso", "dipole", "hw_dipole" or "tr38901".
-        polarization: "V", "H", or dual "VH" or "cross".
+        pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a CSV file of gains (see `read_gain_table`).
+        polarization: "V", "H", or dual "VH" or "cross". The field is polarized so in every direction of the
+            antenna's own frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain that the pattern says.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
 
     Raises:
@@ -78,11 +80,17 @@ class Antenna:
     orientation: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS)):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"antenna {name} = {getattr(self, name)!r}: must be one of {', '.join(known)}"
-                )
+        if self.pattern not in PATTERNS and not (
+            isinstance(self.pattern, str) and is_gain_file(self.pattern)
+        ):
+            raise InputError(
+                f"antenna pattern = {self.pattern!r}: must be one of {', '.join(PATTERNS)}, or a file of gains, "
+                "as 'horn.csv'"
+            )
+        if self.polarization not in POLARIZATIONS:
+            raise InputError(
+                f"antenna polarization = {self.polarization!r}: must be one of {', '.join(POLARIZATIONS)}"
+            )
         try:
             angles = tuple(float(angle) for angle in self.orientation)
         except (TypeError, ValueError):
@@ -97,6 +105,20 @@ class Antenna:
     def ports(self) -> int:
         """Number of ports: 2 for a dual-polarized antenna, else 1."""
         return 2 if self.polarization in ("VH", "cross") else 1
+
+    @property
+    def gain_file(self) -> str | None:
+        """The CSV file that gives the gain, or None."""
+        return self.pattern if is_gain_file(self.pattern) else None
+
+    def record(self) -> dict[str, object]:
+        """The antenna by attribute, for digests: a file of gains counts by what it holds, not by its name.
+
+        Raises:
+            InputError: The file cannot be used.
+        """
+        gain = {} if self.gain_file is None else {"pattern": read_gain_table(self.gain_file).digest()}
+        return asdict(self) | gain
 
 
 def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:

@@ -24,7 +24,11 @@ llvm.select()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import sionna.rt as rt  # noqa: E402
-from sionna.rt.antenna_pattern import antenna_pattern_registry, antenna_pattern_to_world_implicit  # noqa: E402
+from sionna.rt.antenna_pattern import (  # noqa: E402
+    PolarizedAntennaPattern,
+    antenna_pattern_registry,
+    antenna_pattern_to_world_implicit,
+)
 from sionna.rt.path_solvers.field_calculator import FieldCalculator  # noqa: E402
 from sionna.rt.path_solvers.image_method import ImageMethod  # noqa: E402
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer  # noqa: E402
@@ -34,6 +38,7 @@ from sionna.rt.scene import load_scene_from_string  # noqa: E402
 from sionna.rt.utils import rotation_matrix  # noqa: E402
 
 from calibray.errors import EngineError, InputError  # noqa: E402
+from calibray.gain_table import GainTable, read_gain_table  # noqa: E402
 from calibray.geometry import Chains, compile_chains, zenith_azimuth  # noqa: E402
 from calibray.materials import Material  # noqa: E402
 from calibray.paths import Paths, concatenate  # noqa: E402
@@ -133,7 +138,8 @@ class Tracer:
         rx_antenna: Receive antenna.
 
     Raises:
-        InputError: Sionna cannot load the scene, or the frequency is not a positive number.
+        InputError: Sionna cannot load the scene, the frequency is not a positive number, or an antenna's file of gains
+            cannot be used.
     """
 
     def __init__(
@@ -148,6 +154,7 @@ class Tracer:
             raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
         self.scene, self.frequency, self.settings = scene, float(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
+        self._tx_patterns, self._rx_patterns = _patterns(tx_antenna), _patterns(rx_antenna)
         self._scene = _load(scene)
         self._scene.frequency = self.frequency
         self._shape_material = _shape_materials(self._scene)
@@ -300,8 +307,13 @@ class Tracer:
             spreading=program.spreading,
             departure=zenith_azimuth(departure),
             arrival=zenith_azimuth(-arrival),
-            tx_field=_turn(_pattern(self.tx_antenna, departure, "out"), program.departure_rotation),
-            rx_field=_turn(_pattern(self.rx_antenna, -arrival, "in"), program.arrival_rotation * [1, -1]),
+            tx_field=_turn(
+                _pattern(self.tx_antenna, self._tx_patterns, departure, "out"), program.departure_rotation
+            ),
+            rx_field=_turn(
+                _pattern(self.rx_antenna, self._rx_patterns, -arrival, "in"),
+                program.arrival_rotation * [1, -1],
+            ),
             first=program.first,
             kind=program.kind,
             material=program.material,
@@ -372,8 +384,8 @@ class Tracer:
             tgt_positions=chunk.target,
             src_orientations=_points(np.array([self.tx_antenna.orientation])),
             tgt_orientations=_points(np.tile(self.rx_antenna.orientation, (count, 1))),
-            src_antenna_patterns=_patterns(self.tx_antenna),
-            tgt_antenna_patterns=_patterns(self.rx_antenna),
+            src_antenna_patterns=self._tx_patterns,
+            tgt_antenna_patterns=self._rx_patterns,
         )
         dr.eval(found.a, found.tau)  # at once: every array read on its own would run the whole stage again
         buffer.valid = valid  # the field stage narrows it
@@ -502,18 +514,42 @@ def _gather(points: mi.Point3f, index: mi.UInt) -> mi.Point3f:
 
 
 def _patterns(antenna: Antenna) -> list:
-    return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
+    """Sionna's pattern functions of zenith and azimuth [rad], one per port."""
+    if antenna.gain_file is None:
+        return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
+    pattern = _tabulated(read_gain_table(antenna.gain_file))
+    return PolarizedAntennaPattern(v_pattern=pattern, polarization=antenna.polarization).patterns
 
 
-def _pattern(antenna: Antenna, direction: np.ndarray, way: str) -> np.ndarray:
+def _tabulated(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
+    """`GainTable.gain` as a pattern function of Sionna: the field's amplitude."""
+    (rows, columns), (rise, turn) = table.gain_dbi.shape, np.radians(table.steps_deg)
+    first = np.radians(table.first_azimuth_deg)
+    gain = mi.Float(_aligned(table.gain_dbi.ravel(), np.float32))
+
+    def pattern(zenith: mi.Float, azimuth: mi.Float) -> mi.Complex2f:
+        row = dr.clip((np.pi - zenith) / rise, 0, rows - 1)
+        column = (azimuth - first) / turn
+        column = dr.clip(column - dr.floor(column / columns) * columns, 0, columns)
+        i, j = dr.minimum(mi.UInt(row), rows - 2), dr.minimum(mi.UInt(column), columns - 1)
+        k = dr.select(j == columns - 1, 0, j + 1)
+        u, v = row - mi.Float(i), column - mi.Float(j)
+        low, high = (
+            dr.lerp(dr.gather(mi.Float, gain, at + j), dr.gather(mi.Float, gain, at + k), v)
+            for at in (i * columns, (i + 1) * columns)
+        )
+        return mi.Complex2f(dr.power(10.0, dr.lerp(low, high, u) / 20), 0)
+
+    return pattern
+
+
+def _pattern(antenna: Antenna, patterns: list, direction: np.ndarray, way: str) -> np.ndarray:
     """Jones vectors of an antenna in the basis (theta, phi) of the wave, by port [P, ports, 2]."""
     if not len(direction):
         return np.zeros((0, antenna.ports, 2), dtype=complex)
     to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
     look = mi.Vector3f(*(_aligned(axis, np.float32) for axis in direction.T))
-    fields = [
-        antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in _patterns(antenna)
-    ]
+    fields = [antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in patterns]
     parts = np.array([np.array(field, dtype=float) for field in fields])  # [ports, (re, re, im, im), P]
     return np.moveaxis(parts[:, :2] + 1j * parts[:, 2:], 2, 0)
 

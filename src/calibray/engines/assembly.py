@@ -96,7 +96,7 @@ def _command(
         frequency=study.scene.frequency,
         bandwidth=study.scene.bandwidth,
         combining=study.objective.combining,
-        antennas=(study.antennas.tx, study.antennas.rx),
+        antennas=study.antenna_pair,
         tx=links.tx,
         rx=links.rx,
     )
@@ -117,8 +117,9 @@ def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Prog
     Returns:
         The path program.
     """
-    antennas = study.antennas.tx, study.antennas.rx
-    digest = cache.trace_digest(scene, study.scene.frequency, study.trace, antennas, links.tx, links.rx)
+    digest = cache.trace_digest(
+        scene, study.scene.frequency, study.trace, study.antenna_pair, links.tx, links.rx
+    )
     paths = cache.find(digest)
     if paths is None:
         paths = _tracer(study, scene).trace(links, progress).paths()
@@ -164,4 +165,4 @@ def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> T
 
 
 def _tracer(study: Study, scene: Scene) -> Tracer:
-    return Tracer(scene, study.scene.frequency, study.trace, study.antennas.tx, study.antennas.rx)
+    return Tracer(scene, study.scene.frequency, study.trace, *study.antenna_pair)

@@ -40,7 +40,7 @@ def fingerprint(study: Study, scene: Scene, links: Measurements, parameters: Par
         "frequency": study.scene.frequency,
         "bandwidth": study.scene.bandwidth,
         "combining": study.objective.combining,
-        "antennas": [asdict(study.antennas.tx), asdict(study.antennas.rx)],
+        "antennas": [antenna.record() for antenna in study.antenna_pair],
         "trace": study.trace.record(),
         "parameters": list(parameters.names),
         "materials": {

@@ -17,6 +17,7 @@ from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
+from calibray.settings import Antenna
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
     AntennasSection,
@@ -171,13 +172,29 @@ class Study(Section):
         return (
             self.scene.file
             if self.scene.file.startswith(BUNDLED)
-            else str(self._resolve("scene", self.scene.file))
+            else str(self._resolve("scene.file", self.scene.file))
         )
 
     @property
     def links_path(self) -> Path:
         """The table of links."""
-        return self._resolve("links", self.links.file)
+        return self._resolve("links.file", self.links.file)
+
+    @property
+    def antenna_pair(self) -> tuple[Antenna, Antenna]:
+        """The transmit and the receive antenna, their files of gains resolved."""
+        ends = ((end, getattr(self.antennas, end)) for end in ("tx", "rx"))
+        tx, rx = (
+            antenna
+            if antenna.gain_file is None
+            else Antenna(
+                str(self._resolve(f"antennas.{end}.pattern", antenna.pattern).resolve()),
+                antenna.polarization,
+                antenna.orientation,
+            )
+            for end, antenna in ends
+        )
+        return tx, rx
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
@@ -268,20 +285,24 @@ class Study(Section):
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def _resolve(self, section: str, file: str) -> Path:
+    def _resolve(self, key: str, file: str) -> Path:
         try:
             return self._path.parent / expand(file, os.environ)
         except InputError as error:
-            raise InputError(f"{self._path}: {section}.file = {file!r}: {error}") from None
+            raise InputError(f"{self._path}: {key} = {file!r}: {error}") from None
 
     def _check_files(self) -> None:
-        files = {"scene": self.scene_source, "links": self.links_path}
-        for section, file in files.items():
+        files = [
+            ("scene.file", self.scene.file, self.scene_source),
+            ("links.file", self.links.file, self.links_path),
+        ]
+        for end, antenna in zip(("tx", "rx"), self.antenna_pair, strict=True):
+            if antenna.gain_file is not None:
+                written = getattr(self.antennas, end).pattern
+                files.append((f"antennas.{end}.pattern", written, antenna.gain_file))
+        for key, written, file in files:
             if not str(file).startswith(BUNDLED) and not Path(file).is_file():
-                written = getattr(self, section).file
-                raise InputError(
-                    f"{self._path}: {section}.file = {written!r}: no such file, {Path(file).resolve()}"
-                )
+                raise InputError(f"{self._path}: {key} = {written!r}: no such file, {Path(file).resolve()}")
 
 
 def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
