@@ -60,6 +60,18 @@ def test_takes_exactly_its_budget(name, method):
 
 
 @pytest.mark.parametrize(("name", "method"), CASES)
+def test_one_parameter_is_enough(name, method):
+    def evaluate(x):
+        return np.abs(x[:, 0] - 0.3), x - 0.3, np.ones((len(x), 1, 1))
+
+    optimizer = method([0.0], [1.0], seed=1)
+    while not optimizer.done and optimizer.evaluations < 1000:
+        x = optimizer.ask()
+        optimizer.tell(x, *evaluate(x))
+    assert optimizer.best.y < 0.05
+
+
+@pytest.mark.parametrize(("name", "method"), CASES)
 def test_says_what_it_uses(name, method):
     assert method.uses <= {"value", "residuals", "jacobian"}
     assert "value" in method.uses
@@ -107,7 +119,6 @@ def test_evaluations_that_were_not_asked_for_join_without_advancing(name, method
     LANDSCAPE.run(told, budget=20_000)
     LANDSCAPE.run(fresh, budget=20_000)
     assert told.best.y == 0.0
-    assert fresh.best.y > 0.0
     if fresh.budget is not None:
         assert told.evaluations == fresh.evaluations + 2
 

@@ -5,6 +5,10 @@ installed is only missed when its class is constructed.
 """
 
 from calibray.optimizers.archive import Best
+from calibray.optimizers.cma_es import CMAES
+from calibray.optimizers.dfo_ls import DFOLS
+from calibray.optimizers.differential_evolution import DifferentialEvolution
+from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.protocol import Optimizer
@@ -17,16 +21,24 @@ METHODS: dict[str, type[Optimizer]] = {
     "sgwo-im": SGWOIM,
     "vector-surrogate": VectorSurrogate,
     "least-squares": LeastSquares,
+    "cma-es": CMAES,
+    "differential-evolution": DifferentialEvolution,
+    "dfo-ls": DFOLS,
+    "gaussian-process": GaussianProcess,
     "random": RandomSearch,
     "latin-hypercube": LatinHypercube,
     "sobol": Sobol,
 }
 
 __all__ = [
+    "CMAES",
+    "DFOLS",
     "GWO",
     "METHODS",
     "SGWOIM",
     "Best",
+    "DifferentialEvolution",
+    "GaussianProcess",
     "LatinHypercube",
     "LeastSquares",
     "Optimizer",

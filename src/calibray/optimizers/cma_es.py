@@ -1,0 +1,85 @@
+"""CMA-ES, the covariance matrix adaptation evolution strategy, by its author's library.
+
+N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, in the package `cma`. It works in
+the unit cube, where it starts in the middle (or at the best point told before) with a step of 0.3, and
+starts again from a random point whenever it has converged before its budget is used.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibray.optimizers.archive import Archive
+from calibray.optimizers.arguments import whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.inversion import library, limited
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.session import Search, Session
+
+STEP = 0.3  # of the unit cube, initial standard deviation
+
+
+@final
+class CMAES(Optimizer):
+    """Covariance matrix adaptation. Uses the value alone; budget as given. Needs `calibray[optimizers]`.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the one random generator.
+        budget: Number of evaluations.
+        population: Candidates a generation, 4 + 3 ln d if None.
+
+    Raises:
+        InputError: An argument is out of range, or `cma` is not installed.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int = 225,
+        population: int | None = None,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        default = 4 + int(3 * np.log(self.box.dimension))
+        self.population = default if population is None else whole("population", population, at_least=4)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._cma = library("cma", "cma")
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Number of evaluations it will ask for."""
+        return self._budget
+
+    def _search(self, archive: Archive) -> Search:
+        return limited(self._generations(archive), self._budget)
+
+    def _generations(self, archive: Archive) -> Search:
+        d = self.box.dimension
+        start = self.box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
+        options = {
+            "bounds": [0.0, 1.0],
+            "popsize": self.population,
+            "randn": lambda *shape: self._rng.standard_normal(shape),
+            "seed": np.nan,  # leaves NumPy's global generator alone
+            "verbose": -9,
+        }
+        if d == 1:
+            options["maxstd_boundrange"] = np.inf  # whose limit fails in one dimension, as of cma 4.5
+        while True:
+            strategy = self._cma.CMAEvolutionStrategy(start, STEP, options)
+            while not strategy.stop():
+                unit = np.array(strategy.ask())
+                told = yield self.box.from_unit(unit)
+                strategy.tell(list(unit), list(archive.imputed(told).y))
+            start = self._rng.random(d)

@@ -1,0 +1,90 @@
+"""Differential evolution by SciPy, one generation a batch (R. Storn, K. Price, J. Global Optim. 11 (1997) 341).
+
+Without SciPy's final polish, which would need derivatives; started again with another population whenever
+it has converged before its budget is used.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import Bounds, differential_evolution
+
+from calibray.optimizers.archive import Archive
+from calibray.optimizers.arguments import whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.inversion import Evaluate, inverted, limited
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.session import Search, Session
+
+
+@final
+class DifferentialEvolution(Optimizer):
+    """Differential evolution. Uses the value alone; budget as given.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the one random generator.
+        budget: Number of evaluations.
+        population: Candidates a generation as a multiple of d; SciPy makes it at least 5 in all.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> opt = DifferentialEvolution([-5.0, -5.0], [5.0, 5.0])
+        >>> while not opt.done:
+        ...     x = opt.ask()
+        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
+        >>> opt.evaluations, bool(opt.best.y < 0.1)
+        (225, True)
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    def __init__(
+        self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225, population: int = 5
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self.population = whole("population", population, at_least=1)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Number of evaluations it will ask for."""
+        return self._budget
+
+    def _search(self, archive: Archive) -> Search:
+        # The thread knows nothing of this object, so that it ends when this object is dropped.
+        minimise = partial(_minimise, self.population, archive, self._rng)
+        return limited(inverted(minimise), self._budget)
+
+
+def _minimise(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
+    """Minimise with one population after the other, for ever."""
+    box = archive.box
+
+    def objective(x: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form
+        return archive.imputed(evaluate(box.clip(x.T))).y
+
+    start = archive.best.x if len(archive) else None
+    while True:
+        differential_evolution(
+            objective,
+            Bounds(box.lower, box.upper),
+            popsize=population,
+            x0=start,
+            tol=0.0,
+            polish=False,
+            vectorized=True,
+            updating="deferred",
+            rng=rng,
+        )
+        start = None

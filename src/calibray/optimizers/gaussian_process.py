@@ -1,0 +1,158 @@
+"""Bayesian optimization of the objective: a Gaussian process of the value alone, and its expected improvement.
+
+The scalar rival of `VectorSurrogate`, on the same model (see `kriging.py`) of one number instead of every
+residual. A run begins with a maximin Latin hypercube; every further candidate maximises the logarithm of the
+expected improvement: D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; its
+logarithm after S. Ament et al., NeurIPS 2023, arXiv:2310.20708. A failed evaluation enters the model with the
+worst successful value.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
+from scipy.special import erfcx
+from scipy.stats import norm
+
+from calibray.optimizers.archive import Archive, merged
+from calibray.optimizers.arguments import whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.sampling import maximin_design
+from calibray.optimizers.session import Search, Session
+
+CANDIDATES = 300  # drawn over the box, and as many around the best points
+REFINEMENTS = (
+    0.1,
+    0.01,
+    0.001,
+)  # of the unit cube: how far around the most promising candidate more are drawn
+SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
+OFTEN = 40  # evaluations up to which the scales are learned anew every time; beyond, every tenth
+
+
+@final
+class GaussianProcess(Optimizer):
+    """Bayesian optimization. Uses the value alone; 20 d evaluations unless told otherwise.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the one random generator.
+        budget: Number of evaluations, 20 d if None.
+        initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> opt = GaussianProcess([-5.0, -5.0], [5.0, 5.0], budget=25)
+        >>> while not opt.done:
+        ...     x = opt.ask()
+        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
+        >>> opt.evaluations, bool(opt.best.y < 0.01)
+        (25, True)
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int | None = None,
+        initial: int | None = None,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        d = self.box.dimension
+        self._budget = 20 * d if budget is None else whole("budget", budget, at_least=1)
+        self.initial = 2 * (d + 1) if initial is None else whole("initial", initial, at_least=d + 2)
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search)
+
+    @property
+    def budget(self) -> int:
+        """Number of evaluations it will ask for."""
+        return self._budget
+
+    def _search(self, archive: Archive) -> Search:
+        d, left, hyper = self.box.dimension, self._budget, None
+        missing = min(left, max(self.initial - len(archive), 0))
+        if missing:
+            yield self.box.from_unit(maximin_design(missing, d, self._rng))
+            left -= missing
+        for turn in range(left):
+            told = archive.imputed(archive.all())
+            unit = self.box.to_unit(told.x)
+            points, values = merged(unit, told.y[:, None])
+            spanned = np.linalg.matrix_rank(points - points.mean(axis=0)) == d
+            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # nothing to model yet
+                x = self._rng.random(d)
+            else:
+                learn = hyper is None or len(points) <= OFTEN or turn % 10 == 0
+                model = fit(points, values, guess=hyper) if learn else solve(points, values, hyper)
+                hyper = model.hyper
+                x = self._promising(model, unit[np.argsort(told.y, kind="stable")])
+            yield self.box.from_unit(x[None])
+
+    def _promising(self, model: Kriging, taken: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The point of the largest expected improvement [d]; `taken` are the points told, best first."""
+        d, best = self.box.dimension, float(model.residuals.min())
+        near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
+        reach = 10.0 ** self._rng.uniform(-3.0, -0.5, (CANDIDATES, 1))
+        around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
+        candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
+        promise = log_improvement(model, candidates, best)
+        for reach in REFINEMENTS:
+            closer = reach * self._rng.standard_normal((CANDIDATES // 3, d))
+            closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
+            candidates = np.vstack([candidates, closer])
+            promise = np.append(promise, log_improvement(model, closer, best))
+        fresh = cdist(candidates, taken).min(axis=1) > SEPARATION
+        return candidates[np.argmax(np.where(fresh, promise, -np.inf))]
+
+
+def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
+    """The logarithm of the expected decrease of a modelled value below the best one.
+
+    Args:
+        model: A model of one value.
+        x: Points of the unit cube [k, d].
+        best: The lowest value so far.
+
+    Returns:
+        Logarithm of the expected improvement [k].
+    """
+    mean, share = model.predict(x)
+    spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
+    z = (best - mean[:, 0]) / spread
+    return np.log(spread) + log_shape(z)
+
+
+def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The logarithm of phi(z) + z Phi(z), without loss where that is tiny.
+
+    Args:
+        z: Predicted improvement in standard deviations [k].
+
+    Returns:
+        The logarithm [k].
+
+    Example:
+        >>> import numpy as np
+        >>> log_shape(np.array([0.0, -1e6])).round(3).tolist()
+        [-0.919, -500000000028.55]
+    """
+    high, low = np.maximum(z, -1.0), np.minimum(z, -1.0)
+    # phi(z) + z Phi(z) = phi(z) (1 + z Phi(z) / phi(z)), whose second factor tends to 1 / z^2
+    ratio = 1.0 + low * np.sqrt(np.pi / 2.0) * erfcx(-low / np.sqrt(2.0))
+    rest = np.where(low < -1e4, -2.0 * np.log(-low), np.log(np.maximum(ratio, 1e-300)))
+    tail = -0.5 * low**2 - 0.5 * np.log(2.0 * np.pi) + rest
+    return np.where(z > -1.0, np.log(norm.pdf(high) + high * norm.cdf(high)), tail)

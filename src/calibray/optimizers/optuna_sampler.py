@@ -1,0 +1,217 @@
+"""SGWO-IM as a sampler for Optuna, so that its storages, dashboard and workers serve the paper's method.
+
+Every candidate that is handed out is written into its trial. A sampler made anew with the same seed on a stored
+study therefore goes through the same candidates again, takes the answers that are there, and goes on where the
+study stopped. Trials that it did not propose (enqueued, or of another sampler) join the archive: they can lead
+the pack. A trial that failed counts as a failed evaluation.
+
+The pack cannot move before the iteration is complete. When every open candidate is with a worker, one that another
+process took is handed out again, for that process may be gone; else the next trial is a random point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from threading import Lock
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from calibray.errors import InputError
+from calibray.optimizers.inversion import library
+from calibray.optimizers.sgwoim import SGWOIM
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
+    from optuna.samplers import BaseSampler
+    from optuna.study import Study
+    from optuna.trial import FrozenTrial, TrialState
+else:
+    optuna = library("optuna", "Optuna")
+    BaseSampler = optuna.samplers.BaseSampler
+    FloatDistribution = optuna.distributions.FloatDistribution
+    IntDistribution = optuna.distributions.IntDistribution
+    TrialState = optuna.trial.TrialState
+
+CANDIDATE = "sgwo-im:candidate"  # system attribute of a trial: its candidate in the coordinates of the search
+
+
+@final
+class SGWOIMSampler(BaseSampler):
+    """The paper's optimizer for an Optuna study of one objective.
+
+    Args:
+        search_space: The parameters and their distributions, float or integer. If None it is inferred from the
+            trials, which makes the first trial a random point; categorical parameters are sampled at random.
+        seed: Seed.
+        **settings: Further settings of `SGWOIM`.
+
+    Raises:
+        InputError: A distribution is categorical, or a setting is out of range.
+
+    Example:
+        >>> import optuna
+        >>> optuna.logging.set_verbosity(optuna.logging.ERROR)
+        >>> space = {"a": optuna.distributions.FloatDistribution(1.0, 9.0)}
+        >>> study = optuna.create_study(sampler=SGWOIMSampler(space, seed=1, population=6, iterations=8))
+        >>> study.optimize(lambda trial: (trial.suggest_float("a", 1.0, 9.0) - 4.0) ** 2)
+        >>> len(study.trials), round(study.best_params["a"])
+        (45, 4)
+    """
+
+    def __init__(
+        self, search_space: Mapping[str, BaseDistribution] | None = None, *, seed: int = 0, **settings: Any
+    ) -> None:
+        self._space = dict(search_space or {})
+        for name, distribution in self._space.items():
+            if not isinstance(distribution, FloatDistribution | IntDistribution):
+                raise InputError(
+                    f"{name}: {distribution} is neither float nor integer; leave it out of the search space"
+                )
+        self._settings = {"seed": seed, **settings}
+        self._inferred = optuna.search_space.IntersectionSearchSpace()
+        self._random = optuna.samplers.RandomSampler(seed=seed)
+        self._optimizer: SGWOIM | None = None
+        self._told: set[int] = set()
+        self._given: set[int] = set()
+        self._lock = Lock()
+        SGWOIM([0.0] * max(len(self._space), 1), [1.0] * max(len(self._space), 1), **self._settings)
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        """The parameters that the pack moves in.
+
+        Args:
+            study: The study.
+            trial: The trial to sample for.
+
+        Returns:
+            Their distributions by name.
+        """
+        if self._space:
+            return self._space
+        found = self._inferred.calculate(study)
+        numeric = (FloatDistribution, IntDistribution)
+        return {name: d for name, d in found.items() if isinstance(d, numeric) and not d.single()}
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """Hand out a candidate of the pack that no other trial works on.
+
+        Args:
+            study: The study.
+            trial: The trial to sample for.
+            search_space: The parameters that the pack moves in.
+
+        Returns:
+            Values by name; empty where Optuna should draw them at random.
+
+        Raises:
+            InputError: The study has several objectives.
+        """
+        if len(study.directions) != 1:
+            raise InputError(f"the study has {len(study.directions)} objectives; SGWO-IM takes 1: choose one")
+        if not search_space:
+            return {}
+        with self._lock:
+            optimizer = self._synchronized(study, search_space)
+            if optimizer.done:
+                return {}
+            running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+            taken = {other.number: other.system_attrs.get(CANDIDATE) for other in running}
+            ours = [taken[number] for number in self._given & taken.keys()]
+            asked = optimizer.ask().tolist()
+            left = [x for x in asked if x not in taken.values()] or [x for x in asked if x not in ours]
+            if not left:
+                return {}
+            free = left[0]
+            self._given.add(trial.number)
+            study._storage.set_trial_system_attr(trial._trial_id, CANDIDATE, free)
+        values = zip(search_space.items(), free, strict=True)
+        return {name: _value(distribution, x) for (name, distribution), x in values}
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        """Draw a parameter at random that the pack does not move in.
+
+        Args:
+            study: The study.
+            trial: The trial to sample for.
+            param_name: The parameter.
+            param_distribution: Its distribution.
+
+        Returns:
+            Its value.
+        """
+        return self._random.sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self, study: Study, trial: FrozenTrial, state: TrialState, values: list[float] | None
+    ) -> None:
+        """Take a trial's answer, and stop the study when the pack has hunted to the end.
+
+        Args:
+            study: The study.
+            trial: The trial, not stored as finished yet.
+            state: How it ended.
+            values: Its objective.
+        """
+        with self._lock:
+            if self._optimizer is None:
+                return
+            self._take(study, trial, state, values)
+            if self._optimizer.done:
+                with suppress(RuntimeError):  # nothing to stop where trials are asked for one by one
+                    study.stop()
+
+    def _synchronized(self, study: Study, space: Mapping[str, BaseDistribution]) -> SGWOIM:
+        """The optimizer, told every finished trial of the study in order."""
+        if self._optimizer is None or self._space != space:
+            bounds = np.array([_bounds(distribution) for distribution in space.values()])
+            self._optimizer, self._space, self._told = SGWOIM(*bounds.T, **self._settings), dict(space), set()
+        for trial in study.get_trials(deepcopy=False):
+            if trial.state.is_finished():
+                self._take(study, trial, trial.state, trial.values)
+        return self._optimizer
+
+    def _take(self, study: Study, trial: FrozenTrial, state: TrialState, values: list[float] | None) -> None:
+        """Tell a finished trial, once."""
+        optimizer = self._optimizer
+        if trial.number in self._told or optimizer.done:
+            return
+        self._told.add(trial.number)
+        optimizer.ask()  # the iteration begins before its answers come, however many are stored already
+        x = np.array(trial.system_attrs.get(CANDIDATE, self._foreign(trial)), dtype=float)
+        if x.shape != optimizer.box.lower.shape or not np.array_equal(x, optimizer.box.clip(x)):
+            return
+        sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
+        optimizer.tell([x], [sign * values[0] if state == TrialState.COMPLETE and values else np.inf])
+
+    def _foreign(self, trial: FrozenTrial) -> list[float]:
+        """Where a trial lies that the pack did not propose; empty if it lacks a parameter."""
+        if not self._space.keys() <= trial.params.keys():
+            return []
+        return [_coordinate(distribution, trial.params[name]) for name, distribution in self._space.items()]
+
+
+def _bounds(distribution: FloatDistribution | IntDistribution) -> tuple[float, float]:
+    """Bounds of the search coordinate; an integer has an interval of its own width to either side."""
+    margin = 0.5 if isinstance(distribution, IntDistribution) else 0.0
+    return _coordinate(distribution, distribution.low - margin), _coordinate(
+        distribution, distribution.high + margin
+    )
+
+
+def _coordinate(distribution: FloatDistribution | IntDistribution, value: float) -> float:
+    return float(np.log(value)) if distribution.log else float(value)
+
+
+def _value(distribution: FloatDistribution | IntDistribution, coordinate: float) -> float | int:
+    value = float(np.exp(coordinate)) if distribution.log else coordinate
+    if distribution.step is not None:
+        value = distribution.low + round((value - distribution.low) / distribution.step) * distribution.step
+    value = min(max(value, distribution.low), distribution.high)
+    return round(value) if isinstance(distribution, IntDistribution) else value
