@@ -65,7 +65,8 @@ def test_linear_residuals_are_reproduced_everywhere():
 
 
 def test_slope_equals_finite_differences(model):
-    slope = model.slope(QUERY)
+    mean, slope = model.mean_and_slope(QUERY)
+    assert mean == pytest.approx(model.predict(QUERY)[0], abs=1e-9)
     for column, step in enumerate(1e-6 * np.eye(3)):
         difference = (model.predict(QUERY + step)[0] - model.predict(QUERY - step)[0]) / 2e-6
         assert slope[:, :, column] == pytest.approx(difference, abs=1e-4)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
 
 NUGGET = 1e-8  # of the prior variance: keeps the matrix regular, below any engine's precision
 LENGTH = (
@@ -67,22 +68,24 @@ class Kriging:
             Mean [k, m], and the variance as a share of the prior's, the same for every residual [k].
         """
         basis = np.hstack([matern(self._distance(x)), _trend(x)])
-        spread = 1.0 - np.einsum("ki,ij,kj->k", basis, self.inverse, basis)  # eq. 2.42
+        spread = 1.0 - np.sum(basis @ self.inverse * basis, axis=1)  # eq. 2.42
         return basis @ self.weights, np.maximum(spread, 0.0)  # eq. 2.41
 
-    def slope(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the predicted residuals.
+    def mean_and_slope(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Predict residuals and their derivatives.
 
         Args:
             x: Points of the unit cube [k, d].
 
         Returns:
-            Jacobian by the coordinates of the unit cube [k, m, d].
+            Mean [k, m] and Jacobian by the coordinates of the unit cube [k, m, d].
         """
         count, dimension = self.points.shape
-        toward = (x[:, None] - self.points[None]) * np.exp(2.0 * self.hyper[:dimension])
-        kernels = matern_slope(self._distance(x))[:, :, None] * toward
-        return np.einsum("knd,nm->kmd", kernels, self.weights[:count]) + self.weights[count + 1 :].T
+        distance = self._distance(x)
+        mean = np.hstack([matern(distance), _trend(x)]) @ self.weights
+        toward = (x[:, :, None] - self.points.T) * np.exp(2.0 * self.hyper[:dimension, None])
+        by_coordinate = (matern_slope(distance)[:, None] * toward) @ self.weights[:count]
+        return mean, (by_coordinate + self.weights[count + 1 :]).transpose(0, 2, 1)
 
     def left_out(self) -> NDArray[np.float64]:
         """Predict every evaluated point from all the others, scales kept.
@@ -108,7 +111,7 @@ class Kriging:
 
     def _distance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         rates = np.exp(self.hyper[: self.points.shape[1]])
-        return np.sqrt((((x[:, None] - self.points[None]) * rates) ** 2).sum(axis=-1))
+        return cdist(x * rates, self.points * rates)
 
 
 def fit(
@@ -187,7 +190,7 @@ class Likelihood:
     """
 
     def __init__(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
-        self.square = (points[:, None] - points[None]) ** 2
+        self.square = ((points[:, None] - points[None]) ** 2).reshape(-1, points.shape[1])
         self.contrasts = _contrasts(_trend(points))
         spread = residuals.std(axis=0)
         self.residuals = residuals[:, spread > 1e-9 * max(spread.max(), 1e-300)]
@@ -203,8 +206,9 @@ class Likelihood:
             Its value and its gradient [d + 1]; 1e10 where the kernel matrix is singular.
         """
         rates_squared, nugget = np.exp(2.0 * hyper[:-1]), np.exp(hyper[-1])
-        distance = np.sqrt(self.square @ rates_squared)
-        kernel = matern(distance) + nugget * np.eye(len(distance))
+        count = len(self.residuals)
+        distance = np.sqrt(self.square @ rates_squared).reshape(count, count)
+        kernel = matern(distance) + nugget * np.eye(count)
         try:
             root = np.linalg.cholesky(self.contrasts.T @ kernel @ self.contrasts)
         except np.linalg.LinAlgError:
@@ -213,10 +217,10 @@ class Likelihood:
         inverse = half.T @ half
         weights = inverse @ self.residuals
         free = len(root)
-        quadratic = np.maximum(np.einsum("nm,nm->m", self.residuals, weights), 1e-300)
+        quadratic = np.maximum(np.sum(self.residuals * weights, axis=0), 1e-300)
         value = 0.5 * free * np.log(quadratic / free).sum() / self.links + np.log(np.diag(root)).sum()
         gap = inverse - free / self.links * (weights / quadratic) @ weights.T  # eq. 5.9
-        by_rate = 0.5 * np.einsum("ij,ijk->k", gap * matern_slope(distance), self.square) * rates_squared
+        by_rate = 0.5 * ((gap * matern_slope(distance)).ravel() @ self.square) * rates_squared
         return value, np.append(by_rate, 0.5 * nugget * np.trace(gap))
 
 
@@ -234,8 +238,8 @@ def solve(points: NDArray[np.float64], residuals: NDArray[np.float64], hyper: ND
     count, dimension = points.shape
     trend = _trend(points)
     size = count + trend.shape[1]
-    distance = np.sqrt(((points[:, None] - points[None]) ** 2) @ np.exp(2.0 * hyper[:dimension]))
-    kernel = matern(distance) + np.exp(hyper[-1]) * np.eye(count)
+    scaled = points * np.exp(hyper[:dimension])
+    kernel = matern(cdist(scaled, scaled)) + np.exp(hyper[-1]) * np.eye(count)
     bordered = np.zeros((size, size))
     bordered[:count, :count], bordered[:count, count:], bordered[count:, :count] = kernel, trend, trend.T
     inverse = np.linalg.inv(bordered)

@@ -33,12 +33,13 @@ from calibray.optimizers.archive import Archive, merged
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import descend
-from calibray.optimizers.kriging import Kriging, fit
+from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 600  # drawn over the box, and as many around the best points
+REFIT = 1.1  # growth of the number of points after which input scales are learned anew
 SEARCHES = 16  # local searches on the model
 SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
 PATIENCE = 4  # batches in a row that promise too little before the search stops
@@ -134,13 +135,22 @@ class VectorSurrogate(Optimizer):
             if spanned < d or len(points) < d + 2 or good.sum() < 2:  # nothing to model yet
                 chosen = self._rng.random((count, d))
             else:
-                guess = None if self._model is None else self._model.hyper
-                self._model = fit(points, residuals, noisy=self.noisy, guess=guess)
+                self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(told.y, kind="stable")]
                 chosen, gain = self._choose(self._model, best_first, archive.best.y, turn, count)
                 quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
             yield self._from_unit(chosen)
             left, turn = left - count, turn + count
+
+    def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
+        """A model of all points, on new scales if they have grown enough in number to tell better."""
+        if self._model is None:
+            self._learned = len(points)
+            return fit(points, residuals, noisy=self.noisy)
+        if len(points) >= REFIT * self._learned:
+            self._learned = len(points)
+            return fit(points, residuals, noisy=self.noisy, guess=self._model.hyper)
+        return solve(points, residuals, self._model.hyper)
 
     def _choose(
         self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
@@ -231,7 +241,7 @@ def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.
     x = next(descent)
     while True:
         try:
-            x = descent.send((model.predict(x)[0], model.slope(x)))
+            x = descent.send(model.mean_and_slope(x))
         except StopIteration as end:
             return end.value.unit[np.argsort(end.value.cost, kind="stable")]
 
