@@ -201,6 +201,19 @@ def test_a_run_completes_in_spite_of_failures(tmp_path):
     assert result.rmse_db < result.initial_rmse_db
 
 
+def test_auto_is_the_vector_surrogate(tmp_path):
+    """Eighteen calls bring it near the planted materials; the ledger shows that the named method asks for the same."""
+    content = programs.content(tmp_path)
+    results = []
+    for name in ("auto", "vector-surrogate"):
+        method = {"name": name, "options": {"budget": 18}}
+        study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
+        results.append(calibrate(study, out=tmp_path / "out"))
+    assert [(result.rt_calls, result.ledger_hits) for result in results] == [(18, 0), (18, 18)]
+    assert results[0].parameters == results[1].parameters
+    assert results[0].rmse_db < 0.1 * results[0].initial_rmse_db
+
+
 def test_candidates_of_a_batch_run_at_once_and_keep_their_order(tmp_path):
     """Each program waits until all four have started, which they do only side by side."""
     wait = """

@@ -183,7 +183,7 @@ def runner():
 
 @pytest.mark.parametrize(
     ("method", "options", "workers"),
-    [("sgwo-im", SGWOIM, 0), ("random", "{ budget = 30 }", 3)],
+    [("sgwo-im", SGWOIM, 0), ("random", "{ budget = 30 }", 3), ("auto", "{ budget = 20, batch = 3 }", 3)],
 )
 def test_a_run_that_is_killed_and_started_again_ends_as_an_undisturbed_one(
     runner, tmp_path, method, options, workers

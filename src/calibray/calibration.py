@@ -337,14 +337,24 @@ def _optimizer(problem: Problem) -> Optimizer:
     section, parameters = problem.study.method, problem.engine.parameters
     name, options = section.name, dict(section.options)
     if name == AUTO:
-        name = "least-squares" if isinstance(problem.engine, Replay) else "sgwo-im"
+        name = "least-squares" if isinstance(problem.engine, Replay) else "vector-surrogate"
     if name == "least-squares":
         if not isinstance(problem.engine, Replay):
             raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
         options.setdefault("x0", to_search(parameters, parameters.start))
         if problem.engine.large:  # a candidate costs milliseconds there
             options.setdefault("starts", FEW_STARTS)
+    if name == "vector-surrogate":
+        options.setdefault("logarithmic", _better_logarithmic(parameters))
     return make_optimizer(name, parameters, section.seed, **options)
+
+
+def _better_logarithmic(parameters: Parameters) -> list[bool]:
+    """Which parameters [d] a model should see on a logarithmic scale beside those already searched on one.
+
+    Permittivities: a half space reflects -tanh(log(relative_permittivity) / 4) at normal incidence.
+    """
+    return [item.field == "relative_permittivity" and item.scale == "linear" for item in parameters]
 
 
 def _result(
