@@ -14,7 +14,8 @@ from calibray.calibration import calibrate, from_search, make_optimizer, search_
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
-from calibray.parameters import Parameter, Parameters
+from calibray.parameter import Parameter
+from calibray.parameters import Parameters
 from calibray.result import Result
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}

@@ -23,7 +23,8 @@ from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint
 from calibray.engines.ledger import Entry, key
 from calibray.errors import EngineError, InputError
-from calibray.parameters import Parameter, Parameters
+from calibray.parameter import Parameter
+from calibray.parameters import Parameters
 from calibray.study import Study
 
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [3.0, 4.0, 5.0]])

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, constants
-from calibray.parameters import Parameter, Parameters, make_parameter, split_name
+from calibray.parameter import Parameter, make_parameter, split_name
+from calibray.parameters import Parameters
 
 BASE = {
     "ground": Material(3.0, 0.01, 0.5),

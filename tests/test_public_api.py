@@ -10,7 +10,7 @@ SIGNATURES = {
     "Material": "relative_permittivity, conductivity, thickness, scattering_coefficient, xpd_coefficient, "
     "scattering_pattern, alpha_r, alpha_i, lambda_",
     "itu_material": "name, frequency, thickness, revision, scattering",
-    "read_measurements": "path, tx, rx, value, quantity, where, group, weight, std, tx_power_dbm",
+    "read_measurements": "path, tx, rx, value, quantity, where, group, weight, std, tx_power_dbm, frequency",
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import engines
-from calibray.engines import Engine, Recorded, Replay
+from calibray.engines import Differentiable, Engine, Recorded
 from calibray.errors import InputError
 from calibray.files import check_folder
 from calibray.likelihood import Interval, LogDistance, Objective, intervals, make_objective
@@ -209,7 +209,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         InputError: No candidate could be evaluated.
     """
     engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
-    derivatives = "jacobian" in optimizer.uses and isinstance(engine, Replay)
+    derivatives = "jacobian" in optimizer.uses and isinstance(engine, Differentiable)
     started, iteration, calls, hits = time.perf_counter(), 0, engine.calls, _hits(engine)
     while not optimizer.done:
         points = optimizer.ask()
@@ -256,12 +256,12 @@ def settle(
     """
     study, engine = problem.study, problem.engine
     sampled = study.trace.refraction or study.trace.diffuse_reflection
-    if not sampled or not study.fidelity.rounds or not isinstance(engine, Replay):
+    if not sampled or not study.fidelity.rounds or not isinstance(engine, Differentiable):
         return problem, run, None
     for turn in range(study.fidelity.rounds):
         scene = engines.make_scene(study, engine.parameters.materials(run.best, engine.materials))
         paths = engines.traced_paths(study, scene, problem.links, _stage(progress, "checking"))
-        again = Replay(paths, engine.parameters, study.objective.combining, study.scene.bandwidth)
+        again = engines.make_replay(study, paths, problem.links, engine.parameters)
         gap = _gap(again.path_loss(run.best[None])[0], run.best_loss)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
@@ -337,9 +337,9 @@ def _optimizer(problem: Problem) -> Optimizer:
     section, parameters = problem.study.method, problem.engine.parameters
     name, options = section.name, dict(section.options)
     if name == AUTO:
-        name = "least-squares" if isinstance(problem.engine, Replay) else "vector-surrogate"
+        name = "least-squares" if isinstance(problem.engine, Differentiable) else "vector-surrogate"
     if name == "least-squares":
-        if not isinstance(problem.engine, Replay):
+        if not isinstance(problem.engine, Differentiable):
             raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
         options.setdefault("x0", to_search(parameters, parameters.start))
         if problem.engine.large:  # a candidate costs milliseconds there
@@ -354,7 +354,9 @@ def _better_logarithmic(parameters: Parameters) -> list[bool]:
 
     Permittivities: a half space reflects -tanh(log(relative_permittivity) / 4) at normal incidence.
     """
-    return [item.field == "relative_permittivity" and item.scale == "linear" for item in parameters]
+    return [
+        item.field in ("relative_permittivity", "itu_a") and item.scale == "linear" for item in parameters
+    ]
 
 
 def _result(
@@ -367,7 +369,7 @@ def _result(
     judged = problem.held_out & (reached | (objective.ceiling_db is not None))
     offsets = objective.offsets(best[None])[0] if objective.num_groups else np.zeros(0)
     offset_only, after = objective.model(np.stack([before, best]))
-    rival = LogDistance.fit(links.distance, links.path_loss_db, objective.weight).path_loss(links.distance)
+    rival = _log_distance(links, objective.weight, study.scene.frequency)
 
     def rmse(model: np.ndarray, mask: np.ndarray) -> float | None:
         if not mask.any():
@@ -410,12 +412,20 @@ def _result(
         trace_seconds=trace_seconds,
         links=table,
         history=run.history(),
+        laws=engine.parameters.law(run.best),
     )
+
+
+def _log_distance(links: Measurements, weight: np.ndarray, frequency: float) -> np.ndarray:
+    """Path loss [L], [dB] of the log-distance model fitted to links; over carriers it rises as in free space."""
+    rise = 0.0 if links.frequency is None else 20 * np.log10(links.frequency / frequency)
+    model = LogDistance.fit(links.distance, links.path_loss_db - rise, weight)
+    return model.path_loss(links.distance) + rise
 
 
 def _intervals(problem: Problem, best: np.ndarray) -> dict[str, Interval]:
     """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
-    if not isinstance(problem.engine, Replay):
+    if not isinstance(problem.engine, Differentiable):
         return {}
     parameters, objective = problem.engine.parameters, problem.objective
     loss, slope = problem.engine.path_loss_and_jacobian(best[None])

@@ -205,7 +205,7 @@ def predict(
         typer.Argument(
             metavar="LINKS",
             help="CSV or Parquet file with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], and the study's "
-            "group column if its offset has one.",
+            "group column if its offset has one; its frequency column, if it has one, gives the carriers.",
             show_default=False,
         ),
     ],
@@ -225,7 +225,10 @@ def predict(
     from calibray.result import Result
 
     result = Result.load(folder)
-    links = read_links(links_file, group=result.study.offset.per if result.study.offset else None)
+    study = result.study
+    links = read_links(
+        links_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
+    )
     _refuse_column(links_file, links.frame)
     if out is not None:
         check_table(out)

@@ -307,7 +307,7 @@ def itu_material(
         >>> itu_material("concrete", frequency=4e9, revision="P.2040-1").relative_permittivity
         5.31
     """
-    law = _law(name, frequency, revision)
+    law = itu_law(name, frequency, revision)
     frequency_ghz = frequency / 1e9
     return Material(
         relative_permittivity=law.a * frequency_ghz**law.b,  # ITU-R P.2040-1 eq. 58
@@ -317,8 +317,24 @@ def itu_material(
     )
 
 
-def _law(name: str, frequency: float, revision: str) -> ItuLaw:
-    """The law of a material that covers a frequency [Hz]."""
+def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> ItuLaw:
+    """The law of a material of ITU-R P.2040 Table 3 that covers a frequency.
+
+    Args:
+        name: Name as Sionna RT writes it.
+        frequency: Frequency [Hz].
+        revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
+
+    Returns:
+        The row of the table.
+
+    Raises:
+        InputError: The revision or the name is unknown, or no law covers the frequency.
+
+    Example:
+        >>> itu_law("concrete", 4e9).d
+        0.7822
+    """
     if revision not in ITU_MATERIALS:
         raise InputError(f"revision = {revision!r}: unknown, {did_you_mean(revision, ITU_MATERIALS)}")
     _check_frequency(frequency)

@@ -3,95 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from math import isfinite
-from typing import Final, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibray.dispersion import LAWS, PARAMETER_BOUNDS, check_law, power, steady_law
 from calibray.errors import InputError
-from calibray.materials import (
-    BOUNDS,
-    DEFAULT_REVISION,
-    FIELDS,
-    SCATTERING_PATTERNS,
-    Material,
-    constants,
-    itu_material,
-)
-from calibray.spelling import did_you_mean
+from calibray.materials import FIELDS, ItuLaw, Material, constants
+from calibray.parameter import Parameter, check_material
 
-Scale = Literal["linear", "log"]
-
-_ITU_PREFIX: Final = "itu:"
-_ITU_FIELDS: Final = ("relative_permittivity", "conductivity")
-_PATTERN_FIELDS: Final = ("alpha_r", "alpha_i", "lambda_")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One calibrated number: a field of a material, with its bounds and its start.
-
-    Attributes:
-        name: Material and field, joined by the last dot: "walls.relative_permittivity".
-        lower: Lower bound, in the field's unit.
-        upper: Upper bound, in the field's unit.
-        start: Value before calibration, within the bounds, in the field's unit.
-        scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
-
-    Raises:
-        InputError: The field is unknown, or bounds or start are out of order or outside physics.
-
-    Example:
-        >>> Parameter("walls.relative_permittivity", lower=1.5, upper=12.0, start=5.0).material
-        'walls'
-    """
-
-    name: str
-    lower: float
-    upper: float
-    start: float
-    scale: Scale = "linear"
-
-    def __post_init__(self) -> None:
-        split_name(self.name)
-        bound = BOUNDS[self.field]
-        for value in (self.lower, self.upper):
-            if value not in bound:
-                raise InputError(
-                    f"{self.name}: bounds = [{self.lower}, {self.upper}]: {value} must be {bound}"
-                )
-        if self.lower >= self.upper:
-            fault = "equal" if self.lower == self.upper else "reversed"
-            raise InputError(
-                f"{self.name}: bounds = [{self.lower}, {self.upper}] are {fault}; the lower must be less "
-                "than the upper; to fix a constant, give it under [materials] instead"
-            )
-        if not self.lower <= self.start <= self.upper:
-            raise InputError(
-                f"{self.name}: start = {self.start:g} lies outside bounds = [{self.lower:g}, {self.upper:g}];"
-                " widen them or give another start"
-            )
-        if self.scale not in get_args(Scale):
-            raise InputError(
-                f"{self.name}: scale = {self.scale!r}: must be one of {', '.join(get_args(Scale))}"
-            )
-        if self.scale == "log" and self.lower <= 0:
-            raise InputError(
-                f"{self.name}: scale = 'log' with lower bound {self.lower:g}: the lower bound must be "
-                "greater than 0, or the scale 'linear'"
-            )
-
-    @property
-    def material(self) -> str:
-        """The material's name."""
-        return split_name(self.name)[0]
-
-    @property
-    def field(self) -> str:
-        """The field's name, one of `FIELDS`."""
-        return split_name(self.name)[1]
+_NO_LAW: Final = steady_law(Material(1.0, 0.0, 1.0))
+_UNBOUNDED: Final = 1e300
 
 
 @dataclass(frozen=True)
@@ -100,9 +24,12 @@ class Parameters:
 
     Attributes:
         items: The parameters, at least one.
+        frequency: Carrier [Hz] at which laws are taken where none is named.
+        laws: The laws of the materials of which some coefficient is a parameter, by material; a coefficient that is no
+            parameter keeps its value there. Absent, it is that of a material with the same constants everywhere.
 
     Raises:
-        InputError: There is none, or a name stands twice.
+        InputError: There is none, a name stands twice, or a constant and a coefficient of its law are both parameters.
 
     Example:
         >>> wall = Parameter("walls.relative_permittivity", lower=1.0, upper=11.0, start=5.0)
@@ -114,6 +41,8 @@ class Parameters:
     """
 
     items: tuple[Parameter, ...]
+    frequency: float = 1e9
+    laws: Mapping[str, ItuLaw] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "items", tuple(self.items))
@@ -121,6 +50,13 @@ class Parameters:
             raise InputError('parameters: none given; name at least one, as "walls.relative_permittivity"')
         if twice := [name for index, name in enumerate(self.names) if name in self.names[:index]]:
             raise InputError(f"parameters: {twice[0]!r} stands twice; remove one")
+        for parameter in self.items:
+            constant = f"{parameter.material}.{parameter.constant}"
+            if parameter.name != constant and constant in self.names:
+                raise InputError(
+                    f"parameters: {constant!r} is the same at every carrier and {parameter.name!r} belongs to its law; "
+                    "remove one"
+                )
 
     def __len__(self) -> int:
         return len(self.items)
@@ -153,12 +89,126 @@ class Parameters:
         """Whether each parameter [parameters] is searched on a logarithmic scale."""
         return np.array([parameter.scale == "log" for parameter in self.items])
 
-    def materials(self, candidate: ArrayLike, base: Mapping[str, Material]) -> dict[str, Material]:
-        """The materials that a candidate describes.
+    def entries(
+        self, candidates: ArrayLike, frequency: float | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What candidates put into a constants matrix at one carrier.
+
+        Args:
+            candidates: Parameter values [..., parameters], in the fields' units.
+            frequency: The carrier [Hz]; `frequency` of the parameters if None.
+
+        Returns:
+            The value of the constant that each parameter acts on [..., parameters], in its unit, and its derivative
+            by the parameter [..., parameters]. Two coefficients of one law have one value and a derivative each.
+
+        Raises:
+            InputError: The candidates have another length.
+        """
+        given = self._components(candidates)
+        values, slopes = given.copy(), np.ones_like(given)
+        for scale, exponent, fixed in self._laws():
+            found = power(
+                np.asarray(fixed[0]) if scale is None else given[..., scale],
+                np.asarray(fixed[1]) if exponent is None else given[..., exponent],
+                self.frequency if frequency is None else frequency,
+            )
+            for place, slope in ((scale, found.by_scale), (exponent, found.by_exponent)):
+                if place is not None:
+                    values[..., place], slopes[..., place] = found.value, slope
+        return values, slopes
+
+    @property
+    def has_laws(self) -> bool:
+        """Whether some parameter is a coefficient of a law."""
+        return any(parameter.field != parameter.constant for parameter in self.items)
+
+    def at(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
+        """The constants that the parameters act on, as parameters themselves: what is left of laws at one carrier.
+
+        Args:
+            frequency: The carrier [Hz].
+
+        Returns:
+            A parameter for each constant, bounded by physics alone where it follows a law, and the place of each of
+            these parameters' constants among them [parameters].
+        """
+        if not self.has_laws:
+            return self, np.arange(len(self))
+        starts, _ = self.entries(self.start, frequency)
+        found: dict[str, Parameter] = {}
+        for parameter, start in zip(self.items, starts.tolist(), strict=True):
+            name = f"{parameter.material}.{parameter.constant}"
+            least = PARAMETER_BOUNDS[parameter.constant].lower
+            lawful = Parameter(name, least, _UNBOUNDED, start) if name != parameter.name else parameter
+            found.setdefault(name, lawful)
+        names = list(found)
+        places = [names.index(f"{parameter.material}.{parameter.constant}") for parameter in self.items]
+        return Parameters(tuple(found.values()), frequency), np.array(places, dtype=np.int64)
+
+    def law(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
+        """The coefficients of the laws that a candidate describes.
+
+        Args:
+            candidate: Parameter values [parameters], in the fields' units.
+
+        Returns:
+            By material with a coefficient among the parameters: the law of each constant that has one there.
+        """
+        values = self._components(candidate)
+        found: dict[str, dict[str, float]] = {}
+        for scale, exponent, fixed in self._laws():
+            parameter = self.items[exponent if scale is None else scale]
+            for name, place, value in zip(LAWS[parameter.constant], (scale, exponent), fixed, strict=True):
+                found.setdefault(parameter.material, {})[name] = float(
+                    value if place is None else values[place]
+                )
+        return found
+
+    def check_carriers(self, frequencies: Sequence[float]) -> None:
+        """Refuse bounds of laws between which a constant leaves physics at some carrier.
+
+        Args:
+            frequencies: The carriers [Hz].
+
+        Raises:
+            InputError: A law lies outside its constant's bound; the message names the carrier.
+        """
+        for scale, exponent, fixed in self._laws():
+            parameter = self.items[exponent if scale is None else scale]
+            bounds = [
+                (fixed[k],) if place is None else (self.items[place].lower, self.items[place].upper)
+                for k, place in enumerate((scale, exponent))
+            ]
+            check_law(parameter.material, parameter.constant, *bounds, frequencies)
+
+    def _laws(self) -> Iterator[tuple[int | None, int | None, tuple[float, float]]]:
+        """Places of the coefficient and the exponent of every law, None where fixed, and what they are fixed at."""
+        done = set()
+        for parameter in self.items:
+            constant = parameter.constant
+            if parameter.field == constant or (parameter.material, constant) in done:
+                continue
+            done.add((parameter.material, constant))
+            names = LAWS[constant]
+            places = [
+                self.names.index(f"{parameter.material}.{name}")
+                if f"{parameter.material}.{name}" in self.names
+                else None
+                for name in names
+            ]
+            law = self.laws.get(parameter.material, _NO_LAW)
+            yield *places, tuple(getattr(law, name[-1]) for name in names)
+
+    def materials(
+        self, candidate: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
+    ) -> dict[str, Material]:
+        """The materials that a candidate describes, at one carrier.
 
         Args:
             candidate: Parameter values [parameters], in the fields' units.
             base: The scene's materials by name; what is no parameter stays as it is.
+            frequency: The carrier [Hz]; `frequency` of the parameters if None.
 
         Returns:
             All materials of `base`, in its order, with the candidate's values.
@@ -173,15 +223,17 @@ class Parameters:
                 f"candidate: shape {values.shape}, must be ({len(self)},), one value per parameter"
             )
         changes: dict[str, dict[str, float]] = {}
-        for parameter, value in zip(self.items, values.tolist(), strict=True):
-            _check_material(parameter.name, base)
-            changes.setdefault(parameter.material, {})[parameter.field] = value
+        entries, _ = self.entries(values, frequency)
+        for parameter, value in zip(self.items, entries.tolist(), strict=True):
+            check_material(parameter.name, base)
+            changes.setdefault(parameter.material, {})[parameter.constant] = value
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
     def indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Where each parameter stands in a constants matrix [materials, fields].
 
-        A pure replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``.
+        A pure replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``. Coefficients
+        of laws stand nowhere there; what they come to at a carrier does (`at`).
 
         Args:
             materials: The names of the matrix's rows, in order; its columns are `FIELDS`.
@@ -190,21 +242,28 @@ class Parameters:
             The rows [parameters] and the columns [parameters].
 
         Raises:
-            InputError: A parameter's material is not among them.
+            InputError: A parameter's material is not among them, or a parameter is a coefficient of a law.
         """
+        if self.has_laws:
+            raise InputError(
+                f"parameters {', '.join(self.names)}: a law stands in no constants matrix; take them at a carrier"
+            )
         order = list(materials)
         for name in self.names:
-            _check_material(name, order)
+            check_material(name, order)
         rows = np.array([order.index(parameter.material) for parameter in self.items], dtype=np.int64)
         columns = np.array([FIELDS.index(parameter.field) for parameter in self.items], dtype=np.int64)
         return rows, columns
 
-    def constants(self, candidates: ArrayLike, base: Mapping[str, Material]) -> NDArray[np.float64]:
-        """The constants of the materials that candidates describe.
+    def constants(
+        self, candidates: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
+    ) -> NDArray[np.float64]:
+        """The constants of the materials that candidates describe, at one carrier.
 
         Args:
             candidates: Parameter values [..., parameters], in the fields' units.
             base: The scene's materials by name, in the order of the rows.
+            frequency: The carrier [Hz]; `frequency` of the parameters if None.
 
         Returns:
             The constants [..., materials, fields], columns as `FIELDS`.
@@ -212,8 +271,9 @@ class Parameters:
         Raises:
             InputError: The candidates have another length, or a parameter's material is unknown.
         """
-        values = self._components(candidates)
-        rows, columns = self.indices(list(base))
+        carrier = self.frequency if frequency is None else frequency
+        (values, _), (acting, places) = self.entries(candidates, carrier), self.at(carrier)
+        rows, columns = (index[places] for index in acting.indices(list(base)))
         matrix = constants(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
         batch[..., rows, columns] = values
@@ -256,115 +316,3 @@ class Parameters:
     def _scaled_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         lower = self._scaled(self.lower)
         return lower, self._scaled(self.upper) - lower
-
-
-def split_name(name: str) -> tuple[str, str]:
-    """Material and field of a parameter's name: everything before the last dot, and what follows it.
-
-    Args:
-        name: The name.
-
-    Returns:
-        The material's name and the field's.
-
-    Raises:
-        InputError: The name has no material, or the field is unknown.
-
-    Example:
-        >>> split_name("block.7.thickness")
-        ('block.7', 'thickness')
-    """
-    material, _, field = name.rpartition(".")
-    if not material:
-        raise InputError(
-            f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"
-        )
-    if field not in FIELDS:
-        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, FIELDS)}")
-    return material, field
-
-
-def make_parameter(
-    name: str,
-    bounds: tuple[float, float],
-    base: Mapping[str, Material],
-    frequency: float,
-    start: float | str | None = None,
-    scale: Scale = "linear",
-) -> Parameter:
-    """A parameter of a scene, its start resolved.
-
-    Args:
-        name: Material and field, as "walls.relative_permittivity".
-        bounds: Lower and upper bound, in the field's unit.
-        base: The scene's materials by name.
-        frequency: Frequency [Hz], at which ITU-R laws are taken.
-        start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
-            None for the scene's own.
-        scale: "linear" or "log".
-
-    Returns:
-        The parameter.
-
-    Raises:
-        InputError: The scene has no such material, the field has no effect with the material's scattering
-            pattern, or what `Parameter` and `itu_material` refuse.
-
-    Example:
-        >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
-        >>> make_parameter("walls.relative_permittivity", (1, 9), walls, 4e9, start="itu:brick").start
-        3.91
-    """
-    material, field = split_name(name)
-    _check_material(name, base)
-    pattern = base[material].scattering_pattern
-    if field in _PATTERN_FIELDS and field not in SCATTERING_PATTERNS[pattern]:
-        raise InputError(
-            f"parameter {name!r} has no effect: the scattering pattern of {material!r} is {pattern!r}"
-        )
-    if start is None:
-        value = float(getattr(base[material], field))
-    elif isinstance(start, str):
-        value = itu_start(name, start, frequency)
-    elif isinstance(start, bool) or not isfinite(start):
-        raise InputError(f"{name}: start = {start!r}: must be a finite number or 'itu:NAME'")
-    else:
-        value = float(start)
-    return Parameter(name=name, lower=float(bounds[0]), upper=float(bounds[1]), start=value, scale=scale)
-
-
-def itu_start(name: str, start: str, frequency: float) -> float:
-    """The value that ITU-R P.2040 gives for a start like "itu:concrete@P.2040-1".
-
-    Args:
-        name: The parameter, of the field relative_permittivity or conductivity.
-        start: "itu:" and the ITU-R material, then "@" and the revision unless it is the default one.
-        frequency: Frequency [Hz].
-
-    Returns:
-        The value, in the field's unit.
-
-    Raises:
-        InputError: The text has another form, the field has no ITU-R law, or what `itu_material` refuses.
-    """
-    field = split_name(name)[1]
-    if not start.startswith(_ITU_PREFIX):
-        raise InputError(
-            f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"
-        )
-    if field not in _ITU_FIELDS:
-        raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")
-    itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
-    try:
-        material = itu_material(itu_name, frequency, revision=revision or DEFAULT_REVISION)
-    except InputError as error:
-        raise InputError(f"{name}: start = {start!r}: {error}") from None
-    return float(getattr(material, field))
-
-
-def _check_material(name: str, materials: Mapping[str, Material] | Sequence[str]) -> None:
-    material = split_name(name)[0]
-    if material not in materials:
-        raise InputError(
-            f"parameter {name!r}: the scene has no material {material!r}; {did_you_mean(material, materials)}"
-        )

@@ -161,6 +161,30 @@ class Paths:
         """Indices of the links to which no path leads [links]."""
         return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
 
+    def at(self, frequency: float, materials: Mapping[str, Material] | None = None) -> Paths:
+        """The same paths at another carrier: what was traced is geometry, and holds there too.
+
+        Of the paths found, only the share that diffuse reflection and refraction sample depends on the constants at the
+        carrier of the trace; the estimate stays unbiased at others.
+
+        Args:
+            frequency: Carrier frequency [Hz].
+            materials: Constants at that carrier, by name; materials not named keep theirs.
+
+        Returns:
+            The program at that carrier.
+
+        Raises:
+            InputError: The frequency is not a positive number, or a material is not among the paths'.
+        """
+        if not (np.isfinite(frequency) and frequency > 0):
+            raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
+        if unknown := sorted(set(materials or {}) - set(self.materials)):
+            raise InputError(
+                f"no material {unknown[0]!r} in the traced scene; it has {', '.join(self.materials)}"
+            )
+        return replace(self, frequency=float(frequency), materials={**self.materials, **(materials or {})})
+
     def save(self, path: str | Path) -> None:
         """Write an HDF5 file (schema in docs/path-file.md), readable by h5py and MATLAB.
 
@@ -264,6 +288,29 @@ def take(paths: Paths, index: np.ndarray) -> Paths:
         first=first,
         diffuse=_rows(paths.diffuse, _ordinal(paths.kind, Kind.DIFFUSE)[interaction]),
         diffraction=_rows(paths.diffraction, _ordinal(paths.kind, Kind.DIFFRACTION)[interaction]),
+    )
+
+
+def take_links(paths: Paths, links: np.ndarray) -> Paths:
+    """The program of some links, in a given order; a link may be taken more than once.
+
+    Args:
+        paths: A path program, its paths ordered by link.
+        links: Links to take [n].
+
+    Returns:
+        A program of n links.
+    """
+    links = np.asarray(links, dtype=np.int64)
+    start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
+    count = np.diff(start)[links]
+    end = np.cumsum(count)
+    index = np.arange(count.sum()) + np.repeat(start[links] - (end - count), count)
+    return replace(
+        take(paths, index),
+        link=np.repeat(np.arange(len(links)), count).astype(paths.link.dtype),
+        tx_position=paths.tx_position[links],
+        rx_position=paths.rx_position[links],
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import fields
-from calibray.engines import make_scene, traced_paths
+from calibray.engines import make_parameters, make_replay, make_scene, traced_paths
 from calibray.errors import InputError
 from calibray.files import check_folder, write_text
 from calibray.likelihood import Interval
@@ -36,7 +36,7 @@ class Result:
         parameters: Calibrated values by name, in the fields' units.
         initial_parameters: Values before calibration.
         intervals: 95 % intervals and verdicts by parameter; empty where the engine gives no derivatives.
-        materials: All materials of the scene, the calibrated values in place.
+        materials: All materials of the scene at its carrier, the calibrated values in place.
         offsets_db: Offsets by group, [dB]; the nameless group stands for all links; empty without `[offset]`.
         rmse_db: RMSE over the links calibrated on (paper eq. 1), [dB].
         initial_rmse_db: The same before anything was fitted, offsets included.
@@ -55,6 +55,8 @@ class Result:
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
             whether a path leads there, whether it was held out, and its own change on tracing again.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
+        laws: How calibrated constants follow the frequency: the coefficients itu_a to itu_d of ITU-R P.2040's law, by
+            material of which one is a parameter.
     """
 
     study: Study
@@ -78,6 +80,7 @@ class Result:
     trace_seconds: float
     links: pd.DataFrame
     history: pd.DataFrame
+    laws: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def save(self, folder: str | Path) -> None:
         """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.
@@ -129,6 +132,7 @@ class Result:
             "intervals": {name: asdict(interval) for name, interval in self.intervals.items()},
             "offsets_db": self.offsets_db,
             "materials": {name: asdict(material) for name, material in self.materials.items()},
+            "laws": self.laws,
         }
 
     @classmethod
@@ -167,7 +171,8 @@ class Result:
 
         Args:
             links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] and the study's group
-                column, if it has one.
+                column, if it has one. The study's column of frequencies gives the links' carriers; without it all
+                links have the scene's.
             progress: Called with (receivers traced, receivers in all) after every chunk.
 
         Returns:
@@ -177,9 +182,14 @@ class Result:
             InputError: A column is missing, a position cannot be used, or a group has no calibrated offset.
         """
         per = self.study.offset.per if self.study.offset else None
-        wanted = links if isinstance(links, Measurements) else links_from_frame(links, group=per)
-        offset = self._offset(wanted)
-        paths = traced_paths(self.study, make_scene(self.study, self.materials), wanted, progress)
+        if not isinstance(links, Measurements):
+            links = links_from_frame(links, group=per, frequency=self.study.links.frequency)
+        offset = self._offset(links)
+        paths = traced_paths(self.study, make_scene(self.study, self.materials), links, progress)
+        if links.frequency is not None:
+            parameters = make_parameters(self.study, make_scene(self.study), links)
+            values = np.array([[self.parameters[name] for name in parameters.names]])
+            return make_replay(self.study, paths, links, parameters).path_loss(values)[0] + offset
         objective = self.study.objective
         return fields.path_loss(paths, None, objective.combining, self.study.scene.bandwidth) + offset
 

@@ -11,20 +11,29 @@ from __future__ import annotations
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
+from calibray.dispersion import steady_law
 from calibray.errors import InputError
 from calibray.files import write_text
-from calibray.materials import BOUNDS, DEFAULT_REVISION, ITU_MATERIALS, Material, itu_material
+from calibray.materials import (
+    BOUNDS,
+    DEFAULT_REVISION,
+    ITU_MATERIALS,
+    ItuLaw,
+    Material,
+    itu_law,
+    itu_material,
+)
 from calibray.spelling import did_you_mean
 
 BUNDLED_PREFIX: Final = "sionna:"
 DEFAULT_THICKNESS: Final = 0.1  # [m], Sionna's default for a material without one
-_MATERIAL_FIELDS: Final = frozenset(field.name for field in fields(Material))
+_MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,7 @@ class Scene:
         materials: The materials that some object uses, by name, at the frequency the scene was read for.
         objects: The meshes, in the file's order.
         xml: The scene for the tracer; material k of `materials` is the BSDF `calibray-k`.
+        laws: How the constants of each material follow the frequency: ITU-R's law where ITU-R gives them, else not.
     """
 
     source: str
@@ -57,6 +67,7 @@ class Scene:
     materials: dict[str, Material]
     objects: tuple[SceneObject, ...]
     xml: str
+    laws: dict[str, ItuLaw] = field(default_factory=dict)
 
 
 def read_scene(
@@ -89,6 +100,7 @@ def read_scene(
     definitions = _bsdf_definitions(root)
     objects: list[SceneObject] = []
     materials: dict[str, Material] = {}
+    laws: dict[str, ItuLaw] = {}
     origin: dict[str, str] = {}
     for shape in root.findall("shape"):
         _check_mesh(shape, path)
@@ -100,7 +112,9 @@ def read_scene(
             )
         if name not in materials:
             constants = _merged(overrides.get(original), overrides.get(name) if name != original else None)
-            materials[name] = _material(name, original, definitions.get(original), constants, frequency, path)
+            bsdf = definitions.get(original)
+            materials[name] = _material(name, original, bsdf, constants, frequency, path)
+            laws[name] = _law(materials[name], original, bsdf, constants, frequency)
         _refer(shape, f"mat-calibray-{list(materials).index(name)}")
         objects.append(SceneObject(_object_name(shape), name))
     if not objects:
@@ -117,7 +131,8 @@ def read_scene(
         root.remove(bsdf)
     for index, material in enumerate(materials.values()):
         root.insert(index, _bsdf(f"mat-calibray-{index}", material))
-    return Scene(str(source), path, materials, tuple(objects), ElementTree.tostring(root, encoding="unicode"))
+    xml = ElementTree.tostring(root, encoding="unicode")
+    return Scene(str(source), path, materials, tuple(objects), xml, laws)
 
 
 def check_material_name(name: str, materials: Mapping[str, object], place: str) -> None:
@@ -263,6 +278,27 @@ def _material(
         return replace(_file_material(original, bsdf, frequency), **given)
     except InputError as error:
         raise InputError(f"{path}: material {name!r}: {error}") from None
+
+
+def _law(
+    material: Material,
+    original: str,
+    bsdf: ElementTree.Element | None,
+    override: Material | Mapping[str, object] | None,
+    frequency: float,
+) -> ItuLaw:
+    """How a material's constants follow the frequency: those given as numbers do not."""
+    steady = steady_law(material)
+    if isinstance(override, Material):
+        return steady
+    given = {key: value for key, value in (override or {}).items() if value is not None}
+    itu, revision = given.get("itu", _itu_type(original, bsdf)), given.get("revision", DEFAULT_REVISION)
+    if itu is None or {"relative_permittivity", "conductivity"} <= set(given):
+        return steady
+    law = itu_law(str(itu), frequency, str(revision))
+    if "relative_permittivity" in given:
+        law = law._replace(a=steady.a, b=0.0)
+    return law._replace(c=steady.c, d=0.0) if "conductivity" in given else law
 
 
 def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float) -> Material:

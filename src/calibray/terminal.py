@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.table import Table
 
 from calibray.calibration import Progress as Report
-from calibray.materials import BOUNDS
+from calibray.dispersion import PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.result import Result
 
@@ -209,7 +209,7 @@ def _suspects(
 def _parameters(result: Result) -> str:
     rows = []
     for name, after in result.parameters.items():
-        unit = BOUNDS[name.rpartition(".")[2]].unit
+        unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
         label = name if unit == "1" else f"{name} [{unit}]"
         before, interval = result.initial_parameters[name], result.intervals.get(name)
         ends = (

@@ -7,7 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from calibray import cache
+from calibray.engines.carriers import CarrierPaths, ReplayCarriers
 from calibray.engines.command import Command
 from calibray.engines.exchange import Surroundings
 from calibray.engines.fingerprint import fingerprint
@@ -16,12 +19,12 @@ from calibray.engines.program import Program
 from calibray.engines.protocol import Progress
 from calibray.engines.recorded import Recorded
 from calibray.engines.replay import Replay
-from calibray.engines.retrace import Retrace
+from calibray.engines.retrace import CarrierTracer, Retrace
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
-from calibray.paths import Paths
+from calibray.paths import Paths, take_links
 from calibray.scene import Scene, read_scene
 from calibray.study import Study
 from calibray.tracing import Tracer
@@ -35,7 +38,7 @@ def make(
     progress: Progress | None = None,
     ledger: str | Path | None = None,
     executor: Executor | None = None,
-) -> Replay | Retrace | Command | Recorded:
+) -> Replay | ReplayCarriers | Retrace | Command | Recorded:
     """The engine of a study.
 
     Args:
@@ -62,17 +65,18 @@ def make(
         )
     links = study.measurements()
     scene = make_scene(study)
-    parameters = study.parameter_set(scene.materials)
+    parameters = make_parameters(study, scene, links)
     options = study.objective.combining, study.scene.bandwidth
     if name == "replay":
-        return Replay(traced_paths(study, scene, links, progress), parameters, *options)
+        return make_replay(study, traced_paths(study, scene, links, progress), links, parameters)
     if name == "retrace":
-        engine = Retrace(_tracer(study, scene), links, parameters, *options, progress)
+        parts = _carrier_tracers(study, scene, links, parameters)
+        engine = Retrace(parts, scene.materials, parameters, *options, progress)
     else:
         engine = _command(study, scene, links, parameters, executor, progress)
     if ledger is None:
         return engine
-    problem = fingerprint(study, scene, links, parameters, name)
+    problem = fingerprint(study, scene, links, parameters, name, _carriers(study, links, parameters))
     return Recorded(engine, Ledger(ledger), problem, name)
 
 
@@ -99,14 +103,98 @@ def _command(
         antennas=study.antenna_pair,
         tx=links.tx,
         rx=links.rx,
+        link_frequency=links.frequency,
     )
     return Command(
-        program, surroundings, scene.materials, parameters, executor, progress, source=str(study.path)
+        program,
+        surroundings,
+        scene.materials,
+        parameters,
+        executor,
+        progress,
+        source=str(study.path),
+        carriers=_carriers(study, links, parameters),
     )
+
+
+def _carrier_tracers(
+    study: Study, scene: Scene, links: Measurements, parameters: Parameters
+) -> list[CarrierTracer]:
+    if links.frequency is None:
+        return [CarrierTracer(_tracer(study, scene), links, np.arange(len(links)))]
+    return [
+        CarrierTracer(
+            _tracer(study, _scene_at(study, parameters, frequency), frequency),
+            links.select(links.frequency == frequency),
+            index,
+        )
+        for frequency, index in links.carriers
+    ]
+
+
+def make_parameters(study: Study, scene: Scene, links: Measurements) -> Parameters:
+    """The parameters of a study.
+
+    Args:
+        study: The study.
+        scene: Its scene.
+        links: The links, for their carriers.
+
+    Returns:
+        The parameters.
+
+    Raises:
+        InputError: The scene lacks a material, a start lies outside its bounds, or a law leaves physics at a carrier.
+    """
+    parameters = study.parameter_set(scene.materials, scene.laws)
+    parameters.check_carriers([frequency for frequency, _ in links.carriers])
+    return parameters
+
+
+def make_replay(
+    study: Study, paths: Paths, links: Measurements, parameters: Parameters
+) -> Replay | ReplayCarriers:
+    """The replay of a study on stored paths.
+
+    Args:
+        study: The study.
+        paths: The paths of the links, at the study's carrier.
+        links: The links.
+        parameters: What the candidates' components stand for.
+
+    Returns:
+        The engine; with a program for each carrier where the links have carriers of their own.
+    """
+    options = study.objective.combining, study.scene.bandwidth
+    if links.frequency is None and not parameters.has_laws:
+        return Replay(paths, parameters, *options)
+    if links.frequency is None:
+        return ReplayCarriers(
+            [CarrierPaths(paths, np.arange(len(links)))], parameters, paths.materials, *options
+        )
+    materials = _carriers(study, links, parameters)
+    carriers = [
+        CarrierPaths(take_links(paths, index).at(frequency, materials[frequency]), index)
+        for frequency, index in links.carriers
+    ]
+    return ReplayCarriers(carriers, parameters, paths.materials, *options)
+
+
+def _carriers(study: Study, links: Measurements, parameters: Parameters) -> dict[float, dict[str, Material]]:
+    """The scene's materials before calibration at each carrier of the links [Hz]."""
+    return {frequency: _scene_at(study, parameters, frequency).materials for frequency, _ in links.carriers}
+
+
+def _scene_at(study: Study, parameters: Parameters, frequency: float) -> Scene:
+    """A study's scene at another carrier, with the parameters' starts."""
+    scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+    return replace(scene, materials=parameters.materials(parameters.start, scene.materials, frequency))
 
 
 def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Progress | None = None) -> Paths:
     """The paths of some links in a study's scene, from the cache if they were traced before.
+
+    Links that differ in their carrier alone are traced once.
 
     Args:
         study: The study.
@@ -117,6 +205,13 @@ def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Prog
     Returns:
         The path program.
     """
+    if links.frequency is not None:
+        _, first, place = np.unique(
+            np.hstack([links.tx, links.rx]), axis=0, return_index=True, return_inverse=True
+        )
+        once = replace(links.select(np.isin(np.arange(len(links)), first)), frequency=None)
+        order = np.argsort(np.argsort(first))  # `select` keeps the links' order, `unique` sorts them
+        return take_links(traced_paths(study, scene, once, progress), order[place.reshape(-1)])
     digest = cache.trace_digest(
         scene, study.scene.frequency, study.trace, study.antenna_pair, links.tx, links.rx
     )
@@ -143,7 +238,7 @@ def make_scene(study: Study, materials: dict[str, Material] | None = None) -> Sc
     overrides = {**study.overrides, **(materials or {})}
     scene = read_scene(study.scene_source, study.scene.frequency, overrides, study.objects)
     if materials is None:  # what is sampled while tracing, as diffuse reflection is, follows the materials
-        parameters = study.parameter_set(scene.materials)
+        parameters = study.parameter_set(scene.materials, scene.laws)
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
     return scene
 
@@ -164,5 +259,5 @@ def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> T
     return _tracer(study, make_scene(study, materials))
 
 
-def _tracer(study: Study, scene: Scene) -> Tracer:
-    return Tracer(scene, study.scene.frequency, study.trace, *study.antenna_pair)
+def _tracer(study: Study, scene: Scene, frequency: float | None = None) -> Tracer:
+    return Tracer(scene, frequency or study.scene.frequency, study.trace, *study.antenna_pair)

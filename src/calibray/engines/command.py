@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from threading import Event
 
@@ -30,6 +30,8 @@ class Command:
         executor: What runs the calls of a batch; one after the other if None.
         progress: Called with (candidates run, candidates asked for) after every one.
         source: The study file, for messages.
+        carriers: The scene's materials before calibration at each carrier of the links [Hz]; none where all links have
+            the study's.
     """
 
     def __init__(
@@ -41,11 +43,13 @@ class Command:
         executor: Executor | None = None,
         progress: Progress | None = None,
         source: str = "study",
+        carriers: Mapping[float, Mapping[str, Material]] | None = None,
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
         self.num_links = len(surroundings.tx)
         self._program, self._surroundings = program, surroundings
         self._executor, self._progress, self._source = executor, progress, source
+        self._carriers = carriers or {}
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         """Path loss of every link for candidates, as the program answers.
@@ -115,6 +119,10 @@ class Command:
             self._surroundings,
             self.parameters.materials(candidate, self.materials),
             dict(zip(self.parameters.names, candidate.tolist(), strict=True)),
+            {
+                frequency: self.parameters.materials(candidate, base, frequency)
+                for frequency, base in self._carriers.items()
+            },
         )
 
     def _place(self, request: Request, failure: str) -> str:

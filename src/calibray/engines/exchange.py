@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,6 +39,7 @@ class Surroundings:
         antennas: Transmit and receive antenna.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
+        link_frequency: Carrier of every link [L], [Hz], or None where all have `frequency`.
     """
 
     frequency: float
@@ -47,6 +48,7 @@ class Surroundings:
     antennas: tuple[Antenna, Antenna]
     tx: np.ndarray
     rx: np.ndarray
+    link_frequency: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +57,15 @@ class Request:
 
     Attributes:
         surroundings: What is the same for all candidates.
-        materials: All materials of the scene with the candidate's values, by name.
+        materials: All materials of the scene with the candidate's values at `frequency`, by name.
         parameters: The candidate's values by parameter name, in the fields' units.
+        carriers: The same materials at each carrier of the links [Hz]; none where all links have `frequency`.
     """
 
     surroundings: Surroundings
     materials: Mapping[str, Material]
     parameters: Mapping[str, float]
+    carriers: Mapping[float, Mapping[str, Material]] = field(default_factory=dict)
 
     def write(self, path: Path, file_format: str) -> None:
         """Write the request.
@@ -89,14 +93,28 @@ class Request:
         # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and so would
         # garble names such as "walls.relative_permittivity".
         around = self.surroundings
-        return self._head() | {
-            "antennas": {
-                end: asdict(antenna) for end, antenna in zip(("tx", "rx"), around.antennas, strict=True)
-            },
-            "links": {"tx": around.tx.tolist(), "rx": around.rx.tolist()},
-            "materials": [{"name": name, **asdict(material)} for name, material in self.materials.items()],
-            "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
-        }
+        return (
+            self._head()
+            | {
+                "antennas": {
+                    end: asdict(antenna) for end, antenna in zip(("tx", "rx"), around.antennas, strict=True)
+                },
+                "links": {"tx": around.tx.tolist(), "rx": around.rx.tolist()}
+                | ({} if around.link_frequency is None else {"frequency": around.link_frequency.tolist()}),
+                "materials": _listed(self.materials),
+                "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
+            }
+            | (
+                {
+                    "carriers": [
+                        {"frequency": frequency, "materials": _listed(materials)}
+                        for frequency, materials in self.carriers.items()
+                    ]
+                }
+                if self.carriers
+                else {}
+            )
+        )
 
     def _write_hdf5(self, path: Path) -> None:
         around = self.surroundings
@@ -105,13 +123,24 @@ class Request:
             for end, antenna in zip(("tx", "rx"), around.antennas, strict=True):
                 file.create_group(f"antennas/{end}").attrs.update(asdict(antenna))
             file["links/tx"], file["links/rx"] = around.tx, around.rx
-            materials = file.create_group("materials", track_order=True)
-            for name, material in self.materials.items():
-                materials.create_group(name.replace("/", "_")).attrs.update(
-                    {"name": name, **asdict(material)}
-                )
+            if around.link_frequency is not None:
+                file["links/frequency"] = around.link_frequency
+            _write_materials(file.create_group("materials", track_order=True), self.materials)
+            for place, (frequency, materials) in enumerate(self.carriers.items()):
+                group = file.create_group(f"carriers/{place}")
+                group.attrs["frequency"] = frequency
+                _write_materials(group.create_group("materials", track_order=True), materials)
             file["parameters/names"] = list(self.parameters)
             file["parameters/values"] = list(self.parameters.values())
+
+
+def _listed(materials: Mapping[str, Material]) -> list[dict[str, Any]]:
+    return [{"name": name, **asdict(material)} for name, material in materials.items()]
+
+
+def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> None:
+    for name, material in materials.items():
+        group.create_group(name.replace("/", "_")).attrs.update({"name": name, **asdict(material)})
 
 
 def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:

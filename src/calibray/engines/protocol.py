@@ -39,6 +39,20 @@ class Engine(Protocol):
         ...
 
 
+@runtime_checkable
+class Differentiable(Engine, Protocol):
+    """An engine that gives derivatives."""
+
+    @property
+    def large(self) -> bool:
+        """Whether a candidate costs milliseconds rather than microseconds."""
+        ...
+
+    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """What an engine answered to one candidate.

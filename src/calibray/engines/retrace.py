@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +17,27 @@ from calibray.parameters import Parameters
 from calibray.tracing import Tracer
 
 
+@dataclass(frozen=True, eq=False)
+class CarrierTracer:
+    """The ray tracer at one carrier.
+
+    Attributes:
+        tracer: The scene in the ray tracer, with the constants at that carrier before calibration.
+        links: The links measured there.
+        index: Where they stand among all [l].
+    """
+
+    tracer: Tracer
+    links: Measurements
+    index: np.ndarray
+
+
 class Retrace:
     """The ray tracer, run anew for every candidate.
 
     Args:
-        tracer: The scene in the ray tracer.
-        links: The links.
+        parts: The ray tracer at each carrier; together they hold every link once.
+        materials: The scene's materials before calibration, at the study's carrier.
         parameters: What the candidates' components stand for.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
@@ -30,16 +46,16 @@ class Retrace:
 
     def __init__(
         self,
-        tracer: Tracer,
-        links: Measurements,
+        parts: Sequence[CarrierTracer],
+        materials: Mapping[str, Material],
         parameters: Parameters,
         combining: str = "power",
         bandwidth: float | None = None,
         progress: Progress | None = None,
     ) -> None:
-        self.parameters, self.materials, self.calls = parameters, dict(tracer.scene.materials), 0
-        self.num_links = len(links)
-        self._tracer, self._links, self._progress = tracer, links, progress
+        self.parameters, self.materials, self.calls = parameters, dict(materials), 0
+        self.num_links = sum(len(part.index) for part in parts)
+        self._parts, self._progress = tuple(parts), progress
         self._combining, self._bandwidth = combining, bandwidth
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
@@ -71,19 +87,22 @@ class Retrace:
         """
         for index, candidate in enumerate(candidates):
             started = time.perf_counter()
-            loss = self._one(self.parameters.materials(candidate, self.materials))
+            loss = np.empty(self.num_links)
+            for part in self._parts:
+                loss[part.index] = self._one(part, candidate)
             self.calls += 1
             if self._progress is not None:
                 self._progress(index + 1, len(candidates))
             yield Answer(index, loss, time.perf_counter() - started)
 
-    def _one(self, materials: dict[str, Material]) -> np.ndarray:
-        self._tracer.set_materials(materials)
-        trace = self._tracer.trace(self._links)
+    def _one(self, part: CarrierTracer, candidate: np.ndarray) -> np.ndarray:
+        tracer = part.tracer
+        tracer.set_materials(self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency))
+        trace = tracer.trace(part.links)
         gain, link, delay = trace.path_gains(), trace.link(), trace.delay()
         offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
         parts = tuple(jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
         power = fields.link_power(
-            parts, link, delay, len(self._links), self._tracer.frequency, self._combining, offsets
+            parts, link, delay, len(part.links), tracer.frequency, self._combining, offsets
         )
         return np.asarray(fields.decibel(power))

@@ -4,7 +4,7 @@ Positions are metres in the scene's frame. Positions on the globe will enter bes
 them needs a `Table` and ends in the same `Measurements`.
 """
 
-from calibray.measurements.links import Measurements
+from calibray.measurements.links import FREQUENCIES, Measurements
 from calibray.measurements.reading import (
     LINK_COLUMNS,
     Coordinates,
@@ -15,6 +15,7 @@ from calibray.measurements.reading import (
 )
 
 __all__ = [
+    "FREQUENCIES",
     "LINK_COLUMNS",
     "Coordinates",
     "Measurements",

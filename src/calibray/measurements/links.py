@@ -15,6 +15,12 @@ from calibray.measurements.tables import Table
 COINCIDENCE: Final = 1e-3
 """The distance [m] below which transmitter and receiver stand at the same place."""
 
+FREQUENCIES: Final = (1e6, 1e12)
+"""The carrier frequencies [Hz] taken as meant; one outside was probably given in another unit."""
+
+MAX_CARRIERS: Final = 32
+"""The number of carriers beyond which a column of frequencies is taken for another quantity."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements:
@@ -26,11 +32,12 @@ class Measurements:
         path_loss_db: Measured path losses [links] [dB]; all NaN for links that were not measured.
         weight: Relative weights [links] [1], greater than 0; 1 unless given.
         group: Labels [links] of the group each link belongs to, or None.
+        frequency: Carrier of each link [links] [Hz], or None where all have the study's.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a
-            weight is not positive, or only some path losses are finite.
+            weight is not positive, a carrier or their number is implausible, or only some path losses are finite.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -43,6 +50,7 @@ class Measurements:
     path_loss_db: NDArray[np.float64]
     weight: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
     group: NDArray[np.str_] | None = None
+    frequency: NDArray[np.float64] | None = None
     table: Table = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -59,6 +67,8 @@ class Measurements:
         set_field(self, "weight", _array("weight", weight, (count,)))
         if self.group is not None:
             set_field(self, "group", _array("group", self.group, (count,), np.str_))
+        if self.frequency is not None:
+            set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
         if self.table is None:
             set_field(self, "table", Table(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
@@ -110,6 +120,15 @@ class Measurements:
             return np.zeros(len(self), dtype=np.int64)
         return np.searchsorted(self.group_names, self.group)
 
+    @property
+    def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
+        """The carriers [Hz], ascending, each with the links measured there; none where all have the study's."""
+        if self.frequency is None:
+            return ()
+        return tuple(
+            (float(each), np.flatnonzero(self.frequency == each)) for each in np.unique(self.frequency)
+        )
+
     def select(self, mask: ArrayLike) -> Measurements:
         """The links where a mask [links] is true.
 
@@ -129,6 +148,7 @@ class Measurements:
             path_loss_db=self.path_loss_db[chosen],
             weight=self.weight[chosen],
             group=None if self.group is None else self.group[chosen],
+            frequency=None if self.frequency is None else self.frequency[chosen],
             table=self.table.select(chosen),
         )
 
@@ -193,3 +213,20 @@ def _check_links(links: Measurements) -> None:
             raise InputError(
                 f"{links.source}, row {links.row[first]}: {fault} ({wrong.sum()} of {len(links)} rows)"
             )
+    if links.frequency is not None:
+        _check_carriers(links, links.frequency)
+
+
+def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None:
+    lowest, highest = FREQUENCIES
+    if (strange := ~((frequency >= lowest) & (frequency <= highest))).any():
+        first = int(np.flatnonzero(strange)[0])
+        raise InputError(
+            f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must lie in {lowest:g} to "
+            f"{highest:g} Hz ({strange.sum()} of {len(links)} rows); 28.5 GHz is written 28.5e9"
+        )
+    if (count := len(np.unique(frequency))) > MAX_CARRIERS:
+        raise InputError(
+            f"{links.source}: {count} different frequencies, must be at most {MAX_CARRIERS}; give the carrier of each "
+            "link, not what was measured around it"
+        )

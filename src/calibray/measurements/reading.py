@@ -39,11 +39,12 @@ def read_measurements(
     weight: str | None = None,
     std: str | float | None = None,
     tx_power_dbm: str | float | None = None,
+    frequency: str | None = None,
 ) -> Measurements:
     """Read measured links from a CSV or Parquet file.
 
     A link may be measured more than once; each of its values then counts. A row that repeats an earlier one
-    in link, group and value is a copy and refused.
+    in link, carrier, group and value is a copy and refused.
 
     Args:
         path: The table, .csv or .parquet.
@@ -57,6 +58,7 @@ def read_measurements(
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
         tx_power_dbm: Transmitted power [dBm], a number or a column, for "received_power" only: path loss is
             this power less the received one, antenna gains and cable losses included.
+        frequency: Column of carrier frequencies [Hz], for links measured at several.
 
     Returns:
         The links that pass, in the order of the file.
@@ -79,18 +81,22 @@ def read_measurements(
         path_loss_db=_path_loss_db(table, value, quantity, tx_power_dbm),
         weight=_weights(table, weight, std),
         group=None if group is None else table.labels(group),
+        frequency=None if frequency is None else table.numbers(frequency),
         table=table,
     )
     _refuse_copies(measurements)
     return measurements
 
 
-def links_from_frame(frame: pd.DataFrame, group: str | None = None) -> Measurements:
+def links_from_frame(
+    frame: pd.DataFrame, group: str | None = None, frequency: str | None = None
+) -> Measurements:
     """Links without measured values, to predict at.
 
     Args:
         frame: Table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
         group: Column of group labels.
+        frequency: Column of carrier frequencies [Hz]; without that column all links have the study's carrier.
 
     Returns:
         The links, their path losses NaN.
@@ -98,15 +104,16 @@ def links_from_frame(frame: pd.DataFrame, group: str | None = None) -> Measureme
     Raises:
         InputError: A column is missing, or a position is not finite.
     """
-    return _unmeasured(Table(frame.reset_index(drop=True), source="links"), group)
+    return _unmeasured(Table(frame.reset_index(drop=True), source="links"), group, frequency)
 
 
-def read_links(path: str | Path, group: str | None = None) -> Measurements:
+def read_links(path: str | Path, group: str | None = None, frequency: str | None = None) -> Measurements:
     """Links without measured values from a CSV or Parquet file with the columns of `links_from_frame`.
 
     Args:
         path: The table, .csv or .parquet.
         group: Column of group labels.
+        frequency: Column of carrier frequencies [Hz]; without that column all links have the study's carrier.
 
     Returns:
         The links, their path losses NaN.
@@ -114,10 +121,10 @@ def read_links(path: str | Path, group: str | None = None) -> Measurements:
     Raises:
         InputError: The file or a column is missing or malformed, or a position is not finite.
     """
-    return _unmeasured(read_table(path), group)
+    return _unmeasured(read_table(path), group, frequency)
 
 
-def _unmeasured(table: Table, group: str | None) -> Measurements:
+def _unmeasured(table: Table, group: str | None, frequency: str | None) -> Measurements:
     if len(table) == 0:
         raise InputError(f"{table.source}: holds no rows; give at least one link")
     return Measurements(
@@ -125,6 +132,7 @@ def _unmeasured(table: Table, group: str | None) -> Measurements:
         rx=_positions(table, "rx", LINK_COLUMNS[3:]),
         path_loss_db=np.full(len(table), np.nan),
         group=None if group is None else table.labels(group),
+        frequency=table.numbers(frequency) if frequency is not None and frequency in table.frame else None,
         table=table,
     )
 
@@ -207,9 +215,11 @@ def _number_or_column(table: Table, source: str | float | None) -> NDArray[np.fl
 
 
 def _refuse_copies(links: Measurements) -> None:
-    """Refuse a row that repeats an earlier one in link, group and value."""
+    """Refuse a row that repeats an earlier one in link, carrier, group and value."""
     keys = pd.DataFrame(np.column_stack([links.tx, links.rx, links.path_loss_db]))
     keys["group"] = links.group_index
+    if links.frequency is not None:
+        keys["frequency"] = links.frequency
     copies = np.flatnonzero(keys.duplicated())
     if len(copies):
         copy = int(copies[0])

@@ -13,10 +13,12 @@ from typing import Any, Final, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
+from calibray.dispersion import steady_law
 from calibray.errors import InputError
-from calibray.materials import DEFAULT_REVISION, Material, itu_material
+from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
-from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
+from calibray.parameter import Parameter, itu_start, make_parameter
+from calibray.parameters import Parameters
 from calibray.settings import Antenna
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
@@ -227,11 +229,14 @@ class Study(Section):
         """
         return (measurements, None) if self.holdout is None else measurements.split(self.holdout.where)
 
-    def parameter_set(self, base: Mapping[str, Material]) -> Parameters:
+    def parameter_set(
+        self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None
+    ) -> Parameters:
         """The free parameters of a scene, their starts resolved.
 
         Args:
             base: The scene's materials by name, those of ``[materials]`` replaced.
+            laws: How their constants follow the frequency; those not named do not.
 
         Returns:
             The parameters, in the order of the file.
@@ -241,14 +246,17 @@ class Study(Section):
         """
         frequency = self.scene.frequency
         try:
-            return Parameters(
-                tuple(
-                    make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale)
-                    for name, entry in self.parameters.items()
-                )
+            items = tuple(
+                make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
+                for name, entry in self.parameters.items()
             )
+            known = {name: steady_law(material) for name, material in base.items()} | dict(laws or {})
+            lawful = {item.material: known[item.material] for item in items if item.field != item.constant}
+            parameters = Parameters(items, frequency, lawful)
+            parameters.check_carriers([frequency])
         except InputError as error:
             raise InputError(f"{self._path}: {error}") from None
+        return parameters
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Study:
         """The study with another method, seed or engine; the options of a method that is replaced go with it.

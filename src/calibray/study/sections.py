@@ -9,12 +9,9 @@ from pydantic.dataclasses import dataclass as checked
 
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.measurements import Quantity
-from calibray.parameters import Scale
+from calibray.measurements import FREQUENCIES, Quantity
+from calibray.parameter import Scale
 from calibray.settings import Antenna, TraceSettings
-
-FREQUENCIES: Final = (1e6, 1e12)
-"""The carrier frequencies [Hz] taken as meant; one outside was probably given in another unit."""
 
 _CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 _Antenna = checked(Antenna, config=_CLOSED, frozen=True)
@@ -105,6 +102,7 @@ class LinksSection(Section):
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
+        frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
     """
 
     file: Text
@@ -116,6 +114,7 @@ class LinksSection(Section):
     weight: Text | None = None
     std: Coordinate | None = None
     tx_power_dbm: Coordinate | None = None
+    frequency: Text | None = None
 
 
 class AntennasSection(Section):

@@ -1,0 +1,224 @@
+"""One free parameter: its name, its bounds, and its start in a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Final, Literal, get_args
+
+from calibray.dispersion import CONSTANT, LAWS, PARAMETER_BOUNDS, steady_law
+from calibray.errors import InputError
+from calibray.materials import (
+    DEFAULT_REVISION,
+    FIELDS,
+    SCATTERING_PATTERNS,
+    ItuLaw,
+    Material,
+    itu_law,
+    itu_material,
+)
+from calibray.spelling import did_you_mean
+
+Scale = Literal["linear", "log"]
+
+_ITU_PREFIX: Final = "itu:"
+_PATTERN_FIELDS: Final = ("alpha_r", "alpha_i", "lambda_")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One calibrated number: a field of a material or a coefficient of its law, with its bounds and its start.
+
+    Attributes:
+        name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are those of a material,
+            and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz.
+        lower: Lower bound, in the field's unit.
+        upper: Upper bound, in the field's unit.
+        start: Value before calibration, within the bounds, in the field's unit.
+        scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
+
+    Raises:
+        InputError: The field is unknown, or bounds or start are out of order or outside physics.
+
+    Example:
+        >>> Parameter("walls.relative_permittivity", lower=1.5, upper=12.0, start=5.0).material
+        'walls'
+    """
+
+    name: str
+    lower: float
+    upper: float
+    start: float
+    scale: Scale = "linear"
+
+    def __post_init__(self) -> None:
+        split_name(self.name)
+        bound = PARAMETER_BOUNDS[self.field]
+        for value in (self.lower, self.upper):
+            if value not in bound:
+                raise InputError(
+                    f"{self.name}: bounds = [{self.lower}, {self.upper}]: {value} must be {bound}"
+                )
+        if self.lower >= self.upper:
+            fault = "equal" if self.lower == self.upper else "reversed"
+            raise InputError(
+                f"{self.name}: bounds = [{self.lower}, {self.upper}] are {fault}; the lower must be less "
+                "than the upper; to fix a constant, give it under [materials] instead"
+            )
+        if not self.lower <= self.start <= self.upper:
+            raise InputError(
+                f"{self.name}: start = {self.start:g} lies outside bounds = [{self.lower:g}, {self.upper:g}];"
+                " widen them or give another start"
+            )
+        if self.scale not in get_args(Scale):
+            raise InputError(
+                f"{self.name}: scale = {self.scale!r}: must be one of {', '.join(get_args(Scale))}"
+            )
+        if self.scale == "log" and self.lower <= 0:
+            raise InputError(
+                f"{self.name}: scale = 'log' with lower bound {self.lower:g}: the lower bound must be "
+                "greater than 0, or the scale 'linear'"
+            )
+
+    @property
+    def material(self) -> str:
+        """The material's name."""
+        return split_name(self.name)[0]
+
+    @property
+    def field(self) -> str:
+        """The field's name, one of `CONSTANT`."""
+        return split_name(self.name)[1]
+
+    @property
+    def constant(self) -> str:
+        """The material's constant that it acts on, one of `FIELDS`."""
+        return CONSTANT[self.field]
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Material and field of a parameter's name: everything before the last dot, and what follows it.
+
+    Args:
+        name: The name.
+
+    Returns:
+        The material's name and the field's.
+
+    Raises:
+        InputError: The name has no material, or the field is unknown.
+
+    Example:
+        >>> split_name("block.7.thickness")
+        ('block.7', 'thickness')
+    """
+    material, _, field = name.rpartition(".")
+    if not material:
+        raise InputError(
+            f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"
+        )
+    if field not in CONSTANT:
+        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, CONSTANT)}")
+    return material, field
+
+
+def make_parameter(
+    name: str,
+    bounds: tuple[float, float],
+    base: Mapping[str, Material],
+    frequency: float,
+    start: float | str | None = None,
+    scale: Scale = "linear",
+    laws: Mapping[str, ItuLaw] | None = None,
+) -> Parameter:
+    """A parameter of a scene, its start resolved.
+
+    Args:
+        name: Material and field, as "walls.relative_permittivity".
+        bounds: Lower and upper bound, in the field's unit.
+        base: The scene's materials by name.
+        frequency: Frequency [Hz], at which ITU-R laws are taken.
+        start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
+            None for the scene's own.
+        scale: "linear" or "log".
+        laws: How the materials' constants follow the frequency, by name; those not named do not.
+
+    Returns:
+        The parameter.
+
+    Raises:
+        InputError: The scene has no such material, the field has no effect with the material's scattering
+            pattern, or what `Parameter` and `itu_material` refuse.
+
+    Example:
+        >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
+        >>> make_parameter("walls.relative_permittivity", (1, 9), walls, 4e9, start="itu:brick").start
+        3.91
+    """
+    material, field = split_name(name)
+    check_material(name, base)
+    pattern = base[material].scattering_pattern
+    if field in _PATTERN_FIELDS and field not in SCATTERING_PATTERNS[pattern]:
+        raise InputError(
+            f"parameter {name!r} has no effect: the scattering pattern of {material!r} is {pattern!r}"
+        )
+    if start is None and field in FIELDS:
+        value = float(getattr(base[material], field))
+    elif start is None:
+        value = float(getattr((laws or {}).get(material) or steady_law(base[material]), field[-1]))
+    elif isinstance(start, str):
+        value = itu_start(name, start, frequency)
+    elif isinstance(start, bool) or not isfinite(start):
+        raise InputError(f"{name}: start = {start!r}: must be a finite number or 'itu:NAME'")
+    else:
+        value = float(start)
+    return Parameter(name=name, lower=float(bounds[0]), upper=float(bounds[1]), start=value, scale=scale)
+
+
+def itu_start(name: str, start: str, frequency: float) -> float:
+    """The value that ITU-R P.2040 gives for a start like "itu:concrete@P.2040-1".
+
+    Args:
+        name: The parameter, of the field relative_permittivity or conductivity, or a coefficient of their laws.
+        start: "itu:" and the ITU-R material, then "@" and the revision unless it is the default one.
+        frequency: Frequency [Hz].
+
+    Returns:
+        The value, in the field's unit.
+
+    Raises:
+        InputError: The text has another form, the field has no ITU-R law, or what `itu_material` refuses.
+    """
+    field = split_name(name)[1]
+    if not start.startswith(_ITU_PREFIX):
+        raise InputError(
+            f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"
+        )
+    if CONSTANT[field] not in LAWS:
+        raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")
+    itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
+    try:
+        if field not in FIELDS:
+            return float(getattr(itu_law(itu_name, frequency, revision or DEFAULT_REVISION), field[-1]))
+        material = itu_material(itu_name, frequency, revision=revision or DEFAULT_REVISION)
+    except InputError as error:
+        raise InputError(f"{name}: start = {start!r}: {error}") from None
+    return float(getattr(material, field))
+
+
+def check_material(name: str, materials: Mapping[str, Material] | Sequence[str]) -> None:
+    """Refuse a parameter of a material that a scene lacks.
+
+    Args:
+        name: The parameter's name.
+        materials: The scene's materials.
+
+    Raises:
+        InputError: The material is not among them; the message offers the nearest name.
+    """
+    material = split_name(name)[0]
+    if material not in materials:
+        raise InputError(
+            f"parameter {name!r}: the scene has no material {material!r}; {did_you_mean(material, materials)}"
+        )
