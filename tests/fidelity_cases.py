@@ -16,8 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.constants import speed_of_light
 
-from calibray import slab
-from calibray.fields import path_gains
+from calibray.fields import path_gains, slab
 from calibray.materials import SCATTERING_PATTERNS, Material
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
-from calibray import slab
-from calibray.fields import path_gains
+from calibray.fields import path_gains, slab
 from calibray.geometry import (
     Chains,
     Program,

@@ -17,12 +17,11 @@ from scipy.special import fresnel, jv
 
 import calibray as cb
 import synthetic
-from calibray import slab
-from calibray.diffraction import affine_form, transition
-from calibray.fields import path_gains, path_loss
+from calibray.fields import path_gains, path_loss, slab
+from calibray.fields.diffraction import affine_form, transition
+from calibray.fields.scattering import pattern_value
 from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants
 from calibray.paths import Diffraction, Paths
-from calibray.scattering import pattern_value
 from calibray.scene import read_scene
 from calibray.settings import Antenna, TraceSettings
 from calibray.tracing import Tracer

@@ -17,6 +17,9 @@ import numpy as np
 from calibray import fields
 from calibray.errors import InputError
 from calibray.fields import Program
+from calibray.fields.combining import path_power
+from calibray.fields.contributions import contributions, pieces
+from calibray.fields.propagation import path_fields
 from calibray.materials import Material
 from calibray.paths import Paths
 
@@ -68,10 +71,10 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
 def _statistics(
     program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
-    return statistics(program, path_power(program, table), departure, arrival)
+    return statistics(program, powers(program, table), departure, arrival)
 
 
-def path_power(program: Program, table: jax.Array) -> jax.Array:
+def powers(program: Program, table: jax.Array) -> jax.Array:
     """Power gain of every path, summed over receive ports and averaged over transmit ports.
 
     Args:
@@ -81,8 +84,7 @@ def path_power(program: Program, table: jax.Array) -> jax.Array:
     Returns:
         Power gains in the order of the program [P].
     """
-    real, imaginary = fields.gains(program, fields.local_values(program, table))
-    return (real**2 + imaginary**2).sum(axis=(0, 1)) / real.shape[1]
+    return path_power(path_fields(program, pieces(program, contributions(program, table))))
 
 
 def statistics(
@@ -146,7 +148,7 @@ def power_delay_profile(
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
     program = fields.layout(paths).program
-    power = np.asarray(jax.jit(path_power)(program, jnp.asarray(fields.constants(paths, materials))))
+    power = np.asarray(jax.jit(powers)(program, jnp.asarray(fields.constants(paths, materials))))
     place = np.searchsorted(edges, np.asarray(program.delay), side="right") - 1
     inside = (place >= 0) & (place < len(edges) - 1)
     bins = np.asarray(program.link)[inside] * (len(edges) - 1) + place[inside]

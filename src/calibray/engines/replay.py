@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibray import fields, tabulation
+from calibray import fields
 from calibray.engines.protocol import check_candidates
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 BLOCK_INTERACTIONS: Final = 2_000_000  # interactions x candidates evaluated at once, which bounds the memory
 TABULATED: Final = 50_000  # interactions beyond which coefficients come from tables
-FIRST_INTERVALS: Final = 2048  # of a table over the cosine of incidence
+FIRST_INTERVALS: Final = 2048  # of a table of coefficients
 LAST_INTERVALS: Final = 65536
 TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
 BLOCK_SIZES: Final = (1, 8, 32)  # candidates a call; every size is compiled once
@@ -33,6 +32,7 @@ class Replay:
         bandwidth: Bandwidth [Hz], for "band".
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             combine by power.
+        tabulate: Whether coefficients come from tables; if None, for large programs.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -45,6 +45,7 @@ class Replay:
         combining: str = "power",
         bandwidth: float | None = None,
         dtype: type | None = None,
+        tabulate: bool | None = None,
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         if dtype is None:
@@ -57,14 +58,14 @@ class Replay:
         self._columns = columns
         self._base = jnp.asarray(fields.constants(paths).astype(dtype))
         self._fields = tuple(int(column) for column in used)
-        self._intervals = FIRST_INTERVALS if self.large else None
-        self._program = fields.layout(paths, dtype, self._intervals).program
-        room = max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
+        self._intervals = FIRST_INTERVALS if (self.large if tabulate is None else tabulate) else None
+        self._program = self._laid_out()
+        room = 1 if self._intervals else max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
         self._sizes = [size for size in BLOCK_SIZES if size <= room]
 
     @property
     def large(self) -> bool:
-        """Whether there are so many interactions that coefficients come from tables."""
+        """Whether there are so many interactions that a candidate costs milliseconds."""
         return self.paths.num_interactions > TABULATED
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
@@ -97,16 +98,14 @@ class Replay:
         loss, jacobian = self._run(self._jacobian, candidates)
         return loss, jacobian
 
-    def _value(self, tables: jax.Array) -> tuple[jax.Array]:
-        local = _local_values(self._program, tables)
-        power = _power(self._program, local, self._combining, self._offsets)
-        return (fields.decibel(power),)
+    def _value(self, tables: jax.Array) -> tuple[jax.Array, float]:
+        return fields.path_losses(self._program, tables, self._combining, self._offsets)
 
-    def _jacobian(self, tables: jax.Array) -> tuple[jax.Array, jax.Array]:
-        local, tangents = _local_tangents(self._program, tables, self._fields)
-        power, slope = _power_and_slope(self._program, local, self._combining, self._offsets)
-        derivative = _decibel_slope(self._program, power, slope, tangents, tables.shape[1])
-        return fields.decibel(power), derivative[:, :, self._rows, self._places]
+    def _jacobian(self, tables: jax.Array) -> tuple[jax.Array, jax.Array, float]:
+        loss, slope, error = fields.path_losses_and_slopes(
+            self._program, tables, self._fields, self._combining, self._offsets
+        )
+        return loss, slope[:, :, self._rows, self._places], error
 
     def _run(self, function: Callable, candidates: np.ndarray) -> tuple[np.ndarray, ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
@@ -117,52 +116,25 @@ class Replay:
             block = values[start : start + size]
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
             tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
-            self._refine(tables)
-            parts.append([np.asarray(part, dtype=float)[: len(block)] for part in function(tables)])
+            *found, error = function(tables)
+            if error > TABLE_TOLERANCE:
+                self._refine()
+                continue
+            parts.append([np.asarray(part, dtype=float)[: len(block)] for part in found])
             start += len(block)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
-    def _refine(self, tables: jax.Array) -> None:
-        """Make the tables of coefficients fine enough for these candidates, and for all that follow."""
-        while self._intervals is not None and (
-            float(_table_error(self._program.lookup, tables, self._program.wavelength).max())
-            > TABLE_TOLERANCE
-        ):
-            self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
-            self._program = fields.layout(self.paths, self._dtype, self._intervals).program
+    def _refine(self) -> None:
+        """Make the tables of coefficients finer, for these candidates and all that follow."""
+        self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
+        self._program = self._laid_out()
+
+    def _laid_out(self) -> fields.Program:
+        phases = self._combining != "power"
+        return fields.layout(self.paths, self._dtype, self._intervals, phases).program
 
 
-# Stages compiled apart, each over a batch of candidates; see `calibray.fields`.
-_tables = jax.jit(
-    lambda base, rows, columns, values: jax.vmap(lambda value: base.at[rows, columns].set(value))(values)
-)
-_local_values = jax.jit(jax.vmap(fields.local_values, in_axes=(None, 0)))
-_table_error = jax.jit(jax.vmap(tabulation.table_error, in_axes=(None, 0, None)))
-
-
-@partial(jax.jit, static_argnames="columns")
-def _local_tangents(program: fields.Program, tables: jax.Array, columns: tuple[int, ...]) -> tuple:
-    return jax.vmap(lambda table: fields.local_tangents(program, table, columns))(tables)
-
-
-@partial(jax.jit, static_argnames="combining")
-def _power(
-    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
-) -> jax.Array:
-    return jax.vmap(lambda one: fields.program_power(program, one, combining, offsets))(local)
-
-
-@partial(jax.jit, static_argnames="combining")
-def _power_and_slope(
-    program: fields.Program, local: fields.Local, combining: str, offsets: jax.Array | None
-) -> tuple[jax.Array, fields.Local]:
-    return jax.vmap(lambda one: fields.power_and_slope(program, one, combining, offsets))(local)
-
-
-@partial(jax.jit, static_argnames="materials")
-def _decibel_slope(
-    program: fields.Program, power: jax.Array, slope: fields.Local, tangents: tuple, materials: int
-) -> jax.Array:
-    one = partial(fields.decibel_slope, program, num_materials=materials)
-    return jax.vmap(lambda power, slope, tangents: one(power, slope, tangents))(power, slope, tangents)
+@jax.jit
+def _tables(base: jax.Array, rows: np.ndarray, columns: np.ndarray, values: jax.Array) -> jax.Array:
+    return jax.vmap(lambda value: base.at[rows, columns].set(value))(values)

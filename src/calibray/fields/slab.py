@@ -68,11 +68,11 @@ def coefficients(
     Returns:
         The two coefficients, each as (real, imaginary) [...].
     """
-    root = keep(_root(permittivity - (1 - cosine * cosine), loss), wavelength)  # sqrt(eta - sin^2 theta)
+    root = keep(_root((permittivity - 1) + cosine * cosine, loss), wavelength)  # sqrt(eta - sin^2 theta)
     scale = 2 * jnp.pi * thickness / wavelength
     decay, turn = jnp.exp(scale * root[1]), scale * root[0]
     phase = keep((decay * jnp.cos(turn), -decay * jnp.sin(turn)), wavelength)  # e^{-jq}, q of eq. 44
-    across = _multiply(phase, phase)
+    across = multiply(phase, phase)
     eta_cosine = permittivity * cosine, -loss * cosine
     half = (
         _divide((cosine - root[0], -root[1]), (cosine + root[0], root[1])),  # eq. 37a
@@ -97,14 +97,39 @@ def safe_sqrt(value: jax.Array) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
+def multiply(a: Pair, b: Pair) -> Pair:
+    """Product of two complex numbers.
+
+    Args:
+        a: The one, (real, imaginary) [...].
+        b: The other [...].
+
+    Returns:
+        The product [...].
+    """
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def power(value: Pair) -> jax.Array:
+    """Squared magnitude of a complex number.
+
+    Args:
+        value: (real, imaginary) [...].
+
+    Returns:
+        The square [...].
+    """
+    return value[0] * value[0] + value[1] * value[1]
+
+
 def _slab(half: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
-    square = _multiply(half, half)
-    loop = _multiply(square, across)
+    square = multiply(half, half)
+    loop = multiply(square, across)
     denominator = 1 - loop[0], -loop[1]
-    reflected = _multiply(half, (1 - across[0], -across[1]))  # eq. 43a
+    reflected = multiply(half, (1 - across[0], -across[1]))  # eq. 43a
     if transmitted is False:
         return _divide(reflected, denominator)
-    through = _multiply((1 - square[0], -square[1]), phase)  # eq. 43b
+    through = multiply((1 - square[0], -square[1]), phase)  # eq. 43b
     chosen = tuple(jnp.where(transmitted, t, r) for t, r in zip(through, reflected, strict=True))
     return _divide(chosen, denominator)
 
@@ -116,10 +141,6 @@ def _root(real: jax.Array, loss: jax.Array) -> Pair:
     modulus = jnp.sqrt(size * size + loss * loss)
     root = jnp.sqrt(0.5 * (modulus + size))
     return root, -0.5 * loss / root
-
-
-def _multiply(a: Pair, b: Pair) -> Pair:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
 def _divide(a: Pair, b: Pair) -> Pair:

@@ -1,0 +1,42 @@
+"""Fields along stored paths, for any materials: pure JAX, batched over candidates, with derivatives.
+
+A path's gain is (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx. Complex numbers are pairs of real arrays, a form that
+compilers vectorize. Precision follows the program: float64 by default, as `jax_enable_x64` is switched on here.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from calibray.fields.combining import (  # noqa: E402
+    COMBINING,
+    band_quadrature,
+    check_combining,
+    decibel,
+    link_power,
+)
+from calibray.fields.evaluation import (  # noqa: E402
+    path_gains,
+    path_loss,
+    path_losses,
+    path_losses_and_slopes,
+    program_path_loss,
+)
+from calibray.fields.program import Layout, Program, constants, layout  # noqa: E402
+
+__all__ = [
+    "COMBINING",
+    "Layout",
+    "Program",
+    "band_quadrature",
+    "check_combining",
+    "constants",
+    "decibel",
+    "layout",
+    "link_power",
+    "path_gains",
+    "path_loss",
+    "path_losses",
+    "path_losses_and_slopes",
+    "program_path_loss",
+]

@@ -1,0 +1,256 @@
+"""Path loss of every link of a program, and its derivatives, for batches of candidates.
+
+Stages are compiled apart: XLA on CPU would otherwise fuse each into all its uses and repeat it there. Where
+coefficients lie in tables, looking them up, carrying the fields along and taking the power are one stage that reads
+every constant once and writes one number a path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.constants import speed_of_light
+
+from calibray.fields import slab, tabulation
+from calibray.fields.combining import check_combining, decibel, link_power, path_power
+from calibray.fields.contributions import Contributions, Pieces, contributions, pieces, tangents
+from calibray.fields.program import Formula, Program, constants, layout
+from calibray.fields.propagation import path_fields
+from calibray.fields.segments import total
+from calibray.materials import Material
+from calibray.paths import Paths
+
+
+def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) -> np.ndarray:
+    """Path gains for any materials, equal to Sionna RT's `Paths.a` for the same materials.
+
+    Args:
+        paths: The path program.
+        materials: Constants by name; materials not named keep those of the trace.
+
+    Returns:
+        Complex gains [P]; [P, R, T] if an antenna is dual-polarized.
+
+    Raises:
+        InputError: A material is unknown.
+    """
+    plan = layout(paths)
+    local = _contributions(plan.program, jnp.asarray(constants(paths, materials)))
+    real, imaginary = _gains(plan.program, local)
+    found = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
+    found[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
+    return found[:, 0, 0] if found.shape[1:] == (1, 1) else found
+
+
+def path_loss(
+    paths: Paths,
+    materials: Mapping[str, Material] | None = None,
+    combining: str = "power",
+    bandwidth: float | None = None,
+) -> np.ndarray:
+    """Path loss of every link for any materials.
+
+    Args:
+        paths: The path program.
+        materials: Constants by name; materials not named keep those of the trace.
+        combining: "power" sums the paths' powers (a wide band, or many snapshots); "coherent" their fields at the
+            carrier; "band" averages the coherent power over `bandwidth`.
+        bandwidth: Bandwidth [Hz], for "band".
+
+    Returns:
+        Path loss [L], [dB]; +inf where a link has no path.
+
+    Raises:
+        InputError: The combining or a material is unknown, or the bandwidth missing.
+    """
+    offsets = check_combining(paths, combining, bandwidth)
+    tables = jnp.asarray(constants(paths, materials))[None]
+    return np.asarray(path_losses(layout(paths).program, tables, combining, offsets)[0][0])
+
+
+def program_path_loss(
+    program: Program, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+) -> jax.Array:
+    """Path loss of every link of a program, as one pure function.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+        combining: "power", "coherent" or "band".
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Path loss [L], [dB]; +inf where a link has no path.
+    """
+    found = slab.keep(contributions(program, table), program.wavelength)
+    return decibel(_power(program, pieces(program, found), combining, offsets))
+
+
+def path_losses(
+    program: Program, tables: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+) -> tuple[jax.Array, float]:
+    """Path loss of every link for a batch of candidates.
+
+    Args:
+        program: The program.
+        tables: Material constants [n, M, 8].
+        combining: "power", "coherent" or "band".
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Path loss [n, L], [dB], +inf where a link has no path; and the largest error of a tabulated coefficient.
+    """
+    if isinstance(program.coefficients, Formula):
+        found = _many_contributions(program, tables)
+        return decibel(_link_powers(program, found, combining, offsets)), 0.0
+    # Coefficients are looked up where they are used, which is quickest where they are used once.
+    once = all(set(group.signature) <= {"c"} for group in program.groups)
+    powers, errors = [], []
+    for table in tables:
+        found = _contributions(program, table)
+        power = _link_power if once else _link_power_of_pieces
+        powers.append(power(program, found if once else _pieces(program, found), combining, offsets))
+        errors.append(_table_error(program, found))
+    return decibel(jnp.stack(powers)), float(jnp.stack(errors).max())
+
+
+def path_losses_and_slopes(
+    program: Program,
+    tables: jax.Array,
+    columns: tuple[int, ...],
+    combining: str = "power",
+    offsets: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array, float]:
+    """Path loss of every link for a batch of candidates, and its derivatives by the materials' constants.
+
+    Args:
+        program: The program.
+        tables: Material constants [n, M, 8].
+        columns: Columns of the tables to derive by.
+        combining: "power", "coherent" or "band".
+        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+
+    Returns:
+        Path loss [n, L], [dB], its derivatives [n, L, M, columns], [dB] per unit, 0 where a link has no path; and the
+        largest error of a tabulated coefficient.
+    """
+    if isinstance(program.coefficients, Formula):
+        found, rates = _many_tangents(program, tables, columns)
+        power, slope = _powers_and_slopes(program, found, combining, offsets)
+        return decibel(power), _decibel_slopes(program, power, slope, rates, tables.shape[1]), 0.0
+    powers, slopes, errors = [], [], []
+    for table in tables:
+        found, rates = _tangents(program, table, columns)
+        power, slope = _power_and_slope(program, _pieces(program, found), combining, offsets)
+        powers.append(power)
+        slopes.append(_decibel_slope(program, power, slope, rates, table.shape[0]))
+        errors.append(_table_error(program, found))
+    return decibel(jnp.stack(powers)), jnp.stack(slopes), float(jnp.stack(errors).max())
+
+
+def _power(
+    program: Program, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None, keep: bool = False
+) -> jax.Array:
+    """Power gain of every link [L]; `keep` holds the field after every interaction, for a reverse pass."""
+    held = partial(slab.keep, positive=program.wavelength)
+    gain = path_fields(program, found, held if keep else lambda field: field)
+    if combining == "power":
+        return total(program.by_link, held(path_power(gain)))
+    frequency = speed_of_light / program.wavelength
+    return link_power(gain, program.link, program.delay, program.num_links, frequency, combining, offsets)
+
+
+def _slope(
+    program: Program, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None
+) -> tuple[jax.Array, tuple[Pieces, ...]]:
+    """Power gain of every link, and its derivative by every piece.
+
+    Every path belongs to one link, so one reverse pass over the summed power gives the derivatives of all links.
+    """
+    power, pull = jax.vjp(lambda found: _power(program, found, combining, offsets, keep=True), found)
+    (slope,) = pull(jnp.ones_like(power))
+    return power, slope
+
+
+def _contract(
+    program: Program,
+    power: jax.Array,
+    slope: tuple[Pieces, ...],
+    rates: tuple[Contributions, ...],
+    num_materials: int,
+) -> jax.Array:
+    """Derivatives of path loss [L, M, columns] from both passes.
+
+    Every interaction belongs to one material, so one tangent per column serves all materials at once: the cost does not
+    grow with their number.
+    """
+    parts = []
+    for rate in rates:
+        rises = [[], []]
+        for group, rate_of_group in zip(slope, pieces(program, rate), strict=True):
+            for rise, outer, inner in zip(rises, group, rate_of_group, strict=True):
+                rise += [_dot(a, b) for a, b in zip(outer, inner, strict=True)]
+        sums = [
+            total(segments, slab.keep(jnp.concatenate(rise), program.wavelength))
+            for segments, rise in zip(program.by_material, rises, strict=True)
+            if rise
+        ]
+        parts.append(sum(sums, jnp.zeros(program.num_links * num_materials, power.dtype)))
+    inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
+    by_material = jnp.stack(parts, axis=-1).reshape(program.num_links, num_materials, len(rates))
+    return -10 / np.log(10) * inverse[:, None, None] * by_material
+
+
+def _dot(a: Pieces, b: Pieces) -> jax.Array:
+    return sum(x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+_contributions = jax.jit(contributions)
+_many_contributions = jax.jit(jax.vmap(contributions, in_axes=(None, 0)))
+_pieces = jax.jit(pieces)
+_tangents = jax.jit(tangents, static_argnums=2)
+_many_tangents = jax.jit(
+    lambda program, tables, columns: jax.vmap(lambda table: tangents(program, table, columns))(tables),
+    static_argnums=2,
+)
+_gains = jax.jit(lambda program, found: path_fields(program, pieces(program, found)))
+_link_power_of_pieces = jax.jit(_power, static_argnums=2)
+_power_and_slope = jax.jit(_slope, static_argnums=2)
+_decibel_slope = jax.jit(_contract, static_argnums=4)
+
+
+@jax.jit
+def _table_error(program: Program, found: Contributions) -> jax.Array:
+    return tabulation.table_error(found.coefficients, program.coefficients)
+
+
+@partial(jax.jit, static_argnums=2)
+def _link_power(
+    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+) -> jax.Array:
+    return _power(program, pieces(program, found), combining, offsets)
+
+
+@partial(jax.jit, static_argnums=2)
+def _link_powers(
+    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+) -> jax.Array:
+    return jax.vmap(lambda one: _power(program, pieces(program, one), combining, offsets))(found)
+
+
+@partial(jax.jit, static_argnums=2)
+def _powers_and_slopes(
+    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+) -> tuple[jax.Array, tuple[Pieces, ...]]:
+    return jax.vmap(lambda one: _slope(program, pieces(program, one), combining, offsets))(found)
+
+
+@partial(jax.jit, static_argnums=4)
+def _decibel_slopes(
+    program: Program, power: jax.Array, slope: tuple[Pieces, ...], rates: tuple, num_materials: int
+) -> jax.Array:
+    return jax.vmap(lambda *one: _contract(program, *one, num_materials))(power, slope, rates)

@@ -1,0 +1,99 @@
+"""Coefficients from tables: their error is known where it is largest, and replay with them equals the formula."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.constants import speed_of_light
+
+import synthetic
+from calibray.engines import Replay
+from calibray.engines.replay import TABLE_TOLERANCE
+from calibray.fields import layout, tabulation
+from calibray.fields.contributions import contributions
+from calibray.materials import Material, constants
+from calibray.parameters import Parameter, Parameters
+
+WAVELENGTH = jnp.asarray(speed_of_light / 28e9)
+HARD = {
+    "Brewster angle of a loss-free slab": Material(9.0, 0.0, 0.011),
+    "resonances of a thick slab": Material(6.3, 0.001, 0.3),
+    "grazing incidence on metal": Material(1.0, 1e7, 0.1),
+    "total loss": Material(30.0, 50.0, 0.2),
+    "air": Material(1.0, 0.0, 0.1),
+}
+_nodes, _evaluate = jax.jit(tabulation.nodes), jax.jit(tabulation.evaluate)
+
+
+@pytest.mark.parametrize("mode", [0, tabulation.TRANSMITTED, tabulation.RAW])
+@pytest.mark.parametrize("case", HARD)
+def test_error_of_a_table_is_bounded_by_what_it_says(case: str, mode: int) -> None:
+    cosine = np.concatenate([np.linspace(0, 1, 20_011)[1:], np.geomspace(1e-8, 1e-3, 500)])
+    count, table = len(cosine), jnp.asarray(constants({"one": HARD[case]}))
+    lookup = tabulation.make_lookup(np.zeros(count, int), np.full(count, mode), cosine, [count], 4096, float)
+    tables = _nodes(lookup, table, WAVELENGTH)
+    found = tabulation.interpolate(tables, lookup.cell[0], lookup.fraction[0])
+    zero = jnp.zeros(count, dtype=int)
+    exact = _evaluate(
+        jnp.asarray(cosine), table, zero, WAVELENGTH, zero + mode == tabulation.TRANSMITTED, zero + mode != 0
+    )
+    error = max(
+        float(jnp.abs(a - b).max())
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True)
+    )
+    said = float(tabulation.table_error(tables, lookup))
+    assert error <= said + 1e-12
+    assert said <= 4 * error + 1e-9  # and is no empty bound
+
+
+@pytest.fixture(scope="module")
+def paths():
+    return synthetic.program([sequence for sequence in synthetic.EVERY_KIND if sequence] * 40, seed=5)
+
+
+@pytest.fixture(scope="module")
+def parameters(paths) -> Parameters:
+    return Parameters(
+        (
+            Parameter("walls.relative_permittivity", 1.5, 12.0, start=4.3),
+            Parameter("walls.thickness", 0.01, 0.5, start=0.2),
+            Parameter("glass.conductivity", 0.0, 1.0, start=0.02),
+            Parameter("ground.scattering_coefficient", 0.0, 0.9, start=0.6),
+            Parameter("ground.alpha_r", 1.0, 9.0, start=5.6),
+        )
+    )
+
+
+def points(parameters: Parameters, count: int = 6) -> np.ndarray:
+    unit = np.random.default_rng(2).random((count, len(parameters)))
+    return parameters.from_unit(unit)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_replay_with_tables_equals_replay_with_the_formula(paths, parameters, dtype: type) -> None:
+    candidates = points(parameters)
+    exact = Replay(paths, parameters, dtype=np.float64, tabulate=False)
+    tabulated = Replay(paths, parameters, dtype=dtype, tabulate=True)
+    np.testing.assert_allclose(tabulated.path_loss(candidates), exact.path_loss(candidates), atol=2e-3)
+    loss, slope = tabulated.path_loss_and_jacobian(candidates)
+    expected_loss, expected = exact.path_loss_and_jacobian(candidates)
+    np.testing.assert_allclose(loss, expected_loss, atol=2e-3)
+    scale = np.abs(expected).max(axis=(0, 1))
+    assert (np.abs(slope - expected).max(axis=(0, 1)) <= 5e-3 * scale).all()
+    assert tabulated.calls == exact.calls == 2 * len(candidates)
+
+
+def test_a_table_too_coarse_is_refined(paths, parameters) -> None:
+    thick = np.array([[11.0, 0.5, 0.0, 0.3, 3.0]])  # resonances as narrow as they come
+    high = replace(paths, frequency=28e9)
+    engine = Replay(high, parameters, dtype=np.float64, tabulate=True)
+    coarse = layout(high, np.float64, 256).program
+    table = jnp.asarray(parameters.constants(thick, paths.materials)[0])
+    found = jax.jit(contributions)(coarse, table)
+    assert float(tabulation.table_error(found.coefficients, coarse.coefficients)) > TABLE_TOLERANCE
+    exact = Replay(high, parameters, dtype=np.float64, tabulate=False)
+    np.testing.assert_allclose(engine.path_loss(thick), exact.path_loss(thick), atol=5e-3)
