@@ -33,7 +33,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "engines": {"fields", "tracing", "study"},
     "likelihood": {"measurements"},
     "calibration": {"engines", "likelihood", "optimizers"},
-    "report": {"calibration"},
+    "comparison": {"calibration"},
+    "report": {"comparison"},
     "doctor": {"llvm"},
 }
 TRACER = {"sionna", "mitsuba", "drjit"}

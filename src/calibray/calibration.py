@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -333,20 +333,34 @@ def make_optimizer(name: str, parameters: Parameters, seed: int, **options: obje
         raise InputError(f"method.options of {name!r}: {error}") from None
 
 
+def usual_options(name: str, parameters: Parameters, large: bool) -> dict[str, Any]:
+    """Settings of a method that follow from what is calibrated; a study's own replace them.
+
+    Args:
+        name: A method of `METHODS`.
+        parameters: The parameters.
+        large: Whether a candidate costs milliseconds.
+
+    Returns:
+        The settings; none for most methods.
+    """
+    if name == "least-squares":
+        start = {"x0": to_search(parameters, parameters.start)}
+        return {**start, "starts": FEW_STARTS} if large else start
+    if name == "vector-surrogate":
+        return {"logarithmic": _better_logarithmic(parameters)}
+    return {}
+
+
 def _optimizer(problem: Problem) -> Optimizer:
     section, parameters = problem.study.method, problem.engine.parameters
-    name, options = section.name, dict(section.options)
+    replay, name = isinstance(problem.engine, Differentiable), section.name
     if name == AUTO:
-        name = "least-squares" if isinstance(problem.engine, Differentiable) else "vector-surrogate"
-    if name == "least-squares":
-        if not isinstance(problem.engine, Differentiable):
-            raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
-        options.setdefault("x0", to_search(parameters, parameters.start))
-        if problem.engine.large:  # a candidate costs milliseconds there
-            options.setdefault("starts", FEW_STARTS)
-    if name == "vector-surrogate":
-        options.setdefault("logarithmic", _better_logarithmic(parameters))
-    return make_optimizer(name, parameters, section.seed, **options)
+        name = "least-squares" if replay else "vector-surrogate"
+    if name == "least-squares" and not replay:
+        raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
+    usual = usual_options(name, parameters, replay and problem.engine.large)
+    return make_optimizer(name, parameters, section.seed, **{**usual, **section.options})
 
 
 def _better_logarithmic(parameters: Parameters) -> list[bool]:

@@ -167,6 +167,47 @@ def run(
 
 
 @app.command()
+def compare(
+    study_file: StudyFile,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder for tables and figure; finished runs are kept there."
+        ),
+    ],
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Methods with commas between; METHOD@CALLS has a budget of its own."
+        ),
+    ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares",
+    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, from seeds 0 to N - 1.")] = 25,
+    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls of a run.")] = 225,
+    workers: Annotated[int, typer.Option(metavar="N", help="Processes that run at once.")] = 1,
+) -> None:
+    """Run methods from many seeds on a study's stored paths, at equal budgets of RT calls."""
+    from functools import partial
+
+    from calibray import terminal
+    from calibray.arena import study_arena
+    from calibray.comparison import compare as run_all
+    from calibray.report import comparison as report
+
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    with terminal.progress_bars(log) as progress:
+        finished = run_all(
+            partial(study_arena, study_file),
+            names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
+        )  # fmt: skip
+    report.write(finished, out)
+    typer.echo(terminal.render_table(report.HEADINGS, report.rows(finished)))
+    typer.echo(f"\nOptimum {finished.optimum:.6g} dB, found by {finished.found_by}")
+    for name, seed, failure in finished.failures():
+        typer.echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
+    typer.echo(f"Written to {out}: {', '.join(report.FILES)}", err=True)
+
+
+@app.command()
 def trace(
     study_file: StudyFile,
     out: Annotated[

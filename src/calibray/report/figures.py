@@ -18,8 +18,10 @@ MEASURED, BEFORE = "#222222", "#9a9a9a"
 
 
 def label(method: str) -> str:
-    """A method's name for a legend."""
-    return {"gwo": "GWO", "sgwo-im": "SGWO-IM", "auto": "auto (least squares)"}.get(method, method)
+    """A method's name for a legend; one with a budget of its own is "name@calls"."""
+    name, _, calls = method.partition("@")
+    known = {"gwo": "GWO", "sgwo-im": "SGWO-IM", "auto": "auto (least squares)"}.get(name, name)
+    return f"{known}, {calls} calls" if calls else known
 
 
 def cumulative_cost(results: Mapping[str, Result]) -> Figure:
@@ -64,7 +66,7 @@ def convergence(results: Mapping[str, Result], optimum_db: float) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = _figure("RT calls", "Best RMSE so far [dB]")
+    figure, axes = plain_figure("RT calls", "Best RMSE so far [dB]")
     for method, result in results.items():
         history = result.history
         axes.step(
@@ -87,7 +89,7 @@ def path_loss_by_receiver(results: Mapping[str, Result]) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = _figure("Receiver", "Path loss [dB]", width=10.0)
+    figure, axes = plain_figure("Receiver", "Path loss [dB]", width=10.0)
     links = next(iter(results.values())).links
     index = np.arange(1, len(links) + 1)
     axes.plot(index, links["measured_db"], "o-", color=MEASURED, ms=5, lw=1.5, label="measured")
@@ -113,7 +115,17 @@ def write(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _figure(x: str, y: str, width: float = 6.4) -> tuple[Figure, Axes]:
+def plain_figure(x: str, y: str, width: float = 6.4) -> tuple[Figure, Axes]:
+    """An empty figure of one panel in the style of all.
+
+    Args:
+        x: What the horizontal axis shows, with its unit.
+        y: What the vertical axis shows, with its unit.
+        width: Width [in].
+
+    Returns:
+        The figure and its axes.
+    """
     figure = Figure(figsize=(width, 4.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     _style(axes, x, y)

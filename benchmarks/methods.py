@@ -1,0 +1,79 @@
+"""Every method on five problems at equal budgets of RT calls: the tables and figures of docs/methods.
+
+    python benchmarks/methods.py --seeds 25 --workers 2
+
+needs `pip install 'calibray[optimizers]'`, and for the two real campaigns their data (see examples/README.md). Finished
+runs are kept under out/methods, so that a killed benchmark goes on where it stopped; delete the folder to measure
+anew. Excesses can be compared between machines; seconds cannot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from calibray import terminal
+from calibray.arena import Arena, landscape_arena, study_arena
+from calibray.cli import log
+from calibray.comparison import compare
+from calibray.files import write_table, write_text
+from calibray.report import comparison as report
+from calibray.report.figures import write
+from calibray.scenarios import demo_study_path
+
+ROOT = Path(__file__).resolve().parents[1]
+METHODS = (
+    "vector-surrogate", "sgwo-im", "gwo", "gwo@600", "gaussian-process", "dfo-ls", "cma-es",
+    "differential-evolution", "random", "least-squares",
+)  # fmt: skip
+PROBLEMS: dict[str, tuple[str, Callable[[], Arena]]] = {
+    "demo": ("The demo district, 3 permittivities", partial(study_arena, demo_study_path())),
+    "boulder": ("Boulder at 28.5 GHz (NIST)", partial(study_arena, ROOT / "examples/nist_boulder.toml")),
+    "auckland": ("Auckland at 1.88 GHz", partial(study_arena, ROOT / "examples/auckland_tower.toml")),
+    "hall": (
+        "Thick resonating panes, 3 parameters, hundreds of local minima",
+        partial(landscape_arena, "hall"),
+    ),
+    "blocks": ("8 parameters, 60 links", partial(landscape_arena, "blocks")),
+}
+
+
+def main() -> None:
+    """Run what is missing and write tables and figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--seeds", type=int, default=25)
+    parser.add_argument("--budget", type=int, default=225)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--runs", type=Path, default=ROOT / "out/methods", help="folder that keeps the runs")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "docs/methods", help="folder of tables and figures"
+    )
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    sections = ["# Methods compared\n\nWritten by `benchmarks/methods.py`; "
+                f"{chosen.seeds} seeds, {chosen.budget} RT calls unless the method's name says otherwise."]  # fmt: skip
+    for name in chosen.problems:
+        title, arena = PROBLEMS[name]
+        with terminal.progress_bars(log) as progress:
+            finished = compare(
+                arena, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
+                out=chosen.runs / name, workers=chosen.workers, progress=progress,
+            )  # fmt: skip
+        write_table(chosen.out / f"{name}.csv", finished.table())
+        write(report.figure(finished), chosen.out / f"{name}.png")
+        sections.append(
+            f"## {title}\n\nOptimum {finished.optimum:.6g} dB, found by {finished.found_by}.\n\n"
+            f"{report.markdown(finished)}\n\n![Excess RMSE over RT calls]({name}.png)"
+        )
+        print(sections[-1], flush=True)
+    write_text(chosen.out / "tables.md", "\n\n".join(sections) + "\n")
+
+
+if __name__ == "__main__":
+    main()

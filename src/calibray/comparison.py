@@ -1,0 +1,406 @@
+"""Methods side by side at equal budgets: every method from many seeds on one problem, best so far by RT call.
+
+An excess is what the best objective so far lies above the global optimum of the same data. The optimum is that of
+least squares from very many starts, or of any run that found a lower one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from calibray.arena import Arena
+from calibray.calibration import Progress
+from calibray.errors import InputError
+from calibray.files import check_folder
+from calibray.optimizers import METHODS, Optimizer
+from calibray.runs import Run, Runs
+from calibray.spelling import did_you_mean
+
+LEAST_BUDGET: Final = 24  # below, the pack of SGWO-IM would have no three leaders
+WOLVES: Final = 30  # the paper's population
+CALLS: Final = (30, 60, 225)  # where the excess is tabulated, beside the end
+EXCESSES_DB: Final = (0.05, 0.02, 0.01)  # whose first RT call is tabulated
+OPTIMUM: Final = "optimum"  # the run that finds it, among the runs kept
+REFERENCE: Final = "least-squares"  # the one method that uses derivatives and stops by itself
+OPTIMUM_STARTS: Final = {False: 512, True: 64}  # its local searches on small and on large path programs
+
+Open = Callable[[], Arena]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method in a comparison.
+
+    Attributes:
+        name: Its name in tables, as it was asked for.
+        method: Its name in `METHODS`.
+        budget: RT calls that it may use.
+    """
+
+    name: str
+    method: str
+    budget: int
+
+    @staticmethod
+    def parse(name: str, budget: int) -> Entry:
+        """Read a method as it is asked for.
+
+        Args:
+            name: A method, or `METHOD@CALLS` for a budget of its own.
+            budget: RT calls of those without one.
+
+        Returns:
+            The entry.
+
+        Raises:
+            InputError: There is no such method, or the budget is no whole number, or too small.
+
+        Example:
+            >>> Entry.parse("gwo@600", 225)
+            Entry(name='gwo@600', method='gwo', budget=600)
+        """
+        method, _, own = name.partition("@")
+        if method not in METHODS:
+            raise InputError(f"method {method!r}: there is no such method; {did_you_mean(method, METHODS)}")
+        if own:
+            with suppress(ValueError):
+                budget = int(own)
+        if (own and own != str(budget)) or budget < LEAST_BUDGET:
+            raise InputError(
+                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number >= {LEAST_BUDGET}"
+            )
+        return Entry(name, method, budget)
+
+    def optimizer(self, arena: Arena, seed: int) -> Optimizer:
+        """The optimizer of a run.
+
+        Args:
+            arena: The problem.
+            seed: The run's seed.
+
+        Returns:
+            An optimizer that asks for no more than the budget; least squares stops by itself.
+
+        Raises:
+            InputError: The method does not fit the problem, or its library is not installed.
+        """
+        options = {**arena.options.get(self.method, {}), **settings(self.method, self.budget)}
+        return METHODS[self.method](arena.lower, arena.upper, seed=seed, **options)
+
+
+def settings(method: str, budget: int) -> dict[str, int]:
+    """Settings with which a method keeps to a budget.
+
+    GWO has the paper's 30 wolves and as many whole iterations as the budget holds. SGWO-IM spends two thirds of it in
+    its 5 full iterations, on 30 wolves at most, and the rest on 5 elites an iteration: at 225 that is the paper's
+    schedule. All others take the budget itself.
+
+    Args:
+        method: A method of `METHODS`.
+        budget: RT calls.
+
+    Returns:
+        Arguments of its class.
+    """
+    if method == "gwo":
+        wolves = min(WOLVES, budget // 2)
+        return {"population": wolves, "iterations": budget // wolves}
+    if method == "sgwo-im":
+        wolves = min(WOLVES, 2 * budget // 15)
+        elites = min(5, wolves)
+        return {"population": wolves, "elites": elites, "iterations": 5 + (budget - 5 * wolves) // elites}
+    return {} if method == REFERENCE else {"budget": budget}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Finished runs of methods on one problem.
+
+    Attributes:
+        name: The problem.
+        entries: The methods, in the order asked for.
+        runs: Their runs by entry name, one for each seed.
+        optimum: Lowest objective known, [dB].
+        found_by: What found it.
+    """
+
+    name: str
+    entries: tuple[Entry, ...]
+    runs: dict[str, tuple[Run, ...]]
+    optimum: float
+    found_by: str
+
+    def excess(self, name: str, calls: int) -> np.ndarray:
+        """Excess of an entry's runs after some RT calls.
+
+        A run that ended or failed before stays where it was.
+
+        Args:
+            name: The entry.
+            calls: Number of RT calls.
+
+        Returns:
+            Excess [seeds], [dB]; +inf before anything was found.
+        """
+        return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
+
+    def calls_to(self, name: str, excess_db: float) -> np.ndarray:
+        """RT calls after which an entry's runs were within some excess.
+
+        Args:
+            name: The entry.
+            excess_db: The excess [dB].
+
+        Returns:
+            RT calls [seeds]; +inf for a run that never was.
+        """
+        return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
+
+    def table(self) -> pd.DataFrame:
+        """One row per method: excesses at some RT calls, and RT calls to some excesses.
+
+        Returns:
+            Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to
+            an excess over all runs, empty where half of them or more never had it, and how many had; failed runs;
+            median seconds a run.
+        """
+        return pd.DataFrame([self._row(entry) for entry in self.entries])
+
+    def _row(self, entry: Entry) -> dict[str, Any]:
+        runs = self.runs[entry.name]
+        row: dict[str, Any] = {
+            "method": entry.name,
+            "uses": "+".join(
+                name for name in ("value", "residuals", "jacobian") if name in METHODS[entry.method].uses
+            ),
+            "runs": len(runs),
+            "failed": sum(bool(run.failure) for run in runs),
+            "rt_calls": float(np.median([run.evaluations for run in runs])),
+        }
+        for calls in (*CALLS, None):
+            place = "end" if calls is None else str(calls)
+            known = calls is None or entry.method == REFERENCE or calls <= entry.budget
+            excess = self.excess(entry.name, 2**62 if calls is None else calls)
+            for label, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
+                row[f"{label}_excess_db_{place}"] = quantile(excess, share) if known else np.nan
+        for level in EXCESSES_DB:
+            calls_to = self.calls_to(entry.name, level)
+            middle = quantile(calls_to, 0.5)
+            row[f"calls_to_{level:g}_db"] = middle if np.isfinite(middle) else np.nan
+            row[f"reached_{level:g}_db"] = int(np.isfinite(calls_to).sum())
+        row["seconds"] = float(np.median([run.seconds for run in runs]))
+        row["optimum_db"], row["optimum_by"] = self.optimum, self.found_by
+        return row
+
+    def failures(self) -> list[tuple[str, int, str]]:
+        """Runs that ended in an error.
+
+        Returns:
+            Entry, seed and message of each.
+        """
+        return [
+            (name, run.seed, run.failure) for name, runs in self.runs.items() for run in runs if run.failure
+        ]
+
+    def history(self) -> pd.DataFrame:
+        """Every improvement of every run, and its end.
+
+        Returns:
+            Columns method, seed, call, best_db, failure; one row per improvement, and one for the last RT call.
+        """
+        parts = [
+            pd.DataFrame(
+                {
+                    "method": name,
+                    "seed": run.seed,
+                    "call": [*run.calls, run.evaluations],
+                    "best_db": [*run.best, run.at(run.evaluations)],
+                    "failure": ["" for _ in run.calls] + [run.failure],
+                }
+            )
+            for name, runs in self.runs.items()
+            for run in runs
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+
+def quantile(values: np.ndarray, share: float) -> float:
+    """A quantile that may be infinite.
+
+    Args:
+        values: Numbers [n], some of them +inf.
+        share: Between 0 and 1.
+
+    Returns:
+        Linear interpolation between order statistics, +inf as soon as an infinite one takes part.
+
+    Example:
+        >>> import numpy as np
+        >>> quantile(np.array([3.0, 1.0, np.inf]), 0.5), quantile(np.array([1.0, np.inf]), 0.5)
+        (3.0, inf)
+    """
+    ordered = np.sort(values)
+    place = share * (len(ordered) - 1)
+    low, high = ordered[int(np.floor(place))], ordered[int(np.ceil(place))]
+    return float(low) if low == high else float(low + (place % 1.0) * (high - low))
+
+
+def compare(
+    open_arena: Open,
+    methods: Sequence[str],
+    *,
+    seeds: int = 25,
+    budget: int = 225,
+    out: str | Path,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
+
+    Every finished run is appended to `runs.jsonl` in `out` at once; what is found there of the same problem, code of
+    the optimizers, method, budget and seed is not run again.
+
+    Args:
+        open_arena: Makes the problem; picklable if there are several workers, each of which calls it once.
+        methods: Methods, each with the budget or one of its own as in "gwo@600".
+        seeds: Number of runs of each method.
+        budget: RT calls of a run.
+        out: Folder that keeps the runs.
+        workers: Processes that run at once.
+        progress: Called after every run.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        InputError: A method, a number or the folder cannot be used.
+    """
+    for name, value in (("seeds", seeds), ("workers", workers)):
+        if value < 1:
+            raise InputError(f"{name} = {value}; it must be at least 1")
+    entries = tuple(Entry.parse(name, budget) for name in dict.fromkeys(methods))
+    if not entries:
+        raise InputError(f"methods: none is named; {did_you_mean('', METHODS)}")
+    check_folder(out)
+    arena = open_arena()
+    for entry in entries:
+        entry.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
+    store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{_code()}")
+    tasks = [(entry, seed) for seed in range(seeds) for entry in entries]
+    missing = [task for task in tasks if store.find(*_key(*task)) is None]
+    done = len(tasks) - len(missing)
+    for run in _finished(open_arena, arena, missing, workers):
+        store.add(run)
+        done += 1
+        if progress is not None:
+            progress("comparing", done, len(tasks))
+    best = store.find(OPTIMUM, 0, 0)
+    if best is None:
+        best = store.add(_optimum(arena))
+    runs = {entry.name: tuple(store.find(*_key(entry, seed)) for seed in range(seeds)) for entry in entries}
+    return Comparison(arena.name, entries, runs, *_lowest(best, runs))
+
+
+def run_entry(arena: Arena, entry: Entry, seed: int) -> Run:
+    """One run of a method.
+
+    Args:
+        arena: The problem.
+        entry: The method.
+        seed: Its seed.
+
+    Returns:
+        The run; a method or an engine that raised ends it there, with the message kept.
+    """
+    return _recorded(arena, _key(entry, seed), lambda: entry.optimizer(arena, seed))
+
+
+def _recorded(arena: Arena, key: tuple[str, int, int], make: Callable[[], Optimizer]) -> Run:
+    calls: list[int] = []
+    best: list[float] = []
+    evaluations, failure, started = 0, "", time.perf_counter()
+    try:
+        optimizer = make()
+        while not optimizer.done:
+            points = optimizer.ask()
+            told = arena.evaluate(points, "jacobian" in optimizer.uses)
+            optimizer.tell(points, *told)
+            for value in told[0].tolist():
+                evaluations += 1
+                if value < (best[-1] if best else np.inf):
+                    calls.append(evaluations)
+                    best.append(value)
+    except Exception as error:  # a run that fails is a finding about its method
+        failure = f"{type(error).__name__}: {error}"
+    seconds = time.perf_counter() - started
+    return Run(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
+
+
+def _key(entry: Entry, seed: int) -> tuple[str, int, int]:
+    return entry.method, entry.budget, seed
+
+
+def _optimum(arena: Arena) -> Run:
+    """Least squares from so many starts that its answer passes for the global optimum."""
+    starts = OPTIMUM_STARTS[arena.large]
+
+    def make() -> Optimizer:
+        return METHODS[REFERENCE](arena.lower, arena.upper, seed=2**31, starts=starts, x0=arena.start)
+
+    return _recorded(arena, (OPTIMUM, 0, 0), make)
+
+
+def _lowest(best: Run, runs: dict[str, tuple[Run, ...]]) -> tuple[float, str]:
+    """The lowest objective of all runs, and what found it; the reference within rounding."""
+    optimum, found_by = best.at(best.evaluations), "many-start least squares"
+    for name, each in runs.items():
+        for run in each:
+            if run.at(run.evaluations) < optimum - 1e-9:
+                optimum, found_by = run.at(run.evaluations), f"{name}, seed {run.seed}"
+    return min(optimum, *(run.at(run.evaluations) for each in runs.values() for run in each)), found_by
+
+
+def _finished(open_arena: Open, arena: Arena, tasks: list[tuple[Entry, int]], workers: int) -> Iterator[Run]:
+    """The runs, as they finish."""
+    if workers == 1 or len(tasks) < 2:
+        yield from (run_entry(arena, entry, seed) for entry, seed in tasks)
+        return
+    with ProcessPoolExecutor(
+        min(workers, len(tasks)), mp_context=get_context("spawn"), initializer=_start, initargs=(open_arena,)
+    ) as pool:
+        futures = [pool.submit(_work, entry, seed) for entry, seed in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _start(open_arena: Open) -> None:
+    global _opened
+    _opened = open_arena()
+
+
+def _work(entry: Entry, seed: int) -> Run:
+    return run_entry(_opened, entry, seed)
+
+
+@cache
+def _code() -> str:
+    """Fingerprint of the optimizers' code: a run of other code says nothing about this one."""
+    digest = hashlib.sha256()
+    for path in sorted((Path(__file__).parent / "optimizers").glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
