@@ -83,7 +83,7 @@ def trace(
 
     Args:
         scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read.
-        measurements: The links; their values are not looked at.
+        measurements: The links; their values and carriers are not looked at (for another carrier, `Paths.at`).
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
