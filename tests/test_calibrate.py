@@ -10,7 +10,14 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
-from calibray.calibration import calibrate, from_search, make_optimizer, search_slope, to_search
+from calibray.calibration import (
+    calibrate,
+    from_search,
+    make_optimizer,
+    search_slope,
+    to_search,
+    usual_options,
+)
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
@@ -257,6 +264,23 @@ def test_the_search_space_is_the_logarithm_where_asked_for():
     slope = (from_search(parameters, points + step) - from_search(parameters, points - step)) / (2 * step)
     assert search_slope(parameters, values)[0] == pytest.approx(slope[0])
     assert make_optimizer("gwo", parameters, 0).ask()[:, 1].max() <= 0.0
+
+
+def test_a_surrogate_sees_permittivities_on_a_logarithmic_scale_unless_told_otherwise(tmp_path, exact):
+    mixed = Parameters(
+        (
+            Parameter("a.relative_permittivity", lower=1.5, upper=9.0, start=2.0),
+            Parameter("b.relative_permittivity", lower=1.5, upper=9.0, start=2.0, scale="log"),
+            Parameter("b.conductivity", lower=0.0, upper=1.0, start=0.1),
+        )
+    )
+    assert usual_options("vector-surrogate", mixed, large=False) == {"logarithmic": [True, False, False]}
+
+    def history(**options):
+        method = {"name": "vector-surrogate", "options": {"budget": 9, **options}}
+        return run(tmp_path, exact, None, method=method).history.rmse_db.tolist()
+
+    assert history() == history(logarithmic=True) != history(logarithmic=False)
 
 
 @pytest.mark.parametrize(
