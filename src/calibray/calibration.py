@@ -347,8 +347,6 @@ def usual_options(name: str, parameters: Parameters, large: bool) -> dict[str, A
     if name == "least-squares":
         start = {"x0": to_search(parameters, parameters.start)}
         return {**start, "starts": FEW_STARTS} if large else start
-    if name == "vector-surrogate":
-        return {"logarithmic": _better_logarithmic(parameters)}
     return {}
 
 
@@ -361,16 +359,6 @@ def _optimizer(problem: Problem) -> Optimizer:
         raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
     usual = usual_options(name, parameters, replay and problem.engine.large)
     return make_optimizer(name, parameters, section.seed, **{**usual, **section.options})
-
-
-def _better_logarithmic(parameters: Parameters) -> list[bool]:
-    """Which parameters [d] a model should see on a logarithmic scale beside those already searched on one.
-
-    Permittivities: a half space reflects -tanh(log(relative_permittivity) / 4) at normal incidence.
-    """
-    return [
-        item.field in ("relative_permittivity", "itu_a") and item.scale == "linear" for item in parameters
-    ]
 
 
 def _result(

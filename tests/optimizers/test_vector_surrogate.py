@@ -16,7 +16,7 @@ STREET = street()
 
 def excess(method, seeds: int, landscape: Landscape = STREET, **settings) -> np.ndarray:
     """Excess of the best evaluation so far over the global minimum [seeds, evaluations]."""
-    if method is VectorSurrogate:  # as a calibration sets it for permittivities
+    if method is VectorSurrogate:  # reflections alone: log(permittivity) rules them
         settings = {"logarithmic": True, **settings}
     courses = []
     for seed in range(seeds):
