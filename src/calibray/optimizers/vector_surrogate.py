@@ -16,10 +16,10 @@ A run begins with a maximin Latin hypercube. Then two steps take turns on a mode
   different links are correlated, and taking them for independent stops exploration too soon.
 
 Input scales are learned anew when the points have grown in number by a tenth; in between the model only takes
-new points, which lost nothing and saves most of the time. Tried and not kept: two steps of exploitation for one
-of exploration, and exploring around the best points in two coordinates at a time; with eight parameters neither
-was better, and the latter had worse unlucky runs. `logarithmic` for permittivities helped in districts of
-reflections and hurt on a floor of walls that waves pass through, so it is no default.
+new points, which saves most of the time. Tried and not kept, for no clear gain in worst runs: two steps of
+exploitation for one of exploration, and exploring around the best points in two coordinates at a time.
+`logarithmic` for permittivities helped in districts of reflections and hurt on a floor of walls that waves pass
+through, so it is no default.
 
 In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
