@@ -7,12 +7,21 @@ runs are kept under out/methods, so that a killed benchmark goes on where it sto
 anew. Excesses can be compared between machines; seconds cannot.
 """
 
+# ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+
+for library in (
+    "OMP",
+    "OPENBLAS",
+    "MKL",
+):  # read when NumPy is loaded; one core a run, here and in the workers
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from calibray import terminal
 from calibray.arena import Arena, landscape_arena, study_arena

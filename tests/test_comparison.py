@@ -1,6 +1,7 @@
 """Methods side by side: equal budgets, what is written of them, and going on after a kill."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -200,9 +201,17 @@ def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
     assert "none" in markdown(finished)
 
 
+def test_a_lower_minimum_known_beforehand_is_the_optimum(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_optimum", lambda arena: Run("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
+    finished = compare(STREET, ["random"], seeds=1, budget=30, out=tmp_path)
+    assert (finished.optimum, finished.found_by) == (2.97426794, "earlier searches")
+
+
 def test_a_run_below_the_optimum_becomes_the_optimum(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_optimum", lambda arena: Run("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
-    finished = compare(STREET, ["random"], seeds=2, budget=30, out=tmp_path)
+    finished = compare(
+        lambda: replace(STREET(), minimum=np.inf), ["random"], seeds=2, budget=30, out=tmp_path
+    )
     lowest = [run.at(30) for run in finished.runs["random"]]
     assert finished.optimum == min(lowest)
     assert finished.found_by == f"random, seed {int(np.argmin(lowest))}"

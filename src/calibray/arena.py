@@ -33,6 +33,7 @@ class Arena:
         start: Where a user would start [d].
         options: Settings of methods that the problem suggests, by method.
         large: Whether an evaluation is so dear that searches from few starts have to do.
+        minimum: Lowest objective known beforehand; +inf if none is.
         evaluate: Points [n, d], and whether derivatives are wanted, to what an optimizer is told.
     """
 
@@ -43,6 +44,7 @@ class Arena:
     start: np.ndarray
     options: dict[str, dict[str, Any]]
     large: bool
+    minimum: float
     evaluate: Callable[[np.ndarray, bool], Told]
 
 
@@ -86,7 +88,9 @@ def study_arena(path: str | Path) -> Arena:
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = to_search(parameters, parameters.start)
     options = {name: usual_options(name, parameters, engine.large) for name in METHODS}
-    return Arena(Path(path).stem, digest.hexdigest(), lower, upper, start, options, engine.large, evaluate)
+    return Arena(
+        Path(path).stem, digest.hexdigest(), lower, upper, start, options, engine.large, np.inf, evaluate
+    )
 
 
 def landscape_arena(name: str) -> Arena:
@@ -104,8 +108,9 @@ def landscape_arena(name: str) -> Arena:
         value, residuals, jacobian = land.evaluate(points)
         return value, residuals, jacobian if derivatives else None
 
+    known = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)
     digest = hashlib.sha256(name.encode())
     for part in (land.lower, land.upper, *evaluate(middle[None], True)):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
-    return Arena(name, digest.hexdigest(), land.lower, land.upper, middle, {}, False, evaluate)
+    return Arena(name, digest.hexdigest(), land.lower, land.upper, middle, {}, False, known, evaluate)

@@ -186,7 +186,14 @@ def compare(
     workers: Annotated[int, typer.Option(metavar="N", help="Processes that run at once.")] = 1,
 ) -> None:
     """Run methods from many seeds on a study's stored paths, at equal budgets of RT calls."""
+    import os
     from functools import partial
+
+    # The matrices are small: threads cost more than they give, and the runs are what is spread over cores.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(
+            f"{library}_NUM_THREADS", "1"
+        )  # read when NumPy is loaded, here and in the workers
 
     from calibray import terminal
     from calibray.arena import study_arena

@@ -17,7 +17,6 @@ from calibray.report.figures import write as write_figure
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4  # drawn in place of less
 PALETTE: Final = (
-    "#c8553d",
     "#8e6bb0",
     "#d99a2b",
     "#3aa6a6",
@@ -93,7 +92,7 @@ def figure(comparison: Comparison) -> Figure:
         low, middle, high = (
             np.maximum([quantile(each, share) for each in excess], FLOOR_DB) for share in (0.25, 0.5, 0.75)
         )
-        color = COLORS.get(entry.name) or next(colors)
+        color = COLORS.get(entry.method) or next(colors)
         dashed = "--" if entry.method == REFERENCE or entry.name != entry.method else "-"
         axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(entry.name))
         axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
