@@ -31,6 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "scenarios": {"fields", "tracing"},
     "study": {"measurements", "parameters"},
     "engines": {"fields", "tracing", "study"},
+    "convergence": {"fields", "tracing"},
     "likelihood": {"measurements"},
     "calibration": {"engines", "likelihood", "optimizers"},
     "comparison": {"calibration"},

@@ -136,6 +136,18 @@ def test_trace_stores_a_path_program(folder):
     assert outcome.stderr == f"Written to {folder / 'paths.h5'}\n"
 
 
+def test_trace_check_needs_no_file_and_tells_that_nothing_changes(folder):
+    before = sorted(folder.rglob("*"))
+    outcome = calibray("trace", folder / "study.toml", "--check")
+    assert (outcome.exit_code, outcome.stderr) == (0, "")
+    assert re.search(r"^Change from 20,000 to 40,000 samples", outcome.stdout, re.MULTILINE)
+    assert re.search(r"^largest +0\.00 dB$", outcome.stdout, re.MULTILINE)
+    assert outcome.stdout.endswith(
+        "Converged: no link changed by more than 0.5 dB (fidelity.tolerance_db).\n"
+    )
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
     table = planted.links(blocked=True).assign(name=[f"link {k}" for k in range(planted.LINKS)])
     table.to_csv(tmp_path / "new.csv", index=False)
@@ -168,6 +180,7 @@ def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
         (("run", "{folder}/absent.toml", "--out", "{out}"), "absent.toml: no such study file"),
         (("trace", "{study}", "-o", "{folder}/absent/paths.h5"), "there is no folder"),
         (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
+        (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
         (("predict", "{folder}", "{file}"), "is no result of `calibray run`"),
         (("predict", "{result}", "{file}"), "has a column 'path_loss_db' already; rename or remove it"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),

@@ -218,23 +218,50 @@ def compare(
 def trace(
     study_file: StudyFile,
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file to write the paths into.")
-    ],
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file to write the paths into.")
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Trace again with twice the samples and another seed, and tell what changes."
+        ),
+    ] = False,
 ) -> None:
-    """Find the paths of a study's links and store them as a path program."""
-    from calibray import terminal
+    """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
+    from calibray import convergence, terminal
     from calibray.engines import make_tracer
     from calibray.files import check_file
     from calibray.study import Study
 
     study = Study.load(study_file)
-    check_file(out)
+    _refuse_idleness(out, check)
+    if out is not None:
+        check_file(out)
     links, tracer = study.measurements(), make_tracer(study)
     with terminal.progress_bars(log) as progress:
         paths = tracer.trace(links, lambda done, total: progress("tracing", done, total)).paths()
-    paths.save(out)
+        if out is not None:
+            paths.save(out)
+        found = (
+            convergence.check(
+                tracer, links, paths,
+                combining=study.objective.combining, bandwidth=study.scene.bandwidth,
+                progress=lambda done, total: progress("checking", done, total),
+            )
+            if check
+            else None
+        )  # fmt: skip
     typer.echo(terminal.render_paths(paths, links.row, _enclosed(tracer, links)))
-    typer.echo(f"Written to {out}", err=True)
+    if found is not None:
+        typer.echo("\n" + terminal.render_convergence(found, links.row, study.fidelity.tolerance_db))
+    if out is not None:
+        typer.echo(f"Written to {out}", err=True)
+
+
+def _refuse_idleness(out: Path | None, check: bool) -> None:
+    """Refuse to trace for nothing."""
+    if out is None and not check:
+        raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
 
 
 def _refuse_column(file: Path, frame: pd.DataFrame) -> None:

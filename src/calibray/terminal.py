@@ -23,6 +23,7 @@ from rich.progress import (
 from rich.table import Table
 
 from calibray.calibration import Progress as Report
+from calibray.convergence import Convergence
 from calibray.dispersion import PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.result import Result
@@ -122,6 +123,44 @@ def render_paths(paths: Paths, row: np.ndarray, enclosed: Enclosed) -> str:
         *_suspects(row[~reached].tolist(), "", enclosed),
     ]
     return render_table(("Trace", ">", ""), rows)
+
+
+def render_convergence(found: Convergence, row: np.ndarray, tolerance_db: float) -> str:
+    """What tracing again with more samples changed, as tables of plain text and a verdict.
+
+    Args:
+        found: The changes.
+        row: Line of every link in the source file [L].
+        tolerance_db: Change of a link's path loss that is let stand [dB].
+
+    Returns:
+        Lines of text, without a line break at the end.
+    """
+    after = 2 * found.samples
+    overview = [
+        ("median", f"{found.quantile(0.5):.2f} dB", ""),
+        ("95 % of the links", f"{found.quantile(0.95):.2f} dB", ""),
+        ("largest", f"{found.quantile(1.0):.2f} dB", ""),
+        ("links that gained paths", str(len(found.gained)), rows_text(row[found.gained].tolist())),
+        ("links that lost paths", str(len(found.lost)), rows_text(row[found.lost].tolist())),
+    ]
+    tables = [render_table((f"Change from {found.samples:,} to {after:,} samples", ">", ""), overview)]
+    changed = [link for link in found.largest[:LISTED] if found.change_db[link] != 0]
+    if changed:
+        rows = [
+            (str(row[link]), f"{found.change_db[link]:+.2f}",
+             f"{found.paths_before[link]:,}", f"{found.paths_after[link]:,}")
+            for link in changed
+        ]  # fmt: skip
+        tables.append(render_table((">Row", ">change [dB]", ">paths before", ">after"), rows))
+    above = int((np.abs(found.change_db) > tolerance_db).sum())
+    tables.append(
+        f"Converged: no link changed by more than {tolerance_db:g} dB (fidelity.tolerance_db)."
+        if found.converged(tolerance_db)
+        else f"Not converged: {above} of {len(row)} links changed by more than {tolerance_db:g} dB "
+        f"(fidelity.tolerance_db); raise trace.samples to {after} or more and check again."
+    )
+    return "\n\n".join(tables)
 
 
 def rows_text(rows: Sequence[int]) -> str:
