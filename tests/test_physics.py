@@ -501,7 +501,7 @@ def test_scattering_patterns_spread_all_scattered_power_over_the_half_space(
         axis=-1,
     ).reshape(-1, 3)
     value = pattern_value(
-        np.repeat(row, len(out), axis=0), np.zeros(len(out), dtype=int), np.full(len(out), np.cos(incidence)),
+        row, np.zeros(len(out), dtype=int), np.full(len(out), np.cos(incidence)),
         out[:, 2], out @ mirrored, -out @ towards, (pattern,),
     )  # fmt: skip
     total = np.sum(np.asarray(value).reshape(60, 120) * weight[:, None]) * 2 * np.pi / 120

@@ -261,6 +261,7 @@ def settle(
     for turn in range(study.fidelity.rounds):
         scene = engines.make_scene(study, engine.parameters.materials(run.best, engine.materials))
         paths = engines.traced_paths(study, scene, problem.links, _stage(progress, "checking"))
+        paths = engines.compressed_paths(study, paths, engine.parameters)
         again = engines.make_replay(study, paths, problem.links, engine.parameters)
         gap = _gap(again.path_loss(run.best[None])[0], run.best_loss)
         objective = problem.objective

@@ -16,10 +16,7 @@ import numpy as np
 
 from calibray import fields
 from calibray.errors import InputError
-from calibray.fields import Program
-from calibray.fields.combining import path_power
-from calibray.fields.contributions import contributions, pieces
-from calibray.fields.propagation import path_fields
+from calibray.fields import Program, path_powers
 from calibray.materials import Material
 from calibray.paths import Paths
 
@@ -71,20 +68,7 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
 def _statistics(
     program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
-    return statistics(program, powers(program, table), departure, arrival)
-
-
-def powers(program: Program, table: jax.Array) -> jax.Array:
-    """Power gain of every path, summed over receive ports and averaged over transmit ports.
-
-    Args:
-        program: The program.
-        table: Material constants [M, 8].
-
-    Returns:
-        Power gains in the order of the program [P].
-    """
-    return path_power(path_fields(program, pieces(program, contributions(program, table))))
+    return statistics(program, path_powers(program, table), departure, arrival)
 
 
 def statistics(
@@ -148,7 +132,7 @@ def power_delay_profile(
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
     program = fields.layout(paths).program
-    power = np.asarray(jax.jit(powers)(program, jnp.asarray(fields.constants(paths, materials))))
+    power = np.asarray(path_powers(program, jnp.asarray(fields.constants(paths, materials))))
     place = np.searchsorted(edges, np.asarray(program.delay), side="right") - 1
     inside = (place >= 0) & (place < len(edges) - 1)
     bins = np.asarray(program.link)[inside] * (len(edges) - 1) + place[inside]

@@ -10,6 +10,7 @@ A run of one candidate over all links is an RT call. It is counted here, where t
 
 from calibray.engines.assembly import (
     ENGINES,
+    compressed_paths,
     make,
     make_parameters,
     make_replay,
@@ -41,6 +42,7 @@ __all__ = [
     "ReplayCarriers",
     "Retrace",
     "check_candidates",
+    "compressed_paths",
     "make",
     "make_parameters",
     "make_replay",

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from calibray import cache
+from calibray.compression import compress
 from calibray.engines.carriers import CarrierPaths, ReplayCarriers
 from calibray.engines.command import Command
 from calibray.engines.exchange import Surroundings
@@ -68,7 +69,10 @@ def make(
     parameters = make_parameters(study, scene, links)
     options = study.objective.combining, study.scene.bandwidth
     if name == "replay":
-        return make_replay(study, traced_paths(study, scene, links, progress), links, parameters)
+        if study.engine.compress_db is not None:  # before anything is traced
+            _check_compressible(study, links, parameters)
+        paths = compressed_paths(study, traced_paths(study, scene, links, progress), parameters)
+        return make_replay(study, paths, links, parameters)
     if name == "retrace":
         parts = _carrier_tracers(study, scene, links, parameters)
         engine = Retrace(parts, scene.materials, parameters, *options, progress)
@@ -178,6 +182,30 @@ def make_replay(
         for frequency, index in links.carriers
     ]
     return ReplayCarriers(carriers, parameters, paths.materials, *options)
+
+
+def compressed_paths(study: Study, paths: Paths, parameters: Parameters) -> Paths:
+    """The paths to replay for a study: few weighted ones where it asks for them, else all.
+
+    Args:
+        study: The study.
+        paths: The paths of the links, at the study's carrier.
+        parameters: What the candidates' components stand for.
+
+    Returns:
+        The path program.
+    """
+    if study.engine.compress_db is None:
+        return paths
+    return compress(paths, parameters, study.engine.compress_db).paths
+
+
+def _check_compressible(study: Study, links: Measurements, parameters: Parameters) -> None:
+    if study.objective.combining != "power" or links.frequency is not None or parameters.has_laws:
+        raise InputError(
+            f"{study.path}: engine.compress_db = {study.engine.compress_db:g} needs objective.combining = 'power' and "
+            "a single carrier without coefficients of laws; remove it"
+        )
 
 
 def _carriers(study: Study, links: Measurements, parameters: Parameters) -> dict[float, dict[str, Material]]:

@@ -20,6 +20,7 @@ from calibray.fields.evaluation import (  # noqa: E402
     path_loss,
     path_losses,
     path_losses_and_slopes,
+    path_powers,
     program_path_loss,
 )
 from calibray.fields.program import Layout, Program, constants, layout  # noqa: E402
@@ -38,5 +39,6 @@ __all__ = [
     "path_loss",
     "path_losses",
     "path_losses_and_slopes",
+    "path_powers",
     "program_path_loss",
 ]

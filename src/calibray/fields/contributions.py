@@ -20,25 +20,27 @@ from calibray.fields.scattering import pattern_value
 from calibray.materials import FIELDS
 
 Pieces = tuple[tuple[tuple[slab.Pair, slab.Pair], ...], tuple[tuple[jax.Array, jax.Array], ...]]
-"""Of one group: the two coefficients at every place where one stands, amplitude and XPD at every diffuse one."""
+"""Of one group: the coefficients at every place where one stands, and both amplitudes at every diffuse reflection."""
 
 _FIELD: Final = {name: column for column, name in enumerate(FIELDS)}
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["coefficients", "amplitude", "xpd"], meta_fields=[])
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["coefficients", "straight", "crossed"], meta_fields=[]
+)
 @dataclass(frozen=True)
 class Contributions:
     """All that the fields take from the materials.
 
     Attributes:
         coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [J]; or their tables.
-        amplitude: S sqrt(f_s dOmega) of the diffuse interactions [D].
-        xpd: Their XPD coefficient K_x [D].
+        straight: S sqrt(f_s dOmega (1 - K_x)) of the diffuse interactions, which keep the polarization [D].
+        crossed: S sqrt(f_s dOmega K_x), which turns it [D].
     """
 
     coefficients: tuple[slab.Pair, slab.Pair] | tabulation.Nodes
-    amplitude: jax.Array
-    xpd: jax.Array
+    straight: jax.Array
+    crossed: jax.Array
 
 
 def contributions(program: Program, table: jax.Array) -> Contributions:
@@ -64,13 +66,14 @@ def contributions(program: Program, table: jax.Array) -> Contributions:
     else:
         coefficients = tabulation.nodes(source, table, program.wavelength)
     material, solid_angle, scattered, cosine, specular, backward = program.diffuse
-    rows = table.at[material].get(mode="promise_in_bounds")
-    f_s = pattern_value(rows, material, cosine, scattered, specular, backward, program.patterns)
-    return Contributions(
-        coefficients=coefficients,
-        amplitude=rows[:, _FIELD["scattering_coefficient"]] * slab.safe_sqrt(f_s * solid_angle),
-        xpd=rows[:, _FIELD["xpd_coefficient"]],
+    f_s = pattern_value(table, material, cosine, scattered, specular, backward, program.patterns)
+    density = slab.safe_sqrt(f_s * solid_angle)
+    scattering, xpd = table[:, _FIELD["scattering_coefficient"]], table[:, _FIELD["xpd_coefficient"]]
+    straight, crossed = (
+        (scattering * slab.safe_sqrt(share)).at[material].get(mode="promise_in_bounds") * density
+        for share in (1 - xpd, xpd)
     )
+    return Contributions(coefficients, straight, crossed)
 
 
 def tangents(
@@ -109,7 +112,8 @@ def pieces(program: Program, found: Contributions) -> tuple[Pieces, ...]:
         for letter in group.signature:
             coefficients += [next(given) for _ in range(2 if letter == "d" else 1)]
             if letter == "s":
-                diffuse.append((found.amplitude[row : row + group.size], found.xpd[row : row + group.size]))
+                where = slice(row, row + group.size)
+                diffuse.append((found.straight[where], found.crossed[where]))
                 row += group.size
         cut.append((tuple(coefficients), tuple(diffuse)))
     return tuple(cut)

@@ -90,6 +90,19 @@ def program_path_loss(
     return decibel(_power(program, pieces(program, found), combining, offsets))
 
 
+def path_powers(program: Program, table: jax.Array) -> jax.Array:
+    """Power gain of every path, summed over receive ports and averaged over transmit ports.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+
+    Returns:
+        Power gains in the order of the program [P].
+    """
+    return _path_powers(program, _pieces(program, _contributions(program, table)))
+
+
 def path_losses(
     program: Program, tables: jax.Array, combining: str = "power", offsets: jax.Array | None = None
 ) -> tuple[jax.Array, float]:
@@ -218,6 +231,7 @@ _many_tangents = jax.jit(
     static_argnums=2,
 )
 _gains = jax.jit(lambda program, found: path_fields(program, pieces(program, found)))
+_path_powers = jax.jit(lambda program, found: path_power(path_fields(program, found)))
 _link_power_of_pieces = jax.jit(_power, static_argnums=2)
 _power_and_slope = jax.jit(_slope, static_argnums=2)
 _decibel_slope = jax.jit(_contract, static_argnums=4)

@@ -38,8 +38,8 @@ class Group:
     """Paths with the same sequence of interactions: n paths of depth k, T transmit and R receive ports.
 
     Attributes:
-        tx: Transmit field, real and imaginary part [2, T, 2, n].
-        rx: Receive field times A lambda / 4 pi, real and imaginary part [2, R, 2, n].
+        tx: Transmit field, real and imaginary part [2, T, 2, n]; the real part alone if all are real [1, T, 2, n].
+        rx: Receive field times A lambda / 4 pi, likewise [2 or 1, R, 2, n].
         rotation: (cos, sin) into the frame of each interaction [k, 2, n].
         turn: Per position (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
         wedge: Per position the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
@@ -319,14 +319,21 @@ def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type
         wedge.append(None if form is None else _parts(form, dtype))
     scale = paths.spreading[index] * speed_of_light / paths.frequency / (4 * np.pi)
     return Group(
-        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype),
-        rx=_parts(np.moveaxis(paths.rx_field[index] * scale[:, None, None], 0, -1), dtype),
+        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype)[: _parts_needed(paths.tx_field)],
+        rx=_parts(np.moveaxis(paths.rx_field[index] * scale[:, None, None], 0, -1), dtype)[
+            : _parts_needed(paths.rx_field)
+        ],
         rotation=jnp.asarray(np.moveaxis(paths.rotation[at], -1, 1).astype(dtype)),
         turn=tuple(turn),
         wedge=tuple(wedge),
         signature="".join(_LETTER[Kind(kind)] for kind in kinds),
         size=len(index),
     )
+
+
+def _parts_needed(field: np.ndarray) -> int:
+    """1 where every field is real, as those of linearly polarized antennas mostly are, else 2."""
+    return 2 if field.imag.any() else 1
 
 
 def _parts(value: np.ndarray, dtype: type) -> jax.Array:

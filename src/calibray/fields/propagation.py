@@ -41,7 +41,7 @@ def path_fields(
 
 def _group_gains(group: Group, pieces: Pieces, keep: Callable[[Fields], Fields]) -> slab.Pair:
     """Gains of one group's paths, (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, real and imaginary part [R, T, n]."""
-    te, tm = (group.tx[0, :, 0], group.tx[1, :, 0]), (group.tx[0, :, 1], group.tx[1, :, 1])  # [T, n]
+    te, tm = (_complex(group.tx, component) for component in range(2))  # [T, n]
     coefficients, diffuse = (iter(part) for part in pieces)
     for step, letter in enumerate(group.signature):
         te, tm = _turn(group.rotation[step], te, tm)
@@ -55,10 +55,16 @@ def _group_gains(group: Group, pieces: Pieces, keep: Callable[[Fields], Fields])
         te, tm = keep((te, tm))
     real = imaginary = 0.0
     for component, field in enumerate((te, tm)):  # E_rx^H E
-        rx_real, rx_imaginary = group.rx[:, :, component][:, :, None, :]  # [R, 1, n]
+        rx_real, rx_imaginary = (part[:, None] for part in _complex(group.rx, component))  # [R, 1, n]
         real = real + rx_real * field[0] + rx_imaginary * field[1]
         imaginary = imaginary + rx_real * field[1] - rx_imaginary * field[0]
     return real, imaginary
+
+
+def _complex(field: jax.Array, component: int) -> slab.Pair:
+    """One component of an antenna's field [ports, n], whose imaginary part is not stored where there is none."""
+    real = field[0, :, component]
+    return real, field[1, :, component] if field.shape[0] == 2 else jnp.zeros_like(real)
 
 
 def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
@@ -74,18 +80,17 @@ def _scatter(
     tm: slab.Pair,
     r_te: slab.Pair,
     r_tm: slab.Pair,
-    amplitude: jax.Array,
-    xpd: jax.Array,
+    straight: jax.Array,
+    crossed: jax.Array,
     turn: jax.Array,
     keep: Callable,
 ) -> tuple[slab.Pair, slab.Pair]:
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
     incident = slab.power(te) + slab.power(tm)
     reflected = slab.power(r_te) * slab.power(te) + slab.power(r_tm) * slab.power(tm)
-    ratio = keep(reflected / jnp.where(incident > 0, incident, 1.0))
-    strength = keep(amplitude * slab.safe_sqrt(ratio))  # Gamma = |R E| / |E|
+    ratio = keep(slab.safe_sqrt(reflected / jnp.where(incident > 0, incident, 1.0)))  # Gamma = |R E| / |E|
     theta, phi = _turn(turn, te, tm)  # the XPD matrix acts in the basis (theta, phi)
-    straight, crossed = strength * slab.safe_sqrt(1 - xpd), strength * slab.safe_sqrt(xpd)
+    straight, crossed = straight * ratio, crossed * ratio
     return (
         (straight * theta[0] - crossed * phi[0], straight * theta[1] - crossed * phi[1]),
         (crossed * theta[0] + straight * phi[0], crossed * theta[1] + straight * phi[1]),

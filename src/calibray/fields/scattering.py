@@ -14,7 +14,7 @@ LARGEST_EXPONENT = 64
 
 
 def pattern_value(
-    row: jax.Array,
+    table: jax.Array,
     material: jax.Array,
     cosine: jax.Array,
     scattered: jax.Array,
@@ -25,8 +25,8 @@ def pattern_value(
     """Density f_s of the diffusely reflected power over directions.
 
     Args:
-        row: Constants of every interaction's material [n, 8].
-        material: Its index [n].
+        table: Material constants [M, 8].
+        material: Material of every interaction [n].
         cosine: Cosine of the angle of incidence [n].
         scattered: Cosine between scattered direction and normal [n].
         specular: Cosine between scattered and specular direction [n].
@@ -39,7 +39,9 @@ def pattern_value(
     lambertian = scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):
         return lambertian
-    alpha_r, alpha_i, share = (row[:, FIELDS.index(name)] for name in ("alpha_r", "alpha_i", "lambda_"))
+    alpha_r, alpha_i, share = (
+        table[:, FIELDS.index(name)][material] for name in ("alpha_r", "alpha_i", "lambda_")
+    )
     directive = jnp.asarray(np.array([pattern == "directive" for pattern in patterns]))[material]
     share, alpha_i = jnp.where(directive, 1.0, share), jnp.where(directive, 1.0, alpha_i)
     lobes = share * (0.5 * (1 + specular)) ** alpha_r + (1 - share) * (0.5 * (1 + backward)) ** alpha_i

@@ -1,0 +1,200 @@
+"""Compressed programs: few weighted paths in place of tens of thousands, within a stated error of path loss.
+
+The power of a link is a sum over its paths, P(x) = sum_p p_p(x), of functions of the candidate x. Within the bounds of
+a few parameters these functions span a space of few dimensions, so that a few of them with weights w >= 0 suffice:
+sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added greedily as
+long as the fit is not good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
+Weights are non-negative and paths are physical ones, so a compressed link behaves as a link between the training
+candidates too. That is not taken on trust: the error is measured at fresh candidates, many on the faces of the bounds,
+and a link that misses half the tolerance is fitted again to more candidates, or keeps all its paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Final
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import nnls
+from scipy.stats import qmc
+
+from calibray.errors import InputError
+from calibray.fields import layout, path_powers
+from calibray.parameters import Parameters
+from calibray.paths import Paths, take
+
+TOLERANCE_DB: Final = 0.01
+FEW: Final = 64  # paths of a link that are not worth compressing
+FITTED: Final = 0.1  # share of the tolerance that the fit itself may use up
+TRAINING: Final = (
+    16  # candidates per parameter, and as many more, beside the corners, on which the first fit rests
+)
+CORNERS: Final = 5  # parameters of which all corners are fitted to; further ones lie in the middle
+CHECKED: Final = 48  # fresh candidates of every check
+PASSED: Final = 0.5  # share of the tolerance that a check must stay within
+ROUNDS: Final = 6  # fits of a link before it keeps all its paths
+POOL: Final = 2000  # strongest paths of a link that are candidates to be kept, and as many others
+BLOCK: Final = 400_000_000  # powers, paths times candidates, held at once
+TABLE_INTERVALS: Final = 4096
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """A compressed program.
+
+    Attributes:
+        paths: The program, over the same links. The weights are in the spreading of its paths, so that it is good for
+            the sum of powers only, not for delays or sums of fields.
+        error_db: Largest difference of path loss from the full program at the candidates checked [L], [dB].
+        candidates: Candidates that every compressed link was checked at, none of which its weights were fitted to.
+    """
+
+    paths: Paths
+    error_db: np.ndarray
+    candidates: int
+
+
+def compress(
+    paths: Paths,
+    parameters: Parameters,
+    tolerance_db: float = TOLERANCE_DB,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Compressed:
+    """Compress a program for some parameters within their bounds, for path loss by the sum of powers.
+
+    Args:
+        paths: The path program.
+        parameters: What will vary, and between which bounds.
+        tolerance_db: Largest error of a link's path loss [dB].
+        seed: Seed of the candidates.
+        progress: Called with (links done, links in all).
+
+    Returns:
+        The compressed program and its error.
+
+    Raises:
+        InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
+    """
+    if not (np.isfinite(tolerance_db) and tolerance_db > 0):
+        raise InputError(f"tolerance_db = {tolerance_db}: must be a positive number of dB")
+    candidates = _candidates(parameters, seed)
+    weight, error = np.ones(paths.num_paths), np.zeros(paths.num_links)
+    ends = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
+    for links in _blocks(np.diff(ends), sum(len(some) for some in candidates)):
+        start, stop = ends[links[0]], ends[links[-1] + 1]
+        powers = _Powers(take(paths, np.arange(start, stop)), parameters, candidates)
+        for link in links:
+            where = slice(ends[link] - start, ends[link + 1] - start)
+            if where.stop - where.start > FEW:
+                fitted = _fit_link(powers, where, tolerance_db, seed)
+                if fitted is not None:
+                    weight[ends[link] : ends[link + 1]], error[link] = fitted
+            if progress is not None:
+                progress(link + 1, paths.num_links)
+    kept = np.flatnonzero(weight > 0)
+    few = take(paths, kept)
+    few = replace(
+        few,
+        spreading=few.spreading * np.sqrt(weight[kept]),
+        settings={**few.settings, "compressed_db": tolerance_db},
+    )
+    return Compressed(few, error, CHECKED)
+
+
+def _candidates(parameters: Parameters, seed: int) -> list[np.ndarray]:
+    """Candidates to fit to, corners of the bounds among them, then those of every check [n, d], in the fields' units.
+
+    What is fitted fails first where it extrapolates, so half of the candidates to check at lie on faces of the bounds.
+    """
+    d, random = len(parameters), np.random.default_rng(seed)
+    corners = np.full((2 ** min(d, CORNERS), d), 0.5)
+    corners[:, :CORNERS] = list(product([0.0, 1.0], repeat=min(d, CORNERS)))
+    sets = [np.vstack([corners, qmc.LatinHypercube(d, rng=random).random(TRAINING * (d + 1))])]
+    for _ in range(ROUNDS):
+        unit = qmc.LatinHypercube(d, rng=random).random(CHECKED)
+        on_face = random.random(unit.shape) < 0.5
+        on_face[: CHECKED // 2] = False
+        sets.append(np.where(on_face, unit.round(), unit))
+    return [parameters.from_unit(unit) for unit in sets]
+
+
+def _blocks(size: np.ndarray, candidates: int) -> list[np.ndarray]:
+    """Consecutive links whose paths' powers fit into memory together."""
+    block = np.cumsum(size) * candidates // BLOCK
+    return np.split(np.arange(len(size)), np.flatnonzero(np.diff(block)) + 1)
+
+
+class _Powers:
+    """Powers of some paths at sets of candidates, each computed when it is first asked for."""
+
+    def __init__(self, paths: Paths, parameters: Parameters, candidates: list[np.ndarray]) -> None:
+        plan = layout(paths, np.float32, TABLE_INTERVALS, phases=False)
+        self._program, self._place = plan.program, np.argsort(plan.order)
+        self._tables = [parameters.constants(some, paths.materials) for some in candidates]
+        self._known: dict[int, np.ndarray] = {}
+
+    def at(self, which: int, where: slice) -> np.ndarray:
+        """Powers of some of the paths at one set of candidates [n, paths]."""
+        if which not in self._known:
+            tables = jnp.asarray(self._tables[which].astype(np.float32))
+            self._known[which] = np.stack([np.asarray(path_powers(self._program, table)) for table in tables])
+        return self._known[which][:, self._place[where]].astype(float)
+
+
+def _fit_link(
+    powers: _Powers, where: slice, tolerance_db: float, seed: int
+) -> tuple[np.ndarray, float] | None:
+    """Weights of a link's paths, and the largest error at fresh candidates; None if the tolerance is not met."""
+    train = _lit(powers.at(0, where))
+    strongest = np.argsort(-train.sum(axis=0), kind="stable")
+    others = np.random.default_rng(seed).permutation(strongest[POOL:])
+    pool = np.concatenate([strongest[:POOL], others[:POOL]])
+    for turn in range(ROUNDS):
+        total = train.sum(axis=1, keepdims=True)
+        weight = np.zeros(train.shape[1])
+        weight[pool] = sparse_weights(train[:, pool] / total, FITTED * tolerance_db * np.log(10) / 10)
+        fresh = _lit(powers.at(turn + 1, where))
+        error = float(np.abs(10 * np.log10(fresh @ weight / fresh.sum(axis=1))).max(initial=0.0))
+        if error <= PASSED * tolerance_db:
+            return weight, error
+        train = np.vstack([train, fresh])
+    return None
+
+
+def _lit(power: np.ndarray) -> np.ndarray:
+    """The candidates that leave a link some power; at the others, as where nothing scatters, weights cannot err."""
+    return power[power.sum(axis=1) > 0]
+
+
+def sparse_weights(share: np.ndarray, bound: float) -> np.ndarray:
+    """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
+
+    Args:
+        share: A path's share of the link's power at every candidate [n, P].
+        bound: Largest residual of a row.
+
+    Returns:
+        The weights [P], most of them 0; the bound is missed where non-negative weights cannot meet it.
+    """
+    size = np.linalg.norm(share, axis=0)
+    unit = share / np.where(size > 0, size, 1.0)
+    chosen, weight, rest = np.zeros(0, dtype=int), np.zeros(0), np.ones(len(share))
+    for _ in range(share.shape[1]):
+        gain = rest @ unit
+        gain[chosen] = 0.0
+        best = np.argmax(gain)
+        if np.abs(rest).max() <= bound or gain[best] <= 0:
+            break
+        chosen = np.append(chosen, best)
+        weight, _ = nnls(unit[:, chosen], np.ones(len(share)))
+        rest = 1 - unit[:, chosen] @ weight
+        chosen, weight = chosen[weight > 0], weight[weight > 0]
+    found = np.zeros(share.shape[1])
+    found[chosen] = weight / size[chosen]
+    return found
