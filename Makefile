@@ -22,6 +22,8 @@ lint: $(VENV)/.lint
 
 bench: setup
 	$(BIN)/python benchmarks/replay.py
+	$(BIN)/python benchmarks/interactions.py
+	$(BIN)/python benchmarks/diffuse.py
 
 docs: setup
 	$(BIN)/python tools/check_docs.py

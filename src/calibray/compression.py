@@ -155,10 +155,12 @@ def _fit_link(
     strongest = np.argsort(-train.sum(axis=0), kind="stable")
     others = np.random.default_rng(seed).permutation(strongest[POOL:])
     pool = np.concatenate([strongest[:POOL], others[:POOL]])
+    weight = np.zeros(train.shape[1])
     for turn in range(ROUNDS):
         total = train.sum(axis=1, keepdims=True)
-        weight = np.zeros(train.shape[1])
-        weight[pool] = sparse_weights(train[:, pool] / total, FITTED * tolerance_db * np.log(10) / 10)
+        weight[pool] = sparse_weights(
+            train[:, pool] / total, FITTED * tolerance_db * np.log(10) / 10, np.flatnonzero(weight[pool])
+        )
         fresh = _lit(powers.at(turn + 1, where))
         error = float(np.abs(10 * np.log10(fresh @ weight / fresh.sum(axis=1))).max(initial=0.0))
         if error <= PASSED * tolerance_db:
@@ -172,29 +174,33 @@ def _lit(power: np.ndarray) -> np.ndarray:
     return power[power.sum(axis=1) > 0]
 
 
-def sparse_weights(share: np.ndarray, bound: float) -> np.ndarray:
+def sparse_weights(share: np.ndarray, bound: float, first: np.ndarray | None = None) -> np.ndarray:
     """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
 
     Args:
         share: A path's share of the link's power at every candidate [n, P].
         bound: Largest residual of a row.
+        first: Paths to begin with; none if None.
 
     Returns:
         The weights [P], most of them 0; the bound is missed where non-negative weights cannot meet it.
     """
     size = np.linalg.norm(share, axis=0)
     unit = share / np.where(size > 0, size, 1.0)
-    chosen, weight, rest = np.zeros(0, dtype=int), np.zeros(0), np.ones(len(share))
+    chosen, one = np.zeros(0, dtype=int) if first is None else first, np.ones(len(share))
+    weight = np.zeros(len(chosen))
     for _ in range(share.shape[1]):
+        if len(chosen):
+            weight, _ = nnls(unit[:, chosen], one)
+        chosen, weight = chosen[weight > 0], weight[weight > 0]
+        rest = one - unit[:, chosen] @ weight
         gain = rest @ unit
         gain[chosen] = 0.0
         best = np.argmax(gain)
         if np.abs(rest).max() <= bound or gain[best] <= 0:
             break
         chosen = np.append(chosen, best)
-        weight, _ = nnls(unit[:, chosen], np.ones(len(share)))
-        rest = 1 - unit[:, chosen] @ weight
-        chosen, weight = chosen[weight > 0], weight[weight > 0]
+    weight = nnls(unit[:, chosen], one)[0] if len(weight) < len(chosen) else weight
     found = np.zeros(share.shape[1])
     found[chosen] = weight / size[chosen]
     return found
