@@ -6,6 +6,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import planted
+import programs
 from calibray import terminal
 from calibray.cli import app
 from calibray.paths import Paths
@@ -48,7 +50,13 @@ def folder(tmp_path_factory):
         holdout={"where": "rx_x > 20"},
         method={"name": "auto", "seed": 3},
     )
-    sections = study.content()
+    write_study(folder, study.content())
+    return folder
+
+
+def write_study(folder: Path, content: dict) -> None:
+    """Write a study's content as a TOML file."""
+    sections = dict(content)
     parameters = sections.pop("parameters")
     lines = ["version = 1"]
     for name, section in sections.items():
@@ -56,7 +64,6 @@ def folder(tmp_path_factory):
             lines += [f"[{name}]", *(f"{key} = {toml(value)}" for key, value in section.items())]
     lines += ["[parameters]", *(f'"{key}" = {toml(value)}' for key, value in parameters.items())]
     (folder / "study.toml").write_text("\n".join(lines))
-    return folder
 
 
 def toml(value: object) -> str:
@@ -105,6 +112,31 @@ def test_run_prints_what_it_found(folder, ran):
 def test_output_is_plain_text(ran):
     assert "\x1b" not in ran.stdout + ran.stderr
     assert [line for line in ran.stdout.splitlines() if line != line.rstrip()] == []
+
+
+def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeypatch):
+    """The program is all that is asked; every call is in the ledger, and started again the run asks nothing."""
+    write_study(
+        tmp_path, programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 18}}}
+    )
+
+    def refuse(*_: object) -> None:
+        pytest.fail("the ray tracer was loaded")
+
+    monkeypatch.setattr("calibray.engines.assembly.Tracer", refuse)
+    arguments = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", "2")
+    first = calibray(*arguments)
+    assert first.exit_code == 0, first.output
+    assert "RT calls" in first.stdout
+    assert len(programs.calls(tmp_path)) == 19  # with the values before calibration
+    parameters = Result.load(tmp_path / "out").parameters
+    assert list(parameters.values()) == pytest.approx(programs.TRUTH, abs=0.5)
+    assert calibray(*arguments).exit_code == 0
+    assert len(programs.calls(tmp_path)) == 19
+    assert Result.load(tmp_path / "out").parameters == parameters
+    listed = calibray("ledger", tmp_path / "out")
+    assert listed.exit_code == 0
+    assert "19" in listed.stdout
 
 
 def test_run_prints_json_on_demand_and_takes_method_and_seed(folder):

@@ -201,6 +201,26 @@ def test_a_run_completes_in_spite_of_failures(tmp_path):
     assert result.rmse_db < result.initial_rmse_db
 
 
+def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
+    """It answers 8 calls and then never again; mended, it goes on from there."""
+    content = programs.content(tmp_path, "if earlier > 8: sys.exit('the licence ran out')", give_up_after=4)
+    study = Study.from_content(content | {"method": SMALL}, tmp_path / "study.toml")
+    out = tmp_path / "out"
+    with pytest.raises(
+        EngineError, match=r"the licence ran out.*so did the 3 calls before it.*--forget-failed"
+    ):
+        calibrate(study, out=out)
+    assert len(programs.calls(tmp_path)) == 12
+    with closing(Ledger(out / engines.LEDGER_FILE)) as ledger:
+        assert (ledger.table().status == "failed").sum() == 4
+        assert ledger.forget_failures() == 4
+    programs.content(tmp_path)  # mended
+    result = calibrate(study, out=out)
+    assert result.ledger_hits == 8 - 1  # the first was the loop's own
+    undisturbed = calibrate(study, out=tmp_path / "other")
+    assert result.parameters == undisturbed.parameters
+
+
 def test_auto_is_the_vector_surrogate(tmp_path):
     """Eighteen calls bring it near the planted materials; the ledger shows that the named method asks for the same."""
     content = programs.content(tmp_path)

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from calibray import engines
 from calibray.engines import Differentiable, Engine, Recorded
@@ -211,21 +212,23 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
     derivatives = "jacobian" in optimizer.uses and isinstance(engine, Differentiable)
     started, iteration, calls, hits = time.perf_counter(), 0, engine.calls, _hits(engine)
-    while not optimizer.done:
-        points = optimizer.ask()
-        candidates = from_search(parameters, points)
-        iteration += 1
-        if derivatives:
-            loss, slope = engine.path_loss_and_jacobian(candidates)
-            jacobian = objective.jacobian(loss, slope * search_slope(parameters, candidates)[:, None, :])
-        else:
-            loss, jacobian = engine.path_loss(candidates), None
-        residuals = objective.residuals(loss)
-        rmse = objective.rmse(loss)
-        optimizer.tell(points, rmse, residuals=residuals, jacobian=jacobian)
-        run.add(candidates, loss, rmse, iteration, time.perf_counter() - started)
-        if progress is not None:
-            progress("calibrating", len(run.rmse_db), optimizer.budget)
+    # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
+    with threadpool_limits(1, user_api="blas"):
+        while not optimizer.done:
+            points = optimizer.ask()
+            candidates = from_search(parameters, points)
+            iteration += 1
+            if derivatives:
+                loss, slope = engine.path_loss_and_jacobian(candidates)
+                jacobian = objective.jacobian(loss, slope * search_slope(parameters, candidates)[:, None, :])
+            else:
+                loss, jacobian = engine.path_loss(candidates), None
+            residuals = objective.residuals(loss)
+            rmse = objective.rmse(loss)
+            optimizer.tell(points, rmse, residuals=residuals, jacobian=jacobian)
+            run.add(candidates, loss, rmse, iteration, time.perf_counter() - started)
+            if progress is not None:
+                progress("calibrating", len(run.rmse_db), optimizer.budget)
     run.ledger_hits = _hits(engine) - hits
     # What the ledger answered was paid for before, so that a run ends alike however often it was started again.
     run.rt_calls = engine.calls - calls + run.ledger_hits

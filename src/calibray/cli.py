@@ -154,11 +154,14 @@ def run(
     from calibray.engines import make_tracer, open_executor
     from calibray.result import FILES
     from calibray.study import Study
+    from calibray.terminal import Enclosed
 
     study = Study.load(study_file).replace(engine=engine)
     with open_executor(workers, scheduler) as executor, terminal.progress_bars(log) as progress:
         result = calibrate(study, method, seed, out, executor=executor, progress=progress)
-    enclosed = _enclosed(make_tracer(study), study.measurements())
+    # What an external program makes of the scene is its own affair.
+    external = study.engine.name == "command"
+    enclosed = Enclosed() if external else _enclosed(make_tracer(study), study.measurements())
     if as_json:
         typer.echo(json.dumps(result.content() | {"links": terminal.summary(result, enclosed)}, indent=2))
     else:

@@ -41,9 +41,9 @@ class Enclosed:
         indoors: Whether most are, as they are in a building's inside; then none is suspect.
     """
 
-    tx: tuple[int, ...]
-    rx: tuple[int, ...]
-    indoors: bool
+    tx: tuple[int, ...] = ()
+    rx: tuple[int, ...] = ()
+    indoors: bool = False
 
     @classmethod
     def of(cls, row: np.ndarray, tx: np.ndarray, rx: np.ndarray) -> Enclosed:

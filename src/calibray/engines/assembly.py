@@ -118,6 +118,7 @@ def _command(
         progress,
         source=str(study.path),
         carriers=_carriers(study, links, parameters),
+        give_up_after=section.give_up_after,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from calibray.engines.exchange import Request, Surroundings
 from calibray.engines.program import Outcome, Program
 from calibray.engines.protocol import Answer, Progress, check_candidates, gather
+from calibray.errors import EngineError
 from calibray.materials import Material
 from calibray.parameters import Parameters
 
@@ -20,7 +21,8 @@ class Command:
     """An external program, called once for every candidate.
 
     A call that fails in all its attempts costs that candidate alone: its links count as without a path. If every
-    candidate of the first batch fails, the program is taken to be at fault and the run ends.
+    candidate of the first batch fails, or many fail one after the other, the program is taken to be at fault and the
+    run ends.
 
     Args:
         program: How the program is called.
@@ -32,6 +34,7 @@ class Command:
         source: The study file, for messages.
         carriers: The scene's materials before calibration at each carrier of the links [Hz]; none where all links have
             the study's.
+        give_up_after: Failures one after the other that end the run.
     """
 
     def __init__(
@@ -44,12 +47,14 @@ class Command:
         progress: Progress | None = None,
         source: str = "study",
         carriers: Mapping[float, Mapping[str, Material]] | None = None,
+        give_up_after: int = 10,
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
         self.num_links = len(surroundings.tx)
         self._program, self._surroundings = program, surroundings
         self._executor, self._progress, self._source = executor, progress, source
         self._carriers = carriers or {}
+        self._failed, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         """Path loss of every link for candidates, as the program answers.
@@ -62,7 +67,7 @@ class Command:
 
         Raises:
             InputError: The candidates have another width, or a value is outside physics.
-            EngineError: Every candidate of the first batch failed.
+            EngineError: Every candidate of the first batch failed, or too many did one after the other.
         """
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
@@ -79,6 +84,7 @@ class Command:
 
         Raises:
             InputError: A value is outside physics.
+            EngineError: Too many calls failed one after the other; all answers were given before.
         """
         requests = [self._request(candidate) for candidate in candidates]
         if self._executor is None:
@@ -91,6 +97,13 @@ class Command:
                 self._progress(done, len(requests))
             failure = self._place(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure)
+            self._failed = self._failed + 1 if failure else 0
+            if self._failed >= self._give_up_after:
+                raise EngineError(
+                    f"{failure}; so did the {self._failed - 1} calls before it. What was answered is in the ledger: "
+                    "mend the program, take the failures out with `calibray ledger DIR --forget-failed`, and start "
+                    "again"
+                )
 
     def _in_parallel(self, requests: list[Request]) -> Iterator[tuple[int, Outcome]]:
         # An event reaches threads only; programs on other machines run on until their time is up.

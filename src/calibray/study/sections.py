@@ -235,6 +235,7 @@ class EngineSection(Section):
         timeout: Time that one attempt of the program may take [s].
         retries: How often the program is tried again after a failure.
         format: Format of the files exchanged with the program: "json" or "hdf5".
+        give_up_after: Failed calls one after the other that end the run.
         compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
     """
 
@@ -243,6 +244,7 @@ class EngineSection(Section):
     timeout: Annotated[float, Field(gt=0)] = 3600.0
     retries: Annotated[int, Field(ge=0)] = 2
     format: Literal["json", "hdf5"] = "json"
+    give_up_after: Annotated[int, Field(ge=1)] = 10
     compress_db: Annotated[float, Field(gt=0)] | None = None
 
     @field_validator("command")
