@@ -1,12 +1,16 @@
 """Channel statistics against closed forms on synthetic paths of known powers."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibray.channel import channel_statistics, power_delay_profile
+import synthetic
+from calibray.channel import channel_statistics, delay_profile, power_delay_profile, statistics
 from calibray.errors import InputError
-from calibray.fields import path_loss
-from calibray.paths import Paths
+from calibray.fields import constants, layout, path_loss, path_powers
+from calibray.materials import FIELDS
+from calibray.paths import Kind, Paths
 
 
 def direct_paths(link, amplitude, delay, azimuth, links=None):
@@ -66,3 +70,27 @@ def test_power_delay_profile_adds_up_to_the_path_gain_and_keeps_the_bins():
     np.testing.assert_allclose(-10 * np.log10(profile.sum(axis=1)), path_loss(paths), rtol=1e-12)
     with pytest.raises(InputError, match="increasing"):
         power_delay_profile(paths, np.array([1e-6, 0.0]))
+
+
+@pytest.mark.parametrize("field", ["relative_permittivity", "scattering_coefficient"])
+def test_derivatives_equal_central_differences(field):
+    paths = synthetic.program(
+        [(), (Kind.SPECULAR,), (Kind.DIFFUSE,), (Kind.SPECULAR, Kind.DIFFUSE)] * 5, seed=4
+    )
+    plan, table = layout(paths), constants(paths)
+    azimuth = [jnp.asarray(angle[plan.order, 1]) for angle in (paths.departure, paths.arrival)]
+    edges = jnp.asarray(np.quantile(paths.delay, [0, 0.3, 0.7, 1]))
+    where = (0, FIELDS.index(field))
+
+    def numbers(value: jax.Array) -> jax.Array:
+        power = path_powers(plan.program, jnp.asarray(table).at[where].set(value))
+        found = statistics(plan.program, power, *azimuth)
+        spread = 1e9 * found.delay_spread  # [ns]
+        profile = 1e9 * delay_profile(plan.program, power, edges)
+        return jnp.concatenate([spread, found.k_factor_db, found.arrival_spread, profile.ravel()])
+
+    at, step = table[where], 1e-4
+    slope = np.asarray(jax.jacfwd(numbers)(at))
+    expected = np.asarray(numbers(at + step) - numbers(at - step)) / (2 * step)
+    assert (np.abs(slope) > 0).sum() >= 8
+    np.testing.assert_allclose(slope, expected, rtol=1e-5, atol=1e-8 * np.abs(expected).max())

@@ -1,7 +1,7 @@
 """What else stored paths tell about a link, for any materials: delays, angles and power delay profiles.
 
 All are weighted means over a link's paths with the paths' powers as weights, so they follow the materials as smoothly
-as path loss does and are differentiable by them.
+as path loss does. `statistics` and `delay_profile` are pure JAX, differentiable through `calibray.fields.path_powers`.
 """
 
 from __future__ import annotations
@@ -132,8 +132,24 @@ def power_delay_profile(
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
     program = fields.layout(paths).program
-    power = np.asarray(path_powers(program, jnp.asarray(fields.constants(paths, materials))))
-    place = np.searchsorted(edges, np.asarray(program.delay), side="right") - 1
-    inside = (place >= 0) & (place < len(edges) - 1)
-    bins = np.asarray(program.link)[inside] * (len(edges) - 1) + place[inside]
-    return np.bincount(bins, power[inside], paths.num_links * (len(edges) - 1)).reshape(paths.num_links, -1)
+    power = path_powers(program, jnp.asarray(fields.constants(paths, materials)))
+    return np.asarray(delay_profile(program, power, jnp.asarray(edges)))
+
+
+def delay_profile(program: Program, power: jax.Array, edges: jax.Array) -> jax.Array:
+    """Power of every link by delay, from its paths' powers.
+
+    Args:
+        program: The program.
+        power: Power gain of every path [P].
+        edges: Edges of the delay bins, increasing [n + 1], [s].
+
+    Returns:
+        Power gains [L, n].
+    """
+    bins = edges.shape[0] - 1
+    place = jnp.searchsorted(edges, program.delay, side="right") - 1
+    inside = (place >= 0) & (place < bins)
+    target = jnp.where(inside, program.link * bins + place, 0)
+    total = jax.ops.segment_sum(jnp.where(inside, power, 0.0), target, program.num_links * bins)
+    return total.reshape(program.num_links, bins)
