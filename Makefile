@@ -14,7 +14,7 @@ demo: setup
 	$(BIN)/calibray demo
 
 test: setup
-	$(BIN)/python -m pytest --doctest-modules src tests
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --doctest-modules src tests
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
