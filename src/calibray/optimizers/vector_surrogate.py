@@ -4,22 +4,23 @@ The objective is a sum over links, and an evaluation that answers with every lin
 than their sum. Residuals are smoother than the objective formed from them, and tens of them share one
 dependence on the parameters (see `kriging.py` for the model).
 
-A run begins with a maximin Latin hypercube. Then two steps take turns on a model refitted after every batch:
+A run begins with a maximin Latin hypercube. Then three steps take turns on a model refitted after every batch:
 
+- *exploration*: the point of the largest expected improvement of the mean square of the residuals, over
+  draws from the model: R. Astudillo, P. Frazier, ICML 2019. A normal distribution of the mean square
+  in its place (D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) gives weight to
+  values below the least that is possible, and wastes the step on the emptiest corner of many dimensions;
 - *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by
   many local searches with the model's exact derivatives;
-- *exploration*: the point of the largest expected improvement of the mean square Q. With prediction r, prior
-  covariance V of the residuals and the model's share of it s^2, which grows with the distance from evaluated
-  points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. For a normal
-  distribution the improvement follows in closed form: D. R. Jones, M. Schonlau, W. J. Welch, J. Global
-  Optim. 13 (1998) 455, eq. 15; of a composite objective: R. Astudillo, P. Frazier, ICML 2019. Errors of
-  different links are correlated, and taking them for independent stops exploration too soon.
+- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that
+  polishing one basin does not keep the search from the next.
 
-Input scales are learned anew when the points have grown in number by a tenth; in between the model only takes
-new points, which saves most of the time. Tried and not kept, for no clear gain in worst runs: two steps of
-exploitation for one of exploration, and exploring around the best points in two coordinates at a time.
-`logarithmic` for permittivities helped in districts of reflections and hurt on a floor of walls that waves pass
-through, so it is no default.
+Input scales are learned anew at every step until there are `OFTEN` points, and then whenever these have grown in
+number by a tenth; in between the model only takes new points, which saves most of the time. Tried and not kept,
+on analytic and traced districts: a square root or a logarithm of permittivities (`logarithmic` helped with
+reflections and hurt with walls that waves pass through), a Matern kernel of smoothness 7/2, local searches begun
+from the best of hundreds of predictions, and steps from the best points shortened as uncertainty grows (a trust
+region: what remains of the excess is other minima, not unfinished descents).
 
 In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
@@ -32,7 +33,7 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
-from scipy.stats import norm, spearmanr
+from scipy.stats import spearmanr
 
 from calibray.errors import InputError
 from calibray.optimizers.archive import Archive, merged
@@ -45,9 +46,12 @@ from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 600  # drawn over the box, and as many around the best points
-REFIT = 1.1  # growth of the number of points after which input scales are learned anew
+DRAWS = 256  # of the residuals, for the expected improvement
+OFTEN = 80  # points up to which input scales are learned anew at every step
+REFIT = 1.1  # growth of the number of points after which they are beyond
 SEARCHES = 16  # local searches on the model
 SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
+UNCERTAIN = 1e-3  # of the prior variance: where a predicted minimum counts as another basin
 PATIENCE = 4  # batches in a row that promise too little before the search stops
 
 
@@ -153,7 +157,7 @@ class VectorSurrogate(Optimizer):
         if self._model is None:
             self._learned = len(points)
             return fit(points, residuals, noisy=self.noisy)
-        if len(points) >= REFIT * self._learned:
+        if len(points) <= OFTEN or len(points) >= REFIT * self._learned:
             self._learned = len(points)
             return fit(points, residuals, noisy=self.noisy, guess=self._model.hyper)
         return solve(points, residuals, self._model.hyper)
@@ -168,23 +172,35 @@ class VectorSurrogate(Optimizer):
         chosen, gain = [], 0.0
         for place in range(turn, turn + count):
             fresh = minima[_separation(minima, taken) > SEPARATION]
-            if place % 2 and len(fresh):
-                x = fresh[0]
-                promised = best - float(np.sqrt(np.mean(model.predict(x[None])[0] ** 2)))
+            if place % 3 and len(fresh):
+                mean, share = model.predict(fresh)
+                # argmax of flags is the first uncertain minimum, or the lowest one if all are known well
+                index = 0 if place % 3 == 1 else np.argmax(share > UNCERTAIN)
+                x, promised = fresh[index], best - float(np.sqrt(np.mean(mean[index] ** 2)))
             else:
-                near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
-                reach = 10.0 ** self._rng.uniform(-3.0, -0.5, (CANDIDATES, 1))
-                around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
-                candidates = np.vstack([self._rng.random((CANDIDATES, d)), around, fresh])
-                candidates = candidates[_separation(candidates, taken) > SEPARATION]
-                improvement = expected_improvement(model, candidates, best)
-                x = candidates[np.argmax(improvement)]
-                promised = best - np.sqrt(max(best**2 - improvement.max(), 0.0))
+                x, promised = self._explored(model, taken, fresh, best)
             chosen.append(x)
             gain = max(gain, promised)
             if len(chosen) < count:
                 model, taken = model.with_point(x), np.vstack([taken, x])
         return np.array(chosen), gain
+
+    def _explored(
+        self, model: Kriging, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """The point of the largest expected improvement [d], and the gain it promises."""
+        d = self.box.dimension
+        near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
+        reach = 10.0 ** self._rng.uniform(-3.0, -0.5, (CANDIDATES, 1))
+        around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
+        candidates = np.vstack([self._rng.random((CANDIDATES, d)), around, fresh])
+        candidates = candidates[_separation(candidates, taken) > SEPARATION]
+        normal = self._rng.standard_normal((DRAWS, len(model.root)))
+        improvement = expected_improvement(model, candidates, best, normal)
+        if not improvement.any():  # less likely than one draw in all; so the point nearest to improving
+            centre, spread = mean_square(model, candidates)
+            return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))], 0.0
+        return candidates[np.argmax(improvement)], best - np.sqrt(max(best**2 - improvement.max(), 0.0))
 
     def _seen_by_model(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(self._logarithmic, np.log(np.where(self._logarithmic, x, 1.0)), x)
@@ -200,7 +216,12 @@ class VectorSurrogate(Optimizer):
 
 
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The mean square of the residuals as the model sees it.
+    """The mean square Q of the residuals as the model sees it.
+
+    With prediction r, prior covariance V of the residuals and the model's share s^2 of it, which grows with the
+    distance from evaluated points, Q has mean (r^T r + s^2 tr V) / m and variance
+    (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of different links are correlated: taking them for independent
+    stops exploration too soon.
 
     Args:
         model: The model of the residuals.
@@ -216,21 +237,25 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
     return centre, np.sqrt(4.0 * share * along + 2.0 * share**2 * np.sum((root @ root.T) ** 2)) / links
 
 
-def expected_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """Expected decrease of the mean square of the residuals below the best one.
+def expected_improvement(
+    model: Kriging, x: NDArray[np.float64], best: float, normal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Expected decrease of the mean square of the residuals below the best one, by Monte Carlo.
 
     Args:
         model: The model of the residuals.
         x: Points of the unit cube [k, d].
         best: The best objective so far, the root of its mean square.
+        normal: Standard normal draws [draws, n - 1 - d], one column a row of the model's `root`.
 
     Returns:
-        Expected improvement [k].
+        Expected improvement [k]; 0 where no draw improves.
     """
-    centre, spread = mean_square(model, x)
-    spread = np.maximum(spread, 1e-300)
-    z = np.clip((best**2 - centre) / spread, -1e3, 1e3)
-    return spread * (z * norm.cdf(z) + norm.pdf(z))  # Jones et al. 1998, eq. 15
+    mean, share = model.predict(x)
+    scatter = normal @ model.root  # residuals [draws, m] with the prior covariance
+    along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ scatter.T), np.sum(scatter**2, axis=1)
+    square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across
+    return np.maximum(best**2 - square / mean.shape[1], 0.0).mean(axis=1)
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
