@@ -20,7 +20,7 @@ number by a tenth; in between the model only takes new points, which saves most 
 on analytic and traced districts: a square root or a logarithm of permittivities (`logarithmic` helped with
 reflections and hurt with walls that waves pass through), a Matern kernel of smoothness 7/2, local searches begun
 from the best of hundreds of predictions, and steps from the best points shortened as uncertainty grows (a trust
-region: what remains of the excess is other minima, not unfinished descents).
+region, on eight parameters: most of the excess left is other minima, not unfinished descents).
 
 In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
