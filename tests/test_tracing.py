@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sionna.rt
+from sionna.rt.utils import fibonacci_lattice
 
 import calibray as cb
 from calibray import tracing
 from calibray.errors import EngineError, InputError
 from calibray.fields import path_gains, path_loss
+from calibray.launches import directions
 from calibray.paths import Paths
 from calibray.scene import read_scene
 from calibray.settings import Antenna, TraceSettings
@@ -68,7 +71,7 @@ def test_one_receiver_at_a_time_gives_what_all_at_once_give(
     canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """NVlabs/sionna#1172: a receiver's paths do not depend on which others are traced with it."""
-    monkeypatch.setattr(tracing, "LANES", 1)
+    monkeypatch.setattr(tracing, "LANES", MIXED["samples"] * MIXED["max_depth"])
     trace = canyon.trace(links([-20, 2, 15], receivers))
     assert len(trace.chunks) == len(receivers)
     alone = trace.paths()
@@ -102,13 +105,13 @@ def test_full_buffer_is_traced_again_with_the_same_result(
     assert_same(canyon.trace(links([-20, 2, 15], receivers)).paths(), together)
 
 
-def test_buffer_that_cannot_grow_further_is_an_error(
+def test_paths_that_memory_cannot_hold_are_an_error(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tracing, "BUFFER", 8)
-    monkeypatch.setattr(tracing, "LARGEST_BUFFER", 32)
+    monkeypatch.setattr(tracing, "available", lambda: 32_000)
     with pytest.raises(
-        EngineError, match=r"more than 32 paths to 6 receivers; lower trace\.samples or max_depth"
+        EngineError, match=r"more paths than fit into memory, with 6 receivers at work; lower trace\.samples"
     ):
         canyon.trace(links([-20, 2, 15], receivers))
 
@@ -137,6 +140,69 @@ def test_program_tells_how_it_was_traced(together: Paths) -> None:
     expected = {**TraceSettings(**MIXED).record(), "scene": CANYON, "sionna_rt": sionna.rt.__version__}
     assert together.settings == expected
     assert together.materials["brick"].scattering_coefficient == 0.4
+
+
+# Rays shared out over launches
+
+
+def split(canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch, **settings) -> tuple:
+    """A trace in one launch, and one whose rays are shared out over seven for each receiver."""
+    traces = []
+    for lanes in (10**9, None):
+        tracer = Tracer(
+            canyon.scene, FREQUENCY, TraceSettings(**settings), canyon.tx_antenna, canyon.rx_antenna
+        )
+        monkeypatch.setattr(tracing, "LANES", lanes or -(-settings["samples"] * settings["max_depth"] // 7))
+        traces.append(tracer.trace(links([-20, 2, 15], receivers)))
+    assert [len(trace.chunks) for trace in traces] == [1, 7 * len(receivers)]
+    return traces
+
+
+@pytest.mark.parametrize("kinds", [{}, {"refraction": True}])
+def test_rays_shared_out_over_launches_find_the_same_paths(
+    canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch, kinds: dict
+) -> None:
+    one, shared = split(canyon, receivers[:3], monkeypatch, max_depth=3, samples=100_003, **kinds)
+    paths, pieces = one.paths(), shared.paths()
+    assert paths.num_paths == pieces.num_paths > 20
+    order = [np.lexsort((part.delay, part.link)) for part in (paths, pieces)]
+    np.testing.assert_allclose(pieces.delay[order[1]], paths.delay[order[0]], rtol=1e-6)
+    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=1e-3)
+    np.testing.assert_allclose(
+        np.abs(shared.path_gains()[:, 0, 0]), np.abs(path_gains(pieces)), rtol=1e-3, atol=1e-9
+    )
+
+
+def test_rays_shared_out_over_launches_find_the_same_edges(
+    canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether a ray near an edge is diffracted is drawn at random, so that weak paths may come and go."""
+    edges = {"diffraction": True, "edge_diffraction": True}
+    one, shared = split(canyon, receivers[:3], monkeypatch, max_depth=3, samples=100_003, **edges)
+    paths, pieces = one.paths(), shared.paths()
+    assert pieces.num_paths == pytest.approx(paths.num_paths, rel=0.05)
+    assert len(paths.diffraction.distance) > 100
+    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=0.01)
+
+
+def test_rays_shared_out_over_launches_scatter_as_much(
+    canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each launch's diffuse paths stand for a share of all rays, not of its own."""
+    scatter = {"diffuse_reflection": True, "specular_reflection": False, "line_of_sight": False}
+    one, shared = split(canyon, receivers[:2], monkeypatch, max_depth=1, samples=100_000, **scatter)
+    paths, pieces = one.paths(), shared.paths()
+    assert paths.num_paths > 10_000
+    assert pieces.num_paths == pytest.approx(paths.num_paths, rel=0.05)
+    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=0.2)
+
+
+def test_rays_of_the_launches_are_those_of_one(canyon: Tracer) -> None:
+    for samples in (3, 1000):
+        lattice = np.array(fibonacci_lattice(samples)).reshape(2, -1)
+        ends = [0, samples // 3, samples]
+        shares = np.hstack([directions(a, b - a, samples) for a, b in itertools.pairwise(ends)])
+        np.testing.assert_allclose(shares, lattice, atol=1e-6)
 
 
 # Links without a path, points inside buildings

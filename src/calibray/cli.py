@@ -241,6 +241,8 @@ def trace(
     if out is not None:
         check_file(out)
     links, tracer = study.measurements(), make_tracer(study)
+    if told := terminal.render_plan(tracer.plan(links), len(links)):
+        typer.echo(told, err=True)
     with terminal.progress_bars(log) as progress:
         paths = tracer.trace(links, lambda done, total: progress("tracing", done, total)).paths()
         if out is not None:

@@ -19,15 +19,18 @@ from rich.progress import (
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
 from rich.table import Table
 
 from calibray.calibration import Progress as Report
 from calibray.convergence import Convergence
 from calibray.dispersion import PARAMETER_BOUNDS
+from calibray.launches import Plan
 from calibray.paths import Paths
 from calibray.result import Result
 
+LONG: Final = 20_000_000  # rays x interactions x receivers that take some seconds
 LISTED: Final = 12  # rows named one by one before the rest is only counted
 
 
@@ -102,6 +105,24 @@ def render_result(result: Result, enclosed: Enclosed) -> str:
         _costs(result),
     ]
     return "\n\n".join(section for section in sections if section)
+
+
+def render_plan(plan: Plan, links: int) -> str:
+    """What a long trace will take, in a line; the time that is left is told by the progress bar.
+
+    Args:
+        plan: The launches.
+        links: Number of links.
+
+    Returns:
+        The line; empty if one small launch does it all.
+    """
+    if len(plan.launches) == 1 and plan.lanes <= LONG:
+        return ""
+    return (
+        f"Tracing {links:,} links in {len(plan.launches):,} launches of up to {plan.lanes:,} rays x interactions x "
+        f"receivers; about {plan.memory / 2**30:.1f} GiB of memory, besides that of the scene and the paths found"
+    )
 
 
 def render_paths(paths: Paths, row: np.ndarray, enclosed: Enclosed) -> str:
@@ -201,8 +222,16 @@ def progress_bars(console: Console) -> Iterator[Report]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TextColumn("left:"),
+        TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+    with Progress(
+        *columns,
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+        speed_estimate_period=3600.0,  # [s]; a launch of rays may take longer than Rich looks back by itself
+    ) as bars:
         tasks = {"tracing": bars.add_task("tracing", total=None)}
 
         def report(stage: str, done: int, total: int | None) -> None:

@@ -4,14 +4,16 @@ Sionna's solver is a chain of stages: candidates by shooting and bouncing, exact
 The first two never depend on what is calibrated, so their result is kept (`Trace`) and compiled into a path program.
 The third stage remains at hand as the rival that replay is measured and tested against.
 
-Receivers are traced in chunks: Sionna's path buffer is shared by all receivers of a source, and its memory grows with
-samples x depth x receivers (NVlabs/sionna#1172). A buffer that filled up is traced again, larger.
+Receivers, and rays if need be, are shared out over launches (`calibray.launches`): Sionna's path buffer is shared by
+all receivers of a source, and its memory grows with samples x depth x receivers (NVlabs/sionna#1172). A buffer that
+filled up is traced again, larger.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -29,9 +31,11 @@ from sionna.rt.antenna_pattern import (  # noqa: E402
     antenna_pattern_registry,
     antenna_pattern_to_world_implicit,
 )
+from sionna.rt.path_solvers import sb_deterministic  # noqa: E402
 from sionna.rt.path_solvers.field_calculator import FieldCalculator  # noqa: E402
 from sionna.rt.path_solvers.image_method import ImageMethod  # noqa: E402
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer  # noqa: E402
+from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator  # noqa: E402
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator  # noqa: E402
 from sionna.rt.radio_materials import scattering_pattern_registry  # noqa: E402
 from sionna.rt.scene import load_scene_from_string  # noqa: E402
@@ -40,14 +44,18 @@ from sionna.rt.utils import rotation_matrix  # noqa: E402
 from calibray.errors import EngineError, InputError  # noqa: E402
 from calibray.gain_table import GainTable, read_gain_table  # noqa: E402
 from calibray.geometry import Chains, compile_chains, zenith_azimuth  # noqa: E402
+from calibray.launches import Launch, Plan, directions, paths_that_fit, plan, repeated  # noqa: E402
 from calibray.materials import Material  # noqa: E402
-from calibray.paths import Paths, concatenate  # noqa: E402
+from calibray.memory import available  # noqa: E402
+from calibray.paths import Kind, Paths, concatenate  # noqa: E402
 from calibray.scene import Scene, check_material_name, read_scene  # noqa: E402
 from calibray.settings import Antenna, TraceSettings, as_antenna  # noqa: E402
 
-LANES: Final = 20_000_000  # samples x depth x receivers of one chunk; about 45 bytes each
-BUFFER: Final = 1_000_000  # paths that the buffer of one chunk holds at first
-LARGEST_BUFFER: Final = 64_000_000
+LANES: Final = 20_000_000  # samples x depth x receivers of one launch
+BUFFER: Final = 1_000_000  # paths that the buffer of one launch holds at first
+# Candidates whose hashes meet in Sionna's table pass for one, and the others are lost: with its million entries 16 of
+# 6,030 (100 receivers in Munich, 25 at once), with this many none. A prime: the lowest bits of FNV hashes differ least.
+SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
 FLOATS: Final = (
     "relative_permittivity",
     "conductivity",
@@ -88,7 +96,7 @@ def trace(
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
         materials: Constants in place of the scene's, by material name.
-        progress: Called with (receivers traced, receivers in all) after every chunk.
+        progress: Called with (receivers traced, receivers in all) after every launch.
         **settings: The attributes of `TraceSettings`.
 
     Returns:
@@ -96,7 +104,7 @@ def trace(
 
     Raises:
         InputError: The scene, an antenna, a setting or a position cannot be used.
-        EngineError: There are more paths than the largest buffer holds.
+        EngineError: There are more paths than fit into memory.
     """
     tracer = Tracer(
         scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
@@ -179,25 +187,46 @@ class Tracer:
                 setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
             target.scattering_pattern = _scattering_pattern(material)
 
+    def plan(self, links: Links) -> Plan:
+        """How the links will be traced.
+
+        Args:
+            links: The links.
+
+        Returns:
+            The launches, with an estimate of the memory that they take.
+
+        Raises:
+            InputError: There is no link, a position is not finite, or a link's ends coincide.
+        """
+        return plan(_positions(links)[0], self.settings, LANES, BUFFER)
+
     def trace(self, links: Links, progress: Progress | None = None) -> Trace:
         """Find the paths of every link with the present materials.
 
         Args:
             links: The links.
-            progress: Called with (receivers traced, receivers in all) after every chunk.
+            progress: Called with (receivers traced, receivers in all) after every launch.
 
         Returns:
             The paths in Sionna's buffers.
 
         Raises:
             InputError: There is no link, a position is not finite, or a link's ends coincide.
-            EngineError: There are more paths than the largest buffer holds.
+            EngineError: There are more paths than fit into memory.
         """
         tx, rx = _positions(links)
-        chunks, done = [], 0
-        for source, index in self._chunks(tx):
-            chunks.append(self._trace_chunk(source, rx[index], index))
-            done += len(index)
+        room = paths_that_fit(available(), self.settings.max_depth)
+        chunks: list[Chunk] = []
+        pieces: list[Chunk] = []
+        found = done = 0
+        for launch in self.plan(links).launches:
+            pieces.append(self._trace_launch(launch, rx[launch.links], room - found))
+            found += len(pieces[-1].link)
+            if launch.last:
+                chunks += _without_repeats(pieces)
+                pieces = []
+                done += len(launch.links)
             if progress is not None:
                 progress(done, len(rx))
         return Trace(self, tx, rx, tuple(chunks))
@@ -232,44 +261,38 @@ class Tracer:
             dr.eval(ray)
         return odd.reshape(len(points), -1).mean(axis=1) > 0.5
 
-    def _chunks(self, tx: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Transmitters with the links that start there, at most as many at once as memory allows."""
-        lanes = self.settings.samples * max(self.settings.max_depth, 1)
-        size = max(1, LANES // lanes)
-        positions, group = np.unique(tx, axis=0, return_inverse=True)
-        for k, position in enumerate(positions):
-            index = np.flatnonzero(group.reshape(-1) == k)
-            for part in np.array_split(index, -(-len(index) // size)):
-                yield position, part
-
-    def _trace_chunk(self, source: np.ndarray, targets: np.ndarray, index: np.ndarray) -> Chunk:
+    def _trace_launch(self, launch: Launch, targets: np.ndarray, room: int) -> Chunk:
         settings, size = self.settings, BUFFER
-        src, tgt = _points(source[None]), _points(targets)
+        most = (launch.rays * settings.max_depth + 1) * len(targets) + 2  # a path a lane, and the direct ones
+        src, tgt = _points(launch.source[None]), _points(targets)
         while True:
-            buffer = self._candidates(
-                mi_scene=self._scene.mi_scene,
-                src_positions=src,
-                tgt_positions=tgt,
-                samples_per_src=settings.samples,
-                max_num_paths_per_src=size,
-                max_depth=settings.max_depth,
-                los=settings.line_of_sight,
-                specular_reflection=settings.specular_reflection,
-                diffuse_reflection=settings.diffuse_reflection,
-                refraction=settings.refraction,
-                diffraction=settings.diffraction,
-                edge_diffraction=settings.edge_diffraction,
-                seed=settings.seed,
-            )
-            buffer.schedule()
-            dr.eval()
-            if int(np.array(buffer.paths_counter).item()) < size - 1:
-                break
-            if size >= LARGEST_BUFFER:
-                raise EngineError(
-                    f"more than {size:,} paths to {len(index)} receivers; lower trace.samples or max_depth"
+            with _share_of_rays(launch, settings.samples):
+                buffer = self._candidates(
+                    mi_scene=self._scene.mi_scene,
+                    src_positions=src,
+                    tgt_positions=tgt,
+                    samples_per_src=launch.rays,
+                    max_num_paths_per_src=size,
+                    max_depth=settings.max_depth,
+                    los=settings.line_of_sight and launch.first == 0,
+                    specular_reflection=settings.specular_reflection,
+                    diffuse_reflection=settings.diffuse_reflection,
+                    refraction=settings.refraction,
+                    diffraction=settings.diffraction,
+                    edge_diffraction=settings.edge_diffraction,
+                    seed=launch.seed,
                 )
-            size *= 4
+                buffer.schedule()
+                dr.eval()
+            count = int(np.array(buffer.paths_counter).item())
+            if count > room:
+                raise EngineError(
+                    f"more paths than fit into memory, with {len(targets)} receivers at work; "
+                    "lower trace.samples or trace.max_depth, or trace fewer links at once"
+                )
+            if count < size - 1:
+                break
+            size = min(4 * size, most)
         buffer.shrink()
         buffer.detach_geometry()
         if buffer.buffer_size:
@@ -282,7 +305,9 @@ class Tracer:
                 diffraction_lit_region=settings.diffraction_lit_region,
             )
             buffer.discard_invalid()
-        return Chunk(buffer, src, tgt, index[np.array(buffer.target_indices, dtype=np.int64)])
+            buffer.schedule()
+            dr.eval()  # at once: what is left to be computed would hold on to all candidates and the whole buffer
+        return Chunk(buffer, src, tgt, launch.links[np.array(buffer.target_indices, dtype=np.int64)])
 
     def compile(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Paths:
         """Compile one chunk into a path program.
@@ -327,10 +352,11 @@ class Tracer:
     def _chains(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Chains:
         buffer, count = chunk.buffer, len(chunk.link)
         depth = buffer.depth_dim_size
-        shape = np.array(buffer.shapes, dtype=np.int64).reshape(count, depth)
+        shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
+        material = np.array([self._shape_material.get(key, 0) for key in shape.tolist()], dtype=np.int64)
         normal = np.zeros((count, depth, 3))
         wedge = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
-        kind = np.array(buffer.interaction_types, dtype=np.int64).reshape(count, depth)
+        kind = _per_interaction(buffer, "interaction_types")
         if count and kind.any():
             for step in range(depth):
                 active = mi.Bool(_aligned(kind[:, step] != 0, np.bool_))
@@ -345,15 +371,13 @@ class Tracer:
                     np.array(wedges.nn, dtype=float).T,
                     np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1),
                 )
-        vertices = [np.array(axis, dtype=float).reshape(count, depth) for axis in
-                    (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)]  # fmt: skip
         return Chains(
             source=tx[chunk.link],
             target=rx[chunk.link],
-            vertex=np.stack(vertices, axis=-1),
+            vertex=_vertices(buffer),
             normal=normal,
             kind=kind,
-            material=np.vectorize(lambda key: self._shape_material.get(key, 0), otypes=[np.int64])(shape),
+            material=material[of_path].reshape(count, depth),
             probability=np.array(buffer.probs, dtype=float).reshape(count, depth),
             samples=self.settings.samples,
             edge=wedge[0],
@@ -434,6 +458,60 @@ class Trace:
 
     def _order(self) -> np.ndarray:
         return np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
+
+
+@contextmanager
+def _share_of_rays(launch: Launch, samples: int) -> Iterator[None]:
+    """Lets Sionna take a launch's share of the lattice of all rays in place of a lattice of its own."""
+    whole = sb_deterministic.fibonacci_lattice
+    if launch.rays < samples:
+        share = directions(launch.first, launch.rays, samples)
+        sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(
+            *(_aligned(axis, np.float32) for axis in share)
+        )
+    try:
+        yield
+    finally:
+        sb_deterministic.fibonacci_lattice = whole
+
+
+def _without_repeats(pieces: list[Chunk]) -> list[Chunk]:
+    """Chunks of several launches to the same receivers, each path of a kind that is not sampled only once."""
+    if len(pieces) == 1:
+        return pieces
+    kind = np.concatenate([_per_interaction(chunk.buffer, "interaction_types") for chunk in pieces])
+    found = repeated(
+        np.repeat(np.arange(len(pieces)), [len(chunk.link) for chunk in pieces]),
+        np.concatenate([chunk.link for chunk in pieces]),
+        kind,
+        np.concatenate([_per_interaction(chunk.buffer, "shapes") for chunk in pieces]),
+        np.concatenate([_vertices(chunk.buffer) for chunk in pieces]),
+        (kind == Kind.DIFFUSE).any(axis=1),
+    )
+    ends = np.cumsum([len(chunk.link) for chunk in pieces])[:-1]
+    kept = []
+    for chunk, leave_out in zip(pieces, np.split(found, ends), strict=True):
+        if leave_out.any():
+            chunk.buffer.valid &= mi.Bool(_aligned(~leave_out, np.bool_))
+            chunk.buffer.discard_invalid()
+            chunk.buffer.schedule()
+            dr.eval()
+        kept.append(replace(chunk, link=chunk.link[~leave_out]))
+    return kept
+
+
+def _per_interaction(buffer: PathsBuffer, name: str) -> np.ndarray:
+    """A property of a buffer's interactions [P, D]."""
+    values = np.array(getattr(buffer, name), dtype=np.int64)
+    return values.reshape(-1, buffer.depth_dim_size)
+
+
+def _vertices(buffer: PathsBuffer) -> np.ndarray:
+    """A buffer's interaction points [P, D, 3], [m]."""
+    axes = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
+    return np.stack(
+        [np.array(axis, dtype=float).reshape(-1, buffer.depth_dim_size) for axis in axes], axis=-1
+    )
 
 
 def _load(scene: Scene) -> rt.Scene:

@@ -1,0 +1,172 @@
+"""How a trace is cut into launches that fit into memory, whatever number of samples and receivers is asked for.
+
+A launch sends rays from one transmitter and looks for paths to some receivers. The tracer keeps a few numbers for every
+ray, interaction and receiver, a *lane*, so the receivers of a transmitter are shared out; if one receiver is too much
+already, the rays are. Sionna's rays lie on a lattice of directions that a seed does not change: a launch takes a share
+of the lattice of all rays, and the launches together send out the rays that one would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from calibray.settings import TraceSettings
+
+LANE_BYTES: Final = 40  # peak while tracing, measured by benchmarks/memory.py --lanes
+PATH_BYTES: Final = (
+    600,
+    260,
+)  # a path's, and each interaction's, until it is compiled; benchmarks/memory.py --paths
+BUFFER_BYTES: Final = (50, 30)  # the same in the tracer's buffer
+GRID: Final = 0.01  # [m]; interaction points of one path found twice agree better, those of two seldom do
+
+
+@dataclass(frozen=True)
+class Launch:
+    """Rays from one transmitter to some receivers.
+
+    Attributes:
+        source: Position of the transmitter [3], [m].
+        links: The links that end at the receivers [n].
+        first: Number of the first ray within the lattice of all rays.
+        rays: Number of rays sent out.
+        seed: Seed of the tracer's random numbers.
+        last: Whether all rays to these receivers are sent out with this launch.
+    """
+
+    source: np.ndarray
+    links: np.ndarray
+    first: int
+    rays: int
+    seed: int
+    last: bool
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The launches of a trace.
+
+    Attributes:
+        launches: The launches; those to the same receivers follow each other.
+        lanes: Rays times interactions times receivers of the largest one.
+        buffer: Bytes of the buffer that holds the paths of a launch.
+    """
+
+    launches: tuple[Launch, ...]
+    lanes: int
+    buffer: int
+
+    @property
+    def memory(self) -> int:
+        """Memory that tracing takes besides the paths found, estimated [bytes]."""
+        return self.lanes * LANE_BYTES + self.buffer
+
+
+def plan(tx: np.ndarray, settings: TraceSettings, lanes: int, buffer: int) -> Plan:
+    """Cut a trace into launches.
+
+    Args:
+        tx: Transmitter of every link [L, 3], [m].
+        settings: The tracer's switches.
+        lanes: Rays times interactions times receivers that a launch may have.
+        buffer: Paths that the buffer of a launch holds at first.
+
+    Returns:
+        The launches.
+    """
+    depth = max(settings.max_depth, 1)
+    receivers = max(1, lanes // (settings.samples * depth))
+    pieces = min(settings.samples, -(-settings.samples * depth // lanes)) if settings.max_depth else 1
+    ends = np.linspace(0, settings.samples, pieces + 1).astype(np.int64).tolist()
+    positions, group = np.unique(tx, axis=0, return_inverse=True)
+    launches = []
+    for k, position in enumerate(positions):
+        index = np.flatnonzero(group.reshape(-1) == k)
+        for part in np.array_split(index, -(-len(index) // receivers)):
+            launches += [
+                Launch(position, part, start, end - start, _seed(settings.seed, piece), end == ends[-1])
+                for piece, (start, end) in enumerate(pairwise(ends))
+            ]
+    largest = max(launch.rays * settings.max_depth * len(launch.links) for launch in launches)
+    return Plan(tuple(launches), largest, buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth))
+
+
+def _seed(seed: int, piece: int) -> int:
+    """Seed of one of several launches to the same receivers; the first has the trace's own."""
+    return seed if piece == 0 else int(np.random.SeedSequence([seed, piece]).generate_state(1)[0])
+
+
+def directions(first: int, rays: int, samples: int) -> np.ndarray:
+    """A share of the Fibonacci lattice on the unit square, from which Sionna RT takes the directions of its rays.
+
+    Args:
+        first: The first point of the share.
+        rays: Number of points of the share.
+        samples: Number of points of the whole lattice.
+
+    Returns:
+        The points [2, rays].
+
+    Example:
+        >>> directions(0, 3, 3)[1].tolist()
+        [0.0, 0.5, 1.0]
+    """
+    if samples == 1:
+        return np.full((2, 1), 0.5)
+    n = np.arange(first, first + rays)
+    return np.stack([np.modf(n / ((1 + np.sqrt(5)) / 2))[0], n / (samples - 1)])
+
+
+def repeated(
+    piece: np.ndarray,
+    link: np.ndarray,
+    kind: np.ndarray,
+    shape: np.ndarray,
+    vertex: np.ndarray,
+    drawn: np.ndarray,
+) -> np.ndarray:
+    """Paths that an earlier one of several launches to the same receivers has found already.
+
+    A path that is not drawn at random is one and the same whichever ray found it: it meets the same objects in the same
+    points. Paths with a diffuse reflection are samples, and each counts.
+
+    Args:
+        piece: Which launch found the path, ascending [P].
+        link: Link of the path [P].
+        kind: Kinds of interaction, 0 beyond the last one [P, D].
+        shape: Objects met [P, D].
+        vertex: Interaction points [P, D, 3], [m].
+        drawn: Whether a path is a sample [P].
+
+    Returns:
+        True for the paths to leave out [P].
+    """
+    found = np.zeros(len(link), dtype=bool)
+    rows = np.flatnonzero(~drawn)
+    if not len(rows):
+        return found
+    present = kind[rows] != 0
+    where = np.where(present[..., None], vertex[rows], 0) / GRID
+    head = np.hstack([link[rows, None], kind[rows], np.where(present, shape[rows], 0)])
+    for offset in (0.0, 0.5):  # two grids: points that a line of one parts lie together in the other
+        grid = np.floor(where + offset).astype(np.int64).reshape(len(rows), -1)
+        _, first, group = np.unique(np.hstack([head, grid]), axis=0, return_index=True, return_inverse=True)
+        found[rows] |= piece[rows[first[group.reshape(-1)]]] < piece[rows]
+    return found
+
+
+def paths_that_fit(memory: int, depth: int) -> int:
+    """Number of paths that can be traced and compiled in some memory.
+
+    Args:
+        memory: The memory [bytes].
+        depth: Largest number of interactions of a path.
+
+    Returns:
+        The number.
+    """
+    return memory // (PATH_BYTES[0] + PATH_BYTES[1] * depth)
