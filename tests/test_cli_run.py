@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import planted
 import programs
-from calibray import terminal
+from calibray import terminal, tracing
 from calibray.cli import app
 from calibray.paths import Paths
 from calibray.result import FILES, Result
@@ -178,6 +178,16 @@ def test_trace_check_needs_no_file_and_tells_that_nothing_changes(folder):
         "Converged: no link changed by more than 0.5 dB (fidelity.tolerance_db).\n"
     )
     assert sorted(folder.rglob("*")) == before
+
+
+def test_a_long_trace_is_announced_on_stderr(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(tracing, "LANES", 200_000)  # 20,000 samples x 2 interactions x 5 receivers
+    outcome = calibray("trace", folder / "study.toml", "-o", tmp_path / "paths.h5")
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.stderr.startswith(
+        "Tracing 12 links in 3 launches of up to 160,000 rays x interactions x rec"
+    )
+    assert "launches" not in outcome.stdout
 
 
 def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):

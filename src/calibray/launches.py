@@ -17,10 +17,8 @@ import numpy as np
 from calibray.settings import TraceSettings
 
 LANE_BYTES: Final = 40  # peak while tracing, measured by benchmarks/memory.py --lanes
-PATH_BYTES: Final = (
-    600,
-    260,
-)  # a path's, and each interaction's, until it is compiled; benchmarks/memory.py --paths
+# Bytes of a path, and of each of its interactions, until it is compiled; measured by benchmarks/memory.py --paths
+PATH_BYTES: Final = (650, 260)
 BUFFER_BYTES: Final = (50, 30)  # the same in the tracer's buffer
 GRID: Final = 0.01  # [m]; interaction points of one path found twice agree better, those of two seldom do
 
