@@ -166,7 +166,9 @@ def render_convergence(found: Convergence, row: np.ndarray, tolerance_db: float)
         ("links that lost paths", str(len(found.lost)), rows_text(row[found.lost].tolist())),
     ]
     tables = [render_table((f"Change from {found.samples:,} to {after:,} samples", ">", ""), overview)]
-    changed = [link for link in found.largest[:LISTED] if found.change_db[link] != 0]
+    changed = [
+        link for link in found.largest[:LISTED] if abs(found.change_db[link]) >= 0.005
+    ]  # shown to 0.01 dB
     if changed:
         rows = [
             (str(row[link]), f"{found.change_db[link]:+.2f}",
