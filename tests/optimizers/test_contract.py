@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from landscapes import Landscape, rosenbrock
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, METHODS, LeastSquares, Optimizer
 from calibray.optimizers.archive import merged
+from calibray.optimizers.landscapes import Landscape, rosenbrock
 
 LANDSCAPE = rosenbrock()
 CASES = sorted(METHODS.items())

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from landscapes import blocks, hall, rosenbrock, tones, within
 from scipy.optimize import least_squares
 
 from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
+from calibray.optimizers.landscapes import blocks, hall, rosenbrock, tones, within
 
 
 def scipy_search(landscape, start):

@@ -5,7 +5,6 @@ import threading
 
 import numpy as np
 import pytest
-from landscapes import rosenbrock, street, tones, within
 from scipy.stats import norm
 
 from calibray.errors import InputError
@@ -13,6 +12,7 @@ from calibray.optimizers import CMAES, DFOLS, DifferentialEvolution, GaussianPro
 from calibray.optimizers.archive import Evaluations
 from calibray.optimizers.gaussian_process import log_shape
 from calibray.optimizers.inversion import inverted
+from calibray.optimizers.landscapes import rosenbrock, street, tones, within
 
 LARGE = 2.0**31
 LIBRARIES = [CMAES, DFOLS, DifferentialEvolution]

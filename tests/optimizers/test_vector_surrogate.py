@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from landscapes import Landscape, blocks, rosenbrock, street
 
 from calibray.errors import InputError
 from calibray.optimizers import SGWOIM, LatinHypercube, VectorSurrogate
 from calibray.optimizers.kriging import fit
+from calibray.optimizers.landscapes import Landscape, blocks, rosenbrock, street
 from calibray.optimizers.vector_surrogate import expected_improvement, mean_square, predicted_minima
 
 STREET = street()
