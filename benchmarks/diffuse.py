@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,19 +23,10 @@ from calibray.engines import Replay
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
 from calibray.tracing import Tracer
+from timing import seconds
 
 STUDY = Path(__file__).parents[1] / "examples" / "nist_boulder.toml"
 NAMES = ("walls", "ground")
-
-
-def seconds(function: Callable[[], object], repeats: int) -> float:
-    """Median time of a call [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def main() -> None:

@@ -10,9 +10,6 @@ interaction, which is what replay does without tables; the difference between bo
 from __future__ import annotations
 
 import argparse
-import statistics
-import time
-from collections.abc import Callable
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -22,6 +19,7 @@ from calibray.engines import Replay
 from calibray.fields import layout
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Diffuse, Kind, Paths
+from timing import seconds
 
 MATERIALS = {
     "walls": Material(5.3, 0.1, 0.2, 0.3),
@@ -89,17 +87,6 @@ def parameters() -> Parameters:
             for value in [getattr(material, field)]
         )
     )
-
-
-def seconds(function: Callable[[], object], repeats: int) -> float:
-    """Median time of a call after a warm-up call [s]."""
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def main() -> None:

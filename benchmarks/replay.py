@@ -10,8 +10,6 @@ on stored paths (what it would pay if its paths were kept).
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -20,17 +18,7 @@ from calibray import engines
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tracing import Trace
-
-
-def seconds(function: Callable[[], object], repeats: int) -> float:
-    """Median time of a call after one warm-up call [s]."""
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+from timing import seconds
 
 
 def candidates(engine: engines.Replay, count: int) -> np.ndarray:
