@@ -18,11 +18,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from calibray import tracing
 from calibray.fields import path_loss
 from calibray.scene import read_scene
 from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Tracer
+from calibray.tracing import Tracer, tracer
 
 FREQUENCY = 3.5e9
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
@@ -35,7 +34,7 @@ def resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def tracer(scene: str, materials: dict | None = None, **settings: int | bool) -> Tracer:
+def make_tracer(scene: str, materials: dict | None = None, **settings: int | bool) -> Tracer:
     """A tracer of a bundled scene."""
     return Tracer(
         read_scene(scene, FREQUENCY, materials), FREQUENCY, TraceSettings(**settings), Antenna(), Antenna()
@@ -54,7 +53,7 @@ def outdoors(at: Tracer, count: int, seed: int = 0) -> np.ndarray:
 
 def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
     """Trace a large campaign, and some of its links one by one."""
-    munich = tracer("sionna:munich", samples=samples, max_depth=depth)
+    munich = make_tracer("sionna:munich", samples=samples, max_depth=depth)
     rx = outdoors(munich, receivers)
     links = SimpleNamespace(tx=np.repeat(MASTS, len(rx), axis=0), rx=np.tile(rx, (len(MASTS), 1)))
     start = time.perf_counter()
@@ -100,17 +99,17 @@ def canyon_links(count: int) -> SimpleNamespace:
 
 def lanes(samples: int, depth: int, receivers: int) -> None:
     """Trace in one launch."""
-    tracing.LANES = samples * depth * receivers
-    tracer(CANYON, samples=1000, max_depth=depth).trace(canyon_links(1))
+    tracer.LANES = samples * depth * receivers
+    make_tracer(CANYON, samples=1000, max_depth=depth).trace(canyon_links(1))
     before = resident()
-    tracer(CANYON, samples=samples, max_depth=depth).trace(canyon_links(receivers))
-    taken = (resident() - before) / tracing.LANES
+    make_tracer(CANYON, samples=samples, max_depth=depth).trace(canyon_links(receivers))
+    taken = (resident() - before) / tracer.LANES
     print(f"{samples:>11,} rays x {depth} interactions x {receivers:>2} receivers: {taken:.0f} bytes a lane")
 
 
 def paths(samples: int, depth: int, receivers: int) -> None:
     """Trace and compile very many paths."""
-    rough = tracer(CANYON, ROUGH, samples=samples, max_depth=depth, diffuse_reflection=True)
+    rough = make_tracer(CANYON, ROUGH, samples=samples, max_depth=depth, diffuse_reflection=True)
     before = resident()
     found = rough.trace(canyon_links(receivers)).paths()
     taken = (resident() - before) / found.num_paths

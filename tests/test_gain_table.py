@@ -137,7 +137,7 @@ def test_gain_is_interpolated_in_decibel_across_the_seam_and_to_the_poles() -> N
 
 def test_tracer_reads_the_table_as_the_table_reads_itself(tables: dict[str, str]) -> None:
     """In random directions and at the edges of the grid, for a grid from 0 and one from -180 degrees."""
-    from calibray.tracing import _tabulated
+    from calibray.tracing.antennas import tabulated
 
     rng = np.random.default_rng(4)
     azimuth = np.concatenate([rng.uniform(-180, 180, 500), [-180, 180, 0, 179.99, -179.99, 0, 0]])
@@ -146,7 +146,7 @@ def test_tracer_reads_the_table_as_the_table_reads_itself(tables: dict[str, str]
         GainTable(-180.0, rng.uniform(-20, 3, (37, 72))),
         GainTable(0.0, rng.uniform(-20, 3, (13, 24))),
     ):
-        field = _tabulated(table)(mi.Float(np.radians(90 - elevation)), mi.Float(np.radians(azimuth)))
+        field = tabulated(table)(mi.Float(np.radians(90 - elevation)), mi.Float(np.radians(azimuth)))
         gain = 20 * np.log10(np.array(field.real, dtype=float))
         np.testing.assert_allclose(gain, table.gain(azimuth, elevation), atol=2e-3)
 

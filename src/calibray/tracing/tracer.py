@@ -1,4 +1,4 @@
-"""Finding paths with Sionna RT; the only module that imports it.
+"""Finding the paths of links with Sionna RT.
 
 Sionna's solver is a chain of stages: candidates by shooting and bouncing, exact geometry by the image method, fields.
 The first two never depend on what is calibrated, so their result is kept (`Trace`) and compiled into a path program.
@@ -11,45 +11,32 @@ filled up is traced again, larger.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+import sionna.rt as rt
+from sionna.rt.path_solvers.field_calculator import FieldCalculator
+from sionna.rt.path_solvers.image_method import ImageMethod
+from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
-from calibray import llvm
-
-llvm.select()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-import sionna.rt as rt  # noqa: E402
-from sionna.rt.antenna_pattern import (  # noqa: E402
-    PolarizedAntennaPattern,
-    antenna_pattern_registry,
-    antenna_pattern_to_world_implicit,
-)
-from sionna.rt.path_solvers import sb_deterministic  # noqa: E402
-from sionna.rt.path_solvers.field_calculator import FieldCalculator  # noqa: E402
-from sionna.rt.path_solvers.image_method import ImageMethod  # noqa: E402
-from sionna.rt.path_solvers.paths_buffer import PathsBuffer  # noqa: E402
-from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator  # noqa: E402
-from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator  # noqa: E402
-from sionna.rt.radio_materials import scattering_pattern_registry  # noqa: E402
-from sionna.rt.scene import load_scene_from_string  # noqa: E402
-from sionna.rt.utils import rotation_matrix  # noqa: E402
-
-from calibray.errors import EngineError, InputError  # noqa: E402
-from calibray.gain_table import GainTable, read_gain_table  # noqa: E402
-from calibray.geometry import Chains, compile_chains, zenith_azimuth  # noqa: E402
-from calibray.launches import Launch, Plan, directions, paths_that_fit, plan, repeated  # noqa: E402
-from calibray.materials import Material  # noqa: E402
-from calibray.memory import available  # noqa: E402
-from calibray.paths import Kind, Paths, concatenate  # noqa: E402
-from calibray.scene import Scene, check_material_name, read_scene  # noqa: E402
-from calibray.settings import Antenna, TraceSettings, as_antenna  # noqa: E402
+from calibray.errors import EngineError, InputError
+from calibray.geometry import Chains, compile_chains, zenith_azimuth
+from calibray.launches import Launch, Plan, paths_that_fit, plan
+from calibray.materials import Material
+from calibray.memory import available
+from calibray.paths import Paths, concatenate
+from calibray.scene import Scene, check_material_name, read_scene
+from calibray.settings import Antenna, TraceSettings, as_antenna
+from calibray.tracing.antennas import jones_vectors, patterns_of, turned
+from calibray.tracing.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
+from calibray.tracing.chunks import Chunk, share_of_rays, without_repeats
+from calibray.tracing.loading import load, scattering_pattern, shape_materials
 
 LANES: Final = 20_000_000  # samples x depth x receivers of one launch
 BUFFER: Final = 1_000_000  # paths that the buffer of one launch holds at first
@@ -125,16 +112,6 @@ def _settings(settings: Mapping[str, int | bool]) -> TraceSettings:
     return TraceSettings(**settings)  # type: ignore[arg-type]
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Paths from one transmitter to some receivers, in Sionna's own buffer; `link` is the link of every path [P]."""
-
-    buffer: PathsBuffer
-    source: mi.Point3f
-    target: mi.Point3f
-    link: np.ndarray
-
-
 class Tracer:
     """A scene loaded into Sionna RT, with antennas and settings, ready to trace links.
 
@@ -162,10 +139,10 @@ class Tracer:
             raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
         self.scene, self.frequency, self.settings = scene, float(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
-        self._tx_patterns, self._rx_patterns = _patterns(tx_antenna), _patterns(rx_antenna)
-        self._scene = _load(scene)
+        self._tx_patterns, self._rx_patterns = patterns_of(tx_antenna), patterns_of(rx_antenna)
+        self._scene = load(scene)
         self._scene.frequency = self.frequency
-        self._shape_material = _shape_materials(self._scene)
+        self._shape_material = shape_materials(self._scene)
         self._candidates, self._images = SBDeterministicCandidateGenerator(), ImageMethod()
         self._fields = FieldCalculator()
         self.set_materials(scene.materials)
@@ -185,7 +162,7 @@ class Tracer:
             target = self._scene.radio_materials[f"calibray-{names.index(name)}"]
             for constant in FLOATS:  # opaque: a literal would be compiled into the kernels
                 setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
-            target.scattering_pattern = _scattering_pattern(material)
+            target.scattering_pattern = scattering_pattern(material)
 
     def plan(self, links: Links) -> Plan:
         """How the links will be traced.
@@ -224,7 +201,7 @@ class Tracer:
             pieces.append(self._trace_launch(launch, rx[launch.links], room - found))
             found += len(pieces[-1].link)
             if launch.last:
-                chunks += _without_repeats(pieces)
+                chunks += without_repeats(pieces)
                 pieces = []
                 done += len(launch.links)
             if progress is not None:
@@ -264,9 +241,9 @@ class Tracer:
     def _trace_launch(self, launch: Launch, targets: np.ndarray, room: int) -> Chunk:
         settings, size = self.settings, BUFFER
         most = (launch.rays * settings.max_depth + 1) * len(targets) + 2  # a path a lane, and the direct ones
-        src, tgt = _points(launch.source[None]), _points(targets)
+        src, tgt = points(launch.source[None]), points(targets)
         while True:
-            with _share_of_rays(launch, settings.samples):
+            with share_of_rays(launch, settings.samples):
                 buffer = self._candidates(
                     mi_scene=self._scene.mi_scene,
                     src_positions=src,
@@ -332,11 +309,12 @@ class Tracer:
             spreading=program.spreading,
             departure=zenith_azimuth(departure),
             arrival=zenith_azimuth(-arrival),
-            tx_field=_turn(
-                _pattern(self.tx_antenna, self._tx_patterns, departure, "out"), program.departure_rotation
+            tx_field=turned(
+                jones_vectors(self.tx_antenna, self._tx_patterns, departure, "out"),
+                program.departure_rotation,
             ),
-            rx_field=_turn(
-                _pattern(self.rx_antenna, self._rx_patterns, -arrival, "in"),
+            rx_field=turned(
+                jones_vectors(self.rx_antenna, self._rx_patterns, -arrival, "in"),
                 program.arrival_rotation * [1, -1],
             ),
             first=program.first,
@@ -356,15 +334,15 @@ class Tracer:
         material = np.array([self._shape_material.get(key, 0) for key in shape.tolist()], dtype=np.int64)
         normal = np.zeros((count, depth, 3))
         wedge = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
-        kind = _per_interaction(buffer, "interaction_types")
+        kind = per_interaction(buffer, "interaction_types")
         if count and kind.any():
             for step in range(depth):
-                active = mi.Bool(_aligned(kind[:, step] != 0, np.bool_))
+                active = mi.Bool(aligned(kind[:, step] != 0, np.bool_))
                 found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
                 normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
             if self.settings.diffraction:
-                wedges, ends = buffer.diffracting_wedges, (_gather(chunk.source, buffer.source_indices),
-                                                           _gather(chunk.target, buffer.target_indices))  # fmt: skip
+                wedges, ends = buffer.diffracting_wedges, (gather(chunk.source, buffer.source_indices),
+                                                           gather(chunk.target, buffer.target_indices))  # fmt: skip
                 after, before = self._fields._diffraction_compute_s_s_prime(buffer, *ends)
                 wedge = (
                     np.array(wedges.e_hat, dtype=float).T,
@@ -374,7 +352,7 @@ class Tracer:
         return Chains(
             source=tx[chunk.link],
             target=rx[chunk.link],
-            vertex=_vertices(buffer),
+            vertex=vertices_of(buffer),
             normal=normal,
             kind=kind,
             material=material[of_path].reshape(count, depth),
@@ -406,14 +384,14 @@ class Tracer:
             diffraction=self.settings.diffraction,
             src_positions=chunk.source,
             tgt_positions=chunk.target,
-            src_orientations=_points(np.array([self.tx_antenna.orientation])),
-            tgt_orientations=_points(np.tile(self.rx_antenna.orientation, (count, 1))),
+            src_orientations=points(np.array([self.tx_antenna.orientation])),
+            tgt_orientations=points(np.tile(self.rx_antenna.orientation, (count, 1))),
             src_antenna_patterns=self._tx_patterns,
             tgt_antenna_patterns=self._rx_patterns,
         )
         dr.eval(found.a, found.tau)  # at once: every array read on its own would run the whole stage again
         buffer.valid = valid  # the field stage narrows it
-        return np.array([[_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
+        return np.array([[to_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -460,96 +438,6 @@ class Trace:
         return np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
 
 
-@contextmanager
-def _share_of_rays(launch: Launch, samples: int) -> Iterator[None]:
-    """Lets Sionna take a launch's share of the lattice of all rays in place of a lattice of its own."""
-    whole = sb_deterministic.fibonacci_lattice
-    if launch.rays < samples:
-        share = directions(launch.first, launch.rays, samples)
-        sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(
-            *(_aligned(axis, np.float32) for axis in share)
-        )
-    try:
-        yield
-    finally:
-        sb_deterministic.fibonacci_lattice = whole
-
-
-def _without_repeats(pieces: list[Chunk]) -> list[Chunk]:
-    """Chunks of several launches to the same receivers, each path of a kind that is not sampled only once."""
-    if len(pieces) == 1:
-        return pieces
-    kind = np.concatenate([_per_interaction(chunk.buffer, "interaction_types") for chunk in pieces])
-    found = repeated(
-        np.repeat(np.arange(len(pieces)), [len(chunk.link) for chunk in pieces]),
-        np.concatenate([chunk.link for chunk in pieces]),
-        kind,
-        np.concatenate([_per_interaction(chunk.buffer, "shapes") for chunk in pieces]),
-        np.concatenate([_vertices(chunk.buffer) for chunk in pieces]),
-        (kind == Kind.DIFFUSE).any(axis=1),
-    )
-    ends = np.cumsum([len(chunk.link) for chunk in pieces])[:-1]
-    kept = []
-    for chunk, leave_out in zip(pieces, np.split(found, ends), strict=True):
-        if leave_out.any():
-            chunk.buffer.valid &= mi.Bool(_aligned(~leave_out, np.bool_))
-            chunk.buffer.discard_invalid()
-            chunk.buffer.schedule()
-            dr.eval()
-        kept.append(replace(chunk, link=chunk.link[~leave_out]))
-    return kept
-
-
-def _per_interaction(buffer: PathsBuffer, name: str) -> np.ndarray:
-    """A property of a buffer's interactions [P, D]."""
-    values = np.array(getattr(buffer, name), dtype=np.int64)
-    return values.reshape(-1, buffer.depth_dim_size)
-
-
-def _vertices(buffer: PathsBuffer) -> np.ndarray:
-    """A buffer's interaction points [P, D, 3], [m]."""
-    axes = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
-    return np.stack(
-        [np.array(axis, dtype=float).reshape(-1, buffer.depth_dim_size) for axis in axes], axis=-1
-    )
-
-
-def _load(scene: Scene) -> rt.Scene:
-    resolver = mi.file_resolver()
-    try:
-        search = mi.FileResolver(resolver)
-        search.append(str(scene.path.parent.resolve()))
-        mi.set_file_resolver(search)
-        return load_scene_from_string(scene.xml)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{scene.path}: Sionna RT cannot load the scene: {str(error).strip()}") from None
-    finally:
-        mi.set_file_resolver(resolver)
-
-
-def _shape_materials(scene: rt.Scene) -> dict[int, int]:
-    """Material index by the id under which Dr.Jit knows a shape."""
-    return {
-        int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): int(
-            shape.bsdf().name.split("-")[-1]
-        )
-        for shape in scene.mi_scene.shapes()
-    }
-
-
-def _scattering_pattern(material: Material) -> rt.ScatteringPattern:
-    constants = {
-        "lambertian": {},
-        "directive": {"alpha_r": round(material.alpha_r)},
-        "backscattering": {
-            "alpha_r": round(material.alpha_r),
-            "alpha_i": round(material.alpha_i),
-            "lambda_": material.lambda_,
-        },
-    }[material.scattering_pattern]
-    return scattering_pattern_registry.get(material.scattering_pattern)(**constants)
-
-
 def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
@@ -566,78 +454,3 @@ def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
             f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns"
         )
     return tx, rx
-
-
-def _points(position: np.ndarray) -> mi.Point3f:
-    points = mi.Point3f(*(_aligned(axis, np.float32) for axis in position.T))
-    dr.make_opaque(points)
-    return points
-
-
-def _aligned(values: np.ndarray, dtype: type) -> np.ndarray:
-    """A copy that starts at a multiple of 64 bytes.
-
-    Dr.Jit takes over NumPy's memory as it lies and compiles another kernel for another alignment. With an alignment
-    left to chance its kernel cache is of little use, and every process compiles for seconds.
-    """
-    memory = np.empty(values.size * np.dtype(dtype).itemsize + 64, dtype=np.uint8)
-    start = -memory.ctypes.data % 64
-    copy = memory[start : start + memory.size - 64].view(dtype)
-    copy[:] = values
-    return copy
-
-
-def _gather(points: mi.Point3f, index: mi.UInt) -> mi.Point3f:
-    return dr.gather(mi.Point3f, points, index)
-
-
-def _patterns(antenna: Antenna) -> list:
-    """Sionna's pattern functions of zenith and azimuth [rad], one per port."""
-    if antenna.gain_file is None:
-        return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
-    pattern = _tabulated(read_gain_table(antenna.gain_file))
-    return PolarizedAntennaPattern(v_pattern=pattern, polarization=antenna.polarization).patterns
-
-
-def _tabulated(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
-    """`GainTable.gain` as a pattern function of Sionna: the field's amplitude."""
-    (rows, columns), (rise, turn) = table.gain_dbi.shape, np.radians(table.steps_deg)
-    first = np.radians(table.first_azimuth_deg)
-    gain = mi.Float(_aligned(table.gain_dbi.ravel(), np.float32))
-
-    def pattern(zenith: mi.Float, azimuth: mi.Float) -> mi.Complex2f:
-        row = dr.clip((np.pi - zenith) / rise, 0, rows - 1)
-        column = (azimuth - first) / turn
-        column = dr.clip(column - dr.floor(column / columns) * columns, 0, columns)
-        i, j = dr.minimum(mi.UInt(row), rows - 2), dr.minimum(mi.UInt(column), columns - 1)
-        k = dr.select(j == columns - 1, 0, j + 1)
-        u, v = row - mi.Float(i), column - mi.Float(j)
-        low, high = (
-            dr.lerp(dr.gather(mi.Float, gain, at + j), dr.gather(mi.Float, gain, at + k), v)
-            for at in (i * columns, (i + 1) * columns)
-        )
-        return mi.Complex2f(dr.power(10.0, dr.lerp(low, high, u) / 20), 0)
-
-    return pattern
-
-
-def _pattern(antenna: Antenna, patterns: list, direction: np.ndarray, way: str) -> np.ndarray:
-    """Jones vectors of an antenna in the basis (theta, phi) of the wave, by port [P, ports, 2]."""
-    if not len(direction):
-        return np.zeros((0, antenna.ports, 2), dtype=complex)
-    to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
-    look = mi.Vector3f(*(_aligned(axis, np.float32) for axis in direction.T))
-    fields = [antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in patterns]
-    parts = np.array([np.array(field, dtype=float) for field in fields])  # [ports, (re, re, im, im), P]
-    return np.moveaxis(parts[:, :2] + 1j * parts[:, 2:], 2, 0)
-
-
-def _turn(field: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    cos, sin = rotation[:, None, 0], rotation[:, None, 1]
-    return np.stack(
-        [cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1
-    )
-
-
-def _complex(value: mi.Complex2f) -> np.ndarray:
-    return np.array(value.real, dtype=float) + 1j * np.array(value.imag, dtype=float)

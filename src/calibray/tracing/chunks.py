@@ -1,0 +1,82 @@
+"""Chunks of paths in Sionna's own buffers, and what is found twice when rays are shared out over launches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from sionna.rt.path_solvers import sb_deterministic
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+from calibray.launches import Launch, directions, repeated
+from calibray.paths import Kind
+from calibray.tracing.arrays import aligned, per_interaction, vertices_of
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Paths from one transmitter to some receivers, in Sionna's own buffer; `link` is the link of every path [P]."""
+
+    buffer: PathsBuffer
+    source: mi.Point3f
+    target: mi.Point3f
+    link: np.ndarray
+
+
+@contextmanager
+def share_of_rays(launch: Launch, samples: int) -> Iterator[None]:
+    """Lets Sionna take a launch's share of the lattice of all rays in place of a lattice of its own.
+
+    Args:
+        launch: The launch.
+        samples: Number of all rays.
+
+    Yields:
+        Nothing; the share is taken as long as the context is open.
+    """
+    whole = sb_deterministic.fibonacci_lattice
+    if launch.rays < samples:
+        share = directions(launch.first, launch.rays, samples)
+        sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(
+            *(aligned(axis, np.float32) for axis in share)
+        )
+    try:
+        yield
+    finally:
+        sb_deterministic.fibonacci_lattice = whole
+
+
+def without_repeats(pieces: list[Chunk]) -> list[Chunk]:
+    """Chunks of several launches to the same receivers, each path of a kind that is not sampled only once.
+
+    Args:
+        pieces: The chunks as found.
+
+    Returns:
+        The chunks without paths that an earlier one holds.
+    """
+    if len(pieces) == 1:
+        return pieces
+    kind = np.concatenate([per_interaction(chunk.buffer, "interaction_types") for chunk in pieces])
+    found = repeated(
+        np.repeat(np.arange(len(pieces)), [len(chunk.link) for chunk in pieces]),
+        np.concatenate([chunk.link for chunk in pieces]),
+        kind,
+        np.concatenate([per_interaction(chunk.buffer, "shapes") for chunk in pieces]),
+        np.concatenate([vertices_of(chunk.buffer) for chunk in pieces]),
+        (kind == Kind.DIFFUSE).any(axis=1),
+    )
+    ends = np.cumsum([len(chunk.link) for chunk in pieces])[:-1]
+    kept = []
+    for chunk, leave_out in zip(pieces, np.split(found, ends), strict=True):
+        if leave_out.any():
+            chunk.buffer.valid &= mi.Bool(aligned(~leave_out, np.bool_))
+            chunk.buffer.discard_invalid()
+            chunk.buffer.schedule()
+            dr.eval()
+        kept.append(replace(chunk, link=chunk.link[~leave_out]))
+    return kept
