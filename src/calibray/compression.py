@@ -22,7 +22,7 @@ from scipy.optimize import nnls
 from scipy.stats import qmc
 
 from calibray.errors import InputError
-from calibray.fields import layout, path_powers
+from calibray.fields import layout, path_losses, path_powers
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
 
@@ -36,9 +36,12 @@ CORNERS: Final = 5  # parameters of which all corners are fitted to; further one
 CHECKED: Final = 48  # fresh candidates of every check
 PASSED: Final = 0.5  # share of the tolerance that a check must stay within
 ROUNDS: Final = 6  # fits of a link before it keeps all its paths
+STRENGTH: Final = 16  # candidates by which the strongest paths are told
 POOL: Final = 2000  # strongest paths of a link that are candidates to be kept, and as many others
 BLOCK: Final = 400_000_000  # powers, paths times candidates, held at once
-TABLE_INTERVALS: Final = 4096
+FIRST_INTERVALS: Final = 4096  # of a table of coefficients
+LAST_INTERVALS: Final = 65536
+TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
 
 Progress = Callable[[int, int], None]
 
@@ -84,19 +87,25 @@ def compress(
     if not (np.isfinite(tolerance_db) and tolerance_db > 0):
         raise InputError(f"tolerance_db = {tolerance_db}: must be a positive number of dB")
     candidates = _candidates(parameters, seed)
+    intervals, coarse = FIRST_INTERVALS, np.inf
+    while coarse > TABLE_TOLERANCE and intervals <= LAST_INTERVALS:
+        totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
+        intervals *= 2
+    pool = _pool(paths, strength, seed)
     weight, error = np.ones(paths.num_paths), np.zeros(paths.num_links)
-    ends = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
-    for links in _blocks(np.diff(ends), sum(len(some) for some in candidates)):
-        start, stop = ends[links[0]], ends[links[-1] + 1]
-        powers = _Powers(take(paths, np.arange(start, stop)), parameters, candidates)
-        for link in links:
+    links = np.unique(paths.link[pool])
+    ends = np.searchsorted(paths.link[pool], np.arange(paths.num_links + 1))
+    for block in _blocks(links, np.diff(ends), sum(len(some) for some in candidates)):
+        start, stop = ends[block[0]], ends[block[-1] + 1]
+        powers = _Powers(take(paths, pool[start:stop]), parameters, candidates, intervals // 2)
+        for link in block:
             where = slice(ends[link] - start, ends[link + 1] - start)
-            if where.stop - where.start > FEW:
-                fitted = _fit_link(powers, where, tolerance_db, seed)
-                if fitted is not None:
-                    weight[ends[link] : ends[link + 1]], error[link] = fitted
+            fitted = _fit_link(powers, where, [total[:, link] for total in totals], tolerance_db)
+            if fitted is not None:
+                weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
+                weight[pool[ends[link] : ends[link + 1]]], error[link] = fitted
             if progress is not None:
-                progress(link + 1, paths.num_links)
+                progress(int(link) + 1, paths.num_links)
     kept = np.flatnonzero(weight > 0)
     few = take(paths, kept)
     few = replace(
@@ -124,17 +133,53 @@ def _candidates(parameters: Parameters, seed: int) -> list[np.ndarray]:
     return [parameters.from_unit(unit) for unit in sets]
 
 
-def _blocks(size: np.ndarray, candidates: int) -> list[np.ndarray]:
-    """Consecutive links whose paths' powers fit into memory together."""
-    block = np.cumsum(size) * candidates // BLOCK
-    return np.split(np.arange(len(size)), np.flatnonzero(np.diff(block)) + 1)
+def _whole(
+    paths: Paths, parameters: Parameters, candidates: list[np.ndarray], intervals: int
+) -> tuple[list[np.ndarray], np.ndarray, float]:
+    """What only the whole program tells.
+
+    Returns:
+        Power of every link at all candidates, by set [n, L]; every path's share of it, summed over the first ones [P];
+        the largest error of a tabulated coefficient.
+    """
+    plan = layout(paths, np.float32, intervals, phases=False)
+    totals, errors = [], []
+    for some in candidates:
+        tables = parameters.constants(some, paths.materials).astype(np.float32)
+        loss, error = path_losses(plan.program, jnp.asarray(tables))
+        totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
+        errors.append(error)
+    strength = np.zeros(paths.num_paths)
+    for some, total in zip(candidates[0][:STRENGTH], totals[0], strict=False):
+        table = parameters.constants(some[None], paths.materials)[0].astype(np.float32)
+        power = np.asarray(path_powers(plan.program, jnp.asarray(table)))
+        strength[plan.order] += power / np.where(total > 0, total, np.inf)[paths.link[plan.order]]
+    return totals, strength, max(errors)
+
+
+def _pool(paths: Paths, strength: np.ndarray, seed: int) -> np.ndarray:
+    """Paths of links with many that may be kept, in their order: the strongest and as many others."""
+    random, pool = np.random.default_rng(seed), []
+    for some in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
+        if len(some) > FEW:
+            order = some[np.argsort(-strength[some], kind="stable")]
+            pool.append(np.sort(np.concatenate([order[:POOL], random.permutation(order[POOL:])[:POOL]])))
+    return np.concatenate(pool) if pool else np.zeros(0, dtype=np.int64)
+
+
+def _blocks(links: np.ndarray, size: np.ndarray, candidates: int) -> list[np.ndarray]:
+    """Links whose pools' powers fit into memory together."""
+    block = np.cumsum(size[links]) * candidates // BLOCK
+    return [some for some in np.split(links, np.flatnonzero(np.diff(block)) + 1) if len(some)]
 
 
 class _Powers:
     """Powers of some paths at sets of candidates, each computed when it is first asked for."""
 
-    def __init__(self, paths: Paths, parameters: Parameters, candidates: list[np.ndarray]) -> None:
-        plan = layout(paths, np.float32, TABLE_INTERVALS, phases=False)
+    def __init__(
+        self, paths: Paths, parameters: Parameters, candidates: list[np.ndarray], intervals: int
+    ) -> None:
+        plan = layout(paths, np.float32, intervals, phases=False)
         self._program, self._place = plan.program, np.argsort(plan.order)
         self._tables = [parameters.constants(some, paths.materials) for some in candidates]
         self._known: dict[int, np.ndarray] = {}
@@ -148,30 +193,25 @@ class _Powers:
 
 
 def _fit_link(
-    powers: _Powers, where: slice, tolerance_db: float, seed: int
+    powers: _Powers, where: slice, totals: list[np.ndarray], tolerance_db: float
 ) -> tuple[np.ndarray, float] | None:
-    """Weights of a link's paths, and the largest error at fresh candidates; None if the tolerance is not met."""
-    train = _lit(powers.at(0, where))
-    strongest = np.argsort(-train.sum(axis=0), kind="stable")
-    others = np.random.default_rng(seed).permutation(strongest[POOL:])
-    pool = np.concatenate([strongest[:POOL], others[:POOL]])
-    weight = np.zeros(train.shape[1])
-    for turn in range(ROUNDS):
-        total = train.sum(axis=1, keepdims=True)
-        weight[pool] = sparse_weights(
-            train[:, pool] / total, FITTED * tolerance_db * np.log(10) / 10, np.flatnonzero(weight[pool])
-        )
-        fresh = _lit(powers.at(turn + 1, where))
-        error = float(np.abs(10 * np.log10(fresh @ weight / fresh.sum(axis=1))).max(initial=0.0))
-        if error <= PASSED * tolerance_db:
-            return weight, error
-        train = np.vstack([train, fresh])
+    """Weights of the paths in a link's pool, and the largest error at fresh candidates; None if it is too large.
+
+    Candidates that leave the link no power, as where nothing scatters, are left out: no weight can err there.
+    """
+    shares, begin = [], None
+    for turn, total in enumerate(totals):
+        lit = total > 0
+        share = powers.at(turn, where)[lit] / total[lit, None]
+        if turn:
+            bound = FITTED * tolerance_db * np.log(10) / 10
+            weight = sparse_weights(np.vstack(shares), bound, begin)
+            begin = np.flatnonzero(weight)
+            error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))
+            if error <= PASSED * tolerance_db:
+                return weight, error
+        shares.append(share)
     return None
-
-
-def _lit(power: np.ndarray) -> np.ndarray:
-    """The candidates that leave a link some power; at the others, as where nothing scatters, weights cannot err."""
-    return power[power.sum(axis=1) > 0]
 
 
 def sparse_weights(share: np.ndarray, bound: float, first: np.ndarray | None = None) -> np.ndarray:
