@@ -87,7 +87,7 @@ def study_arena(path: str | Path) -> Arena:
     digest.update(repr((objective.num_groups, objective.ceiling_db)).encode())
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = to_search(parameters, parameters.start)
-    options = {name: usual_options(name, parameters, engine.large) for name in METHODS}
+    options = {name: usual_options(name, parameters, engine.interactions) for name in METHODS}
     return Arena(
         Path(path).stem, digest.hexdigest(), lower, upper, start, options, engine.large, np.inf, evaluate
     )

@@ -26,7 +26,8 @@ from calibray.spelling import did_you_mean
 from calibray.study import Study
 
 AUTO: Final = "auto"
-FEW_STARTS: Final = 16  # local searches on a large program
+STARTS: Final = (16, 512)  # local searches on the largest and on small programs
+START_INTERACTIONS: Final = 15_000_000  # local searches times interactions between the two
 
 Progress = Callable[[str, int, int | None], None]
 """Called with what is done, how much of it, and out of how much (None if unknown)."""
@@ -337,20 +338,20 @@ def make_optimizer(name: str, parameters: Parameters, seed: int, **options: obje
         raise InputError(f"method.options of {name!r}: {error}") from None
 
 
-def usual_options(name: str, parameters: Parameters, large: bool) -> dict[str, Any]:
+def usual_options(name: str, parameters: Parameters, interactions: int) -> dict[str, Any]:
     """Settings of a method that follow from what is calibrated; a study's own replace them.
 
     Args:
         name: A method of `METHODS`.
         parameters: The parameters.
-        large: Whether a candidate costs milliseconds.
+        interactions: Interactions that a candidate is evaluated at, 0 where that is no matter.
 
     Returns:
         The settings; none for most methods.
     """
     if name == "least-squares":
-        start = {"x0": to_search(parameters, parameters.start)}
-        return {**start, "starts": FEW_STARTS} if large else start
+        starts = int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))
+        return {"x0": to_search(parameters, parameters.start), "starts": starts}
     return {}
 
 
@@ -361,7 +362,7 @@ def _optimizer(problem: Problem) -> Optimizer:
         name = "least-squares" if replay else "vector-surrogate"
     if name == "least-squares" and not replay:
         raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
-    usual = usual_options(name, parameters, replay and problem.engine.large)
+    usual = usual_options(name, parameters, problem.engine.interactions if replay else 0)
     return make_optimizer(name, parameters, section.seed, **{**usual, **section.options})
 
 

@@ -62,6 +62,11 @@ class ReplayCarriers:
         ]
 
     @property
+    def interactions(self) -> int:
+        """Interactions that a candidate is evaluated at, over all carriers."""
+        return sum(replay.interactions for replay in self._replays)
+
+    @property
     def large(self) -> bool:
         """Whether some carrier has so many interactions that a candidate costs milliseconds."""
         return any(replay.large for replay in self._replays)

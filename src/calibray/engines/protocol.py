@@ -48,6 +48,11 @@ class Differentiable(Engine, Protocol):
         """Whether a candidate costs milliseconds rather than microseconds."""
         ...
 
+    @property
+    def interactions(self) -> int:
+        """Interactions that a candidate is evaluated at."""
+        ...
+
     def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
         ...

@@ -18,6 +18,7 @@ BLOCK_INTERACTIONS: Final = 2_000_000  # interactions x candidates evaluated at 
 TABULATED: Final = 50_000  # interactions beyond which coefficients come from tables
 FIRST_INTERVALS: Final = 2048  # of a table of coefficients
 LAST_INTERVALS: Final = 65536
+NODE_COST: Final = 4  # interactions looked up in the time of evaluating a node, with its share of the check
 TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
 BLOCK_SIZES: Final = (1, 8, 32)  # candidates a call; every size is compiled once
 
@@ -59,14 +60,18 @@ class Replay:
         self._base = jnp.asarray(fields.constants(paths).astype(dtype))
         self._fields = tuple(int(column) for column in used)
         self._intervals = FIRST_INTERVALS if (self.large if tabulate is None else tabulate) else None
+        self._forced = tabulate is True
         self._program = self._laid_out()
-        room = 1 if self._intervals else max(1, BLOCK_INTERACTIONS // max(paths.num_interactions, 1))
-        self._sizes = [size for size in BLOCK_SIZES if size <= room]
+
+    @property
+    def interactions(self) -> int:
+        """Interactions that a candidate is evaluated at."""
+        return self.paths.num_interactions
 
     @property
     def large(self) -> bool:
         """Whether there are so many interactions that a candidate costs milliseconds."""
-        return self.paths.num_interactions > TABULATED
+        return self.interactions > TABULATED
 
     def path_loss(self, candidates: np.ndarray) -> np.ndarray:
         """Path loss of every link for candidates.
@@ -112,7 +117,8 @@ class Replay:
         parts, start = [], 0
         while start < len(values):
             left = len(values) - start
-            size = next((size for size in self._sizes if size >= left), self._sizes[-1])
+            sizes = self._sizes()
+            size = next((size for size in sizes if size >= left), sizes[-1])
             block = values[start : start + size]
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
             tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
@@ -132,7 +138,21 @@ class Replay:
 
     def _laid_out(self) -> fields.Program:
         phases = self._combining != "power"
-        return fields.layout(self.paths, self._dtype, self._intervals, phases).program
+        program = fields.layout(self.paths, self._dtype, self._intervals, phases).program
+        if self._intervals is None or self._forced:
+            return program
+        if (
+            NODE_COST * program.coefficients.num_nodes > self.paths.num_interactions
+        ):  # filling tables would cost more
+            self._intervals = None
+            return fields.layout(self.paths, self._dtype, None, phases).program
+        return program
+
+    def _sizes(self) -> list[int]:
+        """Candidates that a call may take: one where tables are filled for each, else what memory allows."""
+        tabulated = self._intervals is not None
+        room = 1 if tabulated else max(1, BLOCK_INTERACTIONS // max(self.paths.num_interactions, 1))
+        return [size for size in BLOCK_SIZES if size <= room]
 
 
 @jax.jit

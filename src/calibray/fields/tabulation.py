@@ -54,6 +54,11 @@ class Lookup:
     row_mode: jax.Array
     intervals: int
 
+    @property
+    def num_nodes(self) -> int:
+        """Nodes of all rows."""
+        return self.row_material.shape[0] * (self.intervals + 1)
+
 
 @partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=[])
 @dataclass(frozen=True)
