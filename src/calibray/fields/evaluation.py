@@ -119,7 +119,7 @@ def path_losses(
     """
     if isinstance(program.coefficients, Formula):
         found = _many_contributions(program, tables)
-        return decibel(_link_powers(program, found, combining, offsets)), 0.0
+        return _decibel(_link_powers(program, found, combining, offsets)), 0.0
     # Coefficients are looked up where they are used, which is quickest where they are used once.
     once = all(set(group.signature) <= {"c"} for group in program.groups)
     powers, errors = [], []
@@ -128,7 +128,7 @@ def path_losses(
         power = _link_power if once else _link_power_of_pieces
         powers.append(power(program, found if once else _pieces(program, found), combining, offsets))
         errors.append(_table_error(program, found))
-    return decibel(jnp.stack(powers)), float(jnp.stack(errors).max())
+    return _decibel(jnp.stack(powers)), float(jnp.stack(errors).max())
 
 
 def path_losses_and_slopes(
@@ -154,7 +154,7 @@ def path_losses_and_slopes(
     if isinstance(program.coefficients, Formula):
         found, rates = _many_tangents(program, tables, columns)
         power, slope = _powers_and_slopes(program, found, combining, offsets)
-        return decibel(power), _decibel_slopes(program, power, slope, rates, tables.shape[1]), 0.0
+        return _decibel(power), _decibel_slopes(program, power, slope, rates, tables.shape[1]), 0.0
     powers, slopes, errors = [], [], []
     for table in tables:
         found, rates = _tangents(program, table, columns)
@@ -162,7 +162,7 @@ def path_losses_and_slopes(
         powers.append(power)
         slopes.append(_decibel_slope(program, power, slope, rates, table.shape[0]))
         errors.append(_table_error(program, found))
-    return decibel(jnp.stack(powers)), jnp.stack(slopes), float(jnp.stack(errors).max())
+    return _decibel(jnp.stack(powers)), jnp.stack(slopes), float(jnp.stack(errors).max())
 
 
 def _power(
@@ -222,6 +222,7 @@ def _dot(a: Pieces, b: Pieces) -> jax.Array:
     return sum(x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+_decibel = jax.jit(decibel)
 _contributions = jax.jit(contributions)
 _many_contributions = jax.jit(jax.vmap(contributions, in_axes=(None, 0)))
 _pieces = jax.jit(pieces)
