@@ -20,7 +20,7 @@ FIRST_INTERVALS: Final = 2048  # of a table of coefficients
 LAST_INTERVALS: Final = 65536
 NODE_COST: Final = 4  # interactions looked up in the time of evaluating a node, with its share of the check
 TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
-BLOCK_SIZES: Final = (1, 8, 30)  # candidates a call, 30 a generation of the paper; every size is compiled once
+BLOCK_SIZES: Final = (1, 8, 30)  # candidates a call, each size compiled once; the paper has thirty wolves
 
 
 class Replay:
