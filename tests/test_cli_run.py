@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import planted
 import programs
-from calibray import terminal, tracing
+from calibray import terminal
 from calibray.cli import app
 from calibray.paths import Paths
 from calibray.result import FILES, Result
@@ -181,7 +181,9 @@ def test_trace_check_needs_no_file_and_tells_that_nothing_changes(folder):
 
 
 def test_a_long_trace_is_announced_on_stderr(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(tracing, "LANES", 200_000)  # 20,000 samples x 2 interactions x 5 receivers
+    monkeypatch.setattr(
+        "calibray.tracing.tracer.LANES", 200_000
+    )  # 20,000 samples x 2 interactions x 5 receivers
     outcome = calibray("trace", folder / "study.toml", "-o", tmp_path / "paths.h5")
     assert outcome.exit_code == 0, outcome.output
     assert outcome.stderr.startswith(
