@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from calibray import engines
-from calibray.compression import compress
 from calibray.engines import Replay
+from calibray.engines.compression import compress
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
-from calibray.tracing import Tracer
+from calibray.tracing.sionna import Tracer
 from timing import seconds
 
 STUDY = Path(__file__).parents[1] / "examples" / "nist_boulder.toml"

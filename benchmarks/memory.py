@@ -1,8 +1,8 @@
 """What memory tracing takes, and that sharing receivers out over launches does not change the result.
 
     python benchmarks/memory.py             # 2,000 receivers and 2 transmitters in Munich
-    python benchmarks/memory.py --lanes     # bytes of a lane, for calibray.launches.LANE_BYTES
-    python benchmarks/memory.py --paths     # bytes of a path, for calibray.launches.PATH_BYTES
+    python benchmarks/memory.py --lanes     # bytes of a lane, for calibray.tracing.launches.LANE_BYTES
+    python benchmarks/memory.py --paths     # bytes of a path, for calibray.tracing.launches.PATH_BYTES
 
 Each run has a process of its own, whose peak resident memory is what is printed.
 """
@@ -19,9 +19,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from calibray.fields import path_loss
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Tracer, tracer
+from calibray.scenes import read_scene
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer, tracer
 
 FREQUENCY = 3.5e9
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]

@@ -23,12 +23,12 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from calibray import terminal
-from calibray.arena import Arena, landscape_arena, study_arena
-from calibray.cli import log
-from calibray.comparison import compare
+from calibray.cli.commands import log
+from calibray.comparison.arena import Arena, landscape_arena, study_arena
+from calibray.comparison.comparison import compare
 from calibray.files import write_table, write_text
 from calibray.report import comparison as report
+from calibray.report import terminal
 from calibray.report.figures import write
 from calibray.scenarios import demo_study_path
 

@@ -17,7 +17,7 @@ import numpy as np
 from calibray import engines
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
-from calibray.tracing import Trace
+from calibray.tracing.sionna import Trace
 from timing import seconds
 
 

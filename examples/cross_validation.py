@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import calibray as cb
-from calibray.terminal import render_table
+from calibray.report.terminal import render_table
 
 BLOCKS = {
     "nist_boulder": {  # along the street in sight from west to east, and along the other from near to far

@@ -20,9 +20,9 @@ from calibray.fields import path_gains, slab
 from calibray.materials import SCATTERING_PATTERNS, Material
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Trace, Tracer
+from calibray.scenes import read_scene
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Trace, Tracer
 
 PATH_BOUND = 1e-3  # relative error of a path gain
 LOSS_BOUND = 0.01  # [dB], error of a link's path loss

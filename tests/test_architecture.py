@@ -237,7 +237,7 @@ def test_an_import_against_the_table_is_found(imports, fault):
 
 def test_imports_that_the_table_allows_pass():
     imports = {
-        "fields": {"calibray.paths.Paths", "calibray.part.tool", "jax.numpy"},
+        "fields": {"calibray.paths.program.Paths", "calibray.part.tool", "jax.numpy"},
         "paths": {"calibray.materials.Material", "calibray.errors.InputError"},
         "part": {"calibray.materials"},
         "materials": set(),

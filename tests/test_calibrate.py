@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
-from calibray.calibration import (
+from calibray.calibration.calibration import (
     calibrate,
     from_search,
     make_optimizer,
@@ -20,8 +20,7 @@ from calibray.calibration import (
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
-from calibray.parameter import Parameter
-from calibray.parameters import Parameters
+from calibray.parameters import Parameter, Parameters
 from calibray.result import Result
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibration import calibrate
 from calibray.engines import ReplayCarriers
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
@@ -23,10 +23,10 @@ from calibray.fields import path_gains, path_loss
 from calibray.materials import itu_law
 from calibray.paths import Paths, take_links
 from calibray.result import Result
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
+from calibray.scenes import read_scene
 from calibray.study import Study
-from calibray.tracing import Tracer
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
 
 CARRIERS = (3.5e9, 10e9, 28e9)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import synthetic
-from calibray.channel import channel_statistics, delay_profile, power_delay_profile, statistics
 from calibray.errors import InputError
 from calibray.fields import constants, layout, path_loss, path_powers
+from calibray.fields.channel import channel_statistics, delay_profile, power_delay_profile, statistics
 from calibray.materials import FIELDS
 from calibray.paths import Kind, Paths
 

@@ -10,8 +10,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from calibray import doctor
-from calibray.cli import Commands, app
+from calibray.cli import doctor
+from calibray.cli.commands import Commands, app
 from calibray.errors import EngineError, InputError
 
 HEAVY = ("numpy", "scipy", "pandas", "jax", "matplotlib", "pydantic", "h5py", "drjit", "mitsuba", "sionna")
@@ -19,7 +19,7 @@ HEAVY = ("numpy", "scipy", "pandas", "jax", "matplotlib", "pydantic", "h5py", "d
 
 def calibray(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs the installed command."""
-    code = "import sys; sys.argv[0] = 'calibray'; from calibray.cli import main; main()"
+    code = "import sys; sys.argv[0] = 'calibray'; from calibray.cli.commands import main; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )

@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 import planted
 import programs
-from calibray import terminal
-from calibray.cli import app
+from calibray.cli.commands import app
 from calibray.paths import Paths
+from calibray.report import terminal
+from calibray.report.terminal import Enclosed, render_result, render_table, rows_text, summary
 from calibray.result import FILES, Result
-from calibray.terminal import Enclosed, render_result, render_table, rows_text, summary
 
 LOST_ROW = planted.INSIDE + 2  # the header is row 1
 
@@ -182,7 +182,7 @@ def test_trace_check_needs_no_file_and_tells_that_nothing_changes(folder):
 
 def test_a_long_trace_is_announced_on_stderr(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "calibray.tracing.tracer.LANES", 200_000
+        "calibray.tracing.sionna.tracer.LANES", 200_000
     )  # 20,000 samples x 2 interactions x 5 receivers
     outcome = calibray("trace", folder / "study.toml", "-o", tmp_path / "paths.h5")
     assert outcome.exit_code == 0, outcome.output

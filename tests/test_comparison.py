@@ -10,15 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 import planted
-from calibray import comparison as module
-from calibray.arena import landscape_arena, study_arena
-from calibray.calibration import calibrate
-from calibray.cli import app
-from calibray.comparison import Entry, compare, settings
+from calibray.calibration.calibration import calibrate
+from calibray.cli.commands import app
+from calibray.comparison import comparison as module
+from calibray.comparison.arena import landscape_arena, study_arena
+from calibray.comparison.comparison import Entry, compare, settings
+from calibray.comparison.runs import Run, Runs
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
 from calibray.report.comparison import FILES, FLOOR_DB, HEADINGS, figure, markdown, rows
-from calibray.runs import Run, Runs
 from calibray.study import Study
 
 STREET = partial(landscape_arena, "street")

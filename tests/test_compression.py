@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import synthetic
-from calibray.compression import FEW, compress, sparse_weights
 from calibray.engines import Replay
+from calibray.engines.compression import FEW, compress, sparse_weights
 from calibray.errors import InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take

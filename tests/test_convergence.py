@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibray import terminal
-from calibray.convergence import Convergence, check, compare
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Tracer
+from calibray.report import terminal
+from calibray.scenes import read_scene
+from calibray.tracing.convergence import Convergence, check, compare
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9

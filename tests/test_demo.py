@@ -9,8 +9,8 @@ from matplotlib.image import imread
 from scipy.optimize import minimize
 
 from calibray import engines
-from calibray.calibration import Problem
-from calibray.demo import FIGURES, METHODS, run_demo, tables
+from calibray.calibration.calibration import Problem
+from calibray.comparison.experiment import FIGURES, METHODS, run_demo, tables
 from calibray.errors import InputError
 from calibray.scenarios import demo_study_path
 from calibray.study import Study

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.dispersion import CONSTANT, LAWS, power
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, itu_law, itu_material
-from calibray.parameter import Parameter, make_parameter
-from calibray.parameters import Parameters
+from calibray.parameters import Parameter, Parameters, make_parameter
+from calibray.parameters.laws import CONSTANT, LAWS, power
 
 BASE = {"walls": Material(5.0, 0.1, 0.3), "soil": Material(3.0, 0.01, 0.5)}
 CONCRETE = itu_law("concrete", 4e9)

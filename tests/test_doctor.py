@@ -8,8 +8,9 @@ from importlib import metadata
 
 import pytest
 
-from calibray import doctor, llvm
-from calibray.doctor import Check, Diagnosis
+from calibray.cli import doctor
+from calibray.cli.doctor import Check, Diagnosis
+from calibray.tracing import llvm
 
 OLD = llvm.Llvm("/usr/lib/libLLVM-15.so.1", (15,), "LLVM 15 is too old")
 SOUND = Diagnosis(

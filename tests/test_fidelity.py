@@ -19,9 +19,9 @@ import calibray as cb
 from calibray.fields import path_gains, path_loss
 from calibray.materials import Material
 from calibray.paths import Kind, Paths, take
-from calibray.scene import read_scene
-from calibray.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
-from calibray.tracing import Tracer
+from calibray.scenes import read_scene
+from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from fidelity_cases import (
     DATA,
     PATH_BOUND,

@@ -12,17 +12,17 @@ import pytest
 from sionna.rt import antenna_pattern
 
 import calibray as cb
-from calibray import cache
 from calibray.engines import make_scene
 from calibray.engines.exchange import Request, Surroundings
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.fields import path_gains
-from calibray.gain_table import GainTable, read_gain_table
-from calibray.scene import read_scene
-from calibray.settings import POLARIZATIONS, Antenna, TraceSettings
+from calibray.scenes import read_scene
 from calibray.study import Study
-from calibray.tracing import Tracer
+from calibray.tracing import cache
+from calibray.tracing.gain_table import GainTable, read_gain_table
+from calibray.tracing.settings import POLARIZATIONS, Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -137,7 +137,7 @@ def test_gain_is_interpolated_in_decibel_across_the_seam_and_to_the_poles() -> N
 
 def test_tracer_reads_the_table_as_the_table_reads_itself(tables: dict[str, str]) -> None:
     """In random directions and at the edges of the grid, for a grid from 0 and one from -180 degrees."""
-    from calibray.tracing.antennas import tabulated
+    from calibray.tracing.sionna.antennas import tabulated
 
     rng = np.random.default_rng(4)
     azimuth = np.concatenate([rng.uniform(-180, 180, 500), [-180, 180, 0, 179.99, -179.99, 0, 0]])

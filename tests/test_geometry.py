@@ -14,7 +14,9 @@ from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
 from calibray.fields import path_gains, slab
-from calibray.geometry import (
+from calibray.materials import Material
+from calibray.paths import Kind, Paths
+from calibray.paths.chains import (
     Chains,
     Program,
     compile_chains,
@@ -23,8 +25,6 @@ from calibray.geometry import (
     transverse_electric,
     zenith_azimuth,
 )
-from calibray.materials import Material
-from calibray.paths import Kind, Paths
 
 FREQUENCY = 3e9
 WALL = Material(4.0, 0.1, 0.07, scattering_coefficient=0.6)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray import memory, terminal
-from calibray.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
-from calibray.settings import TraceSettings
+from calibray.report import terminal
+from calibray.tracing import memory
+from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
+from calibray.tracing.settings import TraceSettings
 
 MASTS = np.repeat([[0.0, 0, 10], [50, 0, 10]], [7, 4], axis=0)[[0, 7, 1, 8, 2, 9, 3, 10, 4, 5, 6]]
 

@@ -17,14 +17,13 @@ import planted
 import programs
 import restarts
 from calibray import engines
-from calibray.calibration import calibrate
-from calibray.cli import app
+from calibray.calibration.calibration import calibrate
+from calibray.cli.commands import app
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint
 from calibray.engines.ledger import Entry, key
 from calibray.errors import EngineError, InputError
-from calibray.parameter import Parameter
-from calibray.parameters import Parameters
+from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
 
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [3.0, 4.0, 5.0]])

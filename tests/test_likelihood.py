@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import t
 
 from calibray.errors import EngineError, InputError
-from calibray.likelihood import LogDistance, Objective, intervals, make_objective
+from calibray.inference.likelihood import LogDistance, Objective, intervals, make_objective
 from calibray.measurements import Measurements
 
 LINKS = 30

@@ -13,9 +13,9 @@ from types import SimpleNamespace
 import numpy.random.bit_generator
 import pytest
 
-from calibray import llvm
 from calibray.errors import InputError
-from calibray.llvm import Llvm
+from calibray.tracing import llvm
+from calibray.tracing.llvm import Llvm
 
 ELSEWHERE = "/usr/lib/libLLVM"
 
@@ -234,7 +234,7 @@ def test_this_machine_can_trace():
 
 
 def test_the_module_tells_the_choice_or_the_remedy(tmp_path):
-    command = [sys.executable, "-m", "calibray.llvm"]
+    command = [sys.executable, "-m", "calibray.tracing.llvm"]
     good = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (good.returncode, good.stderr) == (0, "")
     assert "_ad_mono_polarized: " in good.stdout

@@ -6,8 +6,8 @@ import pytest
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import Measurements
-from calibray.scene import export_scene, read_scene
-from calibray.tracing import trace
+from calibray.scenes import export_scene, read_scene
+from calibray.tracing.sionna import trace
 
 CANYON = "sionna:simple_street_canyon"
 FREQUENCY = 3.5e9

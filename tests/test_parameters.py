@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, constants
-from calibray.parameter import Parameter, make_parameter, split_name
-from calibray.parameters import Parameters
+from calibray.parameters import Parameter, Parameters, make_parameter, split_name
 
 BASE = {
     "ground": Material(3.0, 0.01, 0.5),

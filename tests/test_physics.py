@@ -22,9 +22,9 @@ from calibray.fields.diffraction import affine_form, transition
 from calibray.fields.scattering import pattern_value
 from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants
 from calibray.paths import Diffraction, Paths
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Tracer
+from calibray.scenes import read_scene
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import write_scene
 
 COSINE = st.floats(0.0, 1.0, exclude_min=True)

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibration import calibrate
 from calibray.errors import InputError
 from calibray.result import FILES, Result
-from calibray.scene import read_scene
+from calibray.scenes import read_scene
 
 OFFSETS = {"west": -3.0, "east": 6.0}
 

@@ -15,8 +15,8 @@ import sionna.rt
 import calibray as cb
 from calibray.errors import InputError
 from calibray.materials import ITU_MATERIALS, Material, itu_material
-from calibray.scene import export_scene, read_scene
-from calibray.tracing import FLOATS
+from calibray.scenes import export_scene, read_scene
+from calibray.tracing.sionna import FLOATS
 from small_scenes import CONCRETE, block, write_scene
 
 SCENES = Path(sionna.rt.__file__).parent / "scenes"

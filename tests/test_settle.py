@@ -7,7 +7,7 @@ import pytest
 
 import planted
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibration import calibrate
 from calibray.paths import take
 
 

@@ -13,8 +13,8 @@ from pydantic import BaseModel
 
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.settings import Antenna, TraceSettings
 from calibray.study import Study, expand
+from calibray.tracing.settings import Antenna, TraceSettings
 
 MINIMAL = """\
 version = 1

@@ -16,11 +16,11 @@ from sionna.rt.utils import fibonacci_lattice
 import calibray as cb
 from calibray.errors import EngineError, InputError
 from calibray.fields import path_gains, path_loss
-from calibray.launches import directions
 from calibray.paths import Paths
-from calibray.scene import read_scene
-from calibray.settings import Antenna, TraceSettings
-from calibray.tracing import Tracer
+from calibray.scenes import read_scene
+from calibray.tracing.launches import directions
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -71,7 +71,7 @@ def test_one_receiver_at_a_time_gives_what_all_at_once_give(
     canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """NVlabs/sionna#1172: a receiver's paths do not depend on which others are traced with it."""
-    monkeypatch.setattr("calibray.tracing.tracer.LANES", MIXED["samples"] * MIXED["max_depth"])
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", MIXED["samples"] * MIXED["max_depth"])
     trace = canyon.trace(links([-20, 2, 15], receivers))
     assert len(trace.chunks) == len(receivers)
     alone = trace.paths()
@@ -101,15 +101,15 @@ def test_several_transmitters_in_any_order(canyon: Tracer, receivers: np.ndarray
 def test_full_buffer_is_traced_again_with_the_same_result(
     canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.tracer.BUFFER", 8)
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
     assert_same(canyon.trace(links([-20, 2, 15], receivers)).paths(), together)
 
 
 def test_paths_that_memory_cannot_hold_are_an_error(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.tracer.BUFFER", 8)
-    monkeypatch.setattr("calibray.tracing.tracer.available", lambda: 32_000)
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.available", lambda: 32_000)
     with pytest.raises(
         EngineError, match=r"more paths than fit into memory, with 6 receivers at work; lower trace\.samples"
     ):
@@ -130,7 +130,7 @@ def test_same_seed_same_paths_and_another_seed_others(
 def test_progress_counts_receivers(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.tracer.LANES", 2 * MIXED["samples"] * MIXED["max_depth"])
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", 2 * MIXED["samples"] * MIXED["max_depth"])
     seen = []
     canyon.trace(links([-20, 2, 15], receivers), lambda done, total: seen.append((done, total)))
     assert seen == [(2, 6), (4, 6), (6, 6)]
@@ -161,7 +161,8 @@ def split(canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
             canyon.scene, FREQUENCY, TraceSettings(**settings), canyon.tx_antenna, canyon.rx_antenna
         )
         monkeypatch.setattr(
-            "calibray.tracing.tracer.LANES", lanes or -(-settings["samples"] * settings["max_depth"] // 7)
+            "calibray.tracing.sionna.tracer.LANES",
+            lanes or -(-settings["samples"] * settings["max_depth"] // 7),
         )
         traces.append(tracer.trace(links([-20, 2, 15], receivers)))
     assert [len(trace.chunks) for trace in traces] == [1, 7 * len(receivers)]

@@ -9,10 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from calibray import cache
-from calibray.compression import compress
 from calibray.engines.carriers import CarrierPaths, ReplayCarriers
 from calibray.engines.command import Command
+from calibray.engines.compression import compress
 from calibray.engines.exchange import Surroundings
 from calibray.engines.fingerprint import fingerprint
 from calibray.engines.ledger import Ledger
@@ -26,9 +25,10 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
-from calibray.scene import Scene, read_scene
+from calibray.scenes import Scene, read_scene
 from calibray.study import Study
-from calibray.tracing import Tracer
+from calibray.tracing import cache
+from calibray.tracing.sionna import Tracer
 
 ENGINES: Final = ("replay", "retrace", "command")
 

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from calibray.materials import Material
-from calibray.settings import Antenna
+from calibray.tracing.settings import Antenna
 
 SCHEMA: Final = "calibray.request"
 VERSION: Final = 1

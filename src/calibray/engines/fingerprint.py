@@ -9,12 +9,12 @@ from dataclasses import asdict
 from importlib.metadata import version
 from xml.etree import ElementTree
 
-from calibray.cache import meshes
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
-from calibray.scene import Scene
+from calibray.scenes import Scene
 from calibray.study import Study
+from calibray.tracing.cache import meshes
 
 TRACER: tuple[str, ...] = ("sionna-rt", "mitsuba", "drjit")
 

@@ -14,7 +14,7 @@ from calibray.engines.protocol import Answer, Progress, check_candidates
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
-from calibray.tracing import Tracer
+from calibray.tracing.sionna import Tracer
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from calibray.comparison import REFERENCE, Comparison, quantile
+from calibray.comparison.comparison import REFERENCE, Comparison, quantile
 from calibray.files import write_table
 from calibray.report.figures import COLORS, label, plain_figure
 from calibray.report.figures import write as write_figure

@@ -13,13 +13,11 @@ from typing import Any, Final, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
-from calibray.dispersion import steady_law
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
-from calibray.parameter import Parameter, itu_start, make_parameter
-from calibray.parameters import Parameters
-from calibray.settings import Antenna
+from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
+from calibray.parameters.laws import steady_law
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
     AntennasSection,
@@ -37,6 +35,7 @@ from calibray.study.sections import (
     Text,
     TraceSection,
 )
+from calibray.tracing.settings import Antenna
 
 VERSION: Final = 1
 """The version of the study file that this module reads."""

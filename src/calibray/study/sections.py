@@ -10,8 +10,8 @@ from pydantic.dataclasses import dataclass as checked
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
-from calibray.parameter import Scale
-from calibray.settings import Antenna, TraceSettings
+from calibray.parameters import Scale
+from calibray.tracing.settings import Antenna, TraceSettings
 
 _CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 _Antenna = checked(Antenna, config=_CLOSED, frozen=True)

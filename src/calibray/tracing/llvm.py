@@ -4,7 +4,7 @@ On a machine without CUDA, Dr.Jit compiles its kernels with the newest libLLVM t
 that it cannot work with ends the whole process. So the choice is made here, before Dr.Jit is imported: every
 candidate is opened in a process of its own, and `DRJIT_LIBLLVM_PATH` is set to the best one.
 
-`python -m calibray.llvm` prints what the ray tracer will run on, or says what to install and exits with 2.
+`python -m calibray.tracing.llvm` prints what the ray tracer will run on, or says what to install and exits with 2.
 """
 
 from __future__ import annotations
@@ -291,7 +291,7 @@ def _refuse_loaded() -> None:
     if loaded[0] < OLDEST_MAJOR:
         state = "without libLLVM" if loaded[0] < 0 else f"with LLVM {loaded[0]}"
         raise InputError(
-            f"Dr.Jit was imported {state}, and needs {OLDEST_MAJOR} or newer. Call calibray.llvm.prepare() "
+            f"Dr.Jit was imported {state}, and needs {OLDEST_MAJOR} or newer. Call calibray.tracing.llvm.prepare() "
             f"before importing sionna.rt, mitsuba or drjit, or set {PATH_VARIABLE}. To install one: "
             f"{remedy()}"
         )

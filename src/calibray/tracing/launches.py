@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from calibray.settings import TraceSettings
+from calibray.tracing.settings import TraceSettings
 
 LANE_BYTES: Final = 40  # peak while tracing, measured by benchmarks/memory.py --lanes
 # Bytes of a path, and of each of its interactions, until it is compiled; measured by benchmarks/memory.py --paths

@@ -17,7 +17,7 @@ from calibray import engines
 from calibray.engines import Differentiable, Engine, Recorded
 from calibray.errors import InputError
 from calibray.files import check_folder
-from calibray.likelihood import Interval, LogDistance, Objective, intervals, make_objective
+from calibray.inference.likelihood import Interval, LogDistance, Objective, intervals, make_objective
 from calibray.measurements import Measurements
 from calibray.optimizers import METHODS, Optimizer
 from calibray.parameters import Parameters

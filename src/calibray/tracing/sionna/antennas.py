@@ -14,9 +14,9 @@ from sionna.rt.antenna_pattern import (
 )
 from sionna.rt.utils import rotation_matrix
 
-from calibray.gain_table import GainTable, read_gain_table
-from calibray.settings import Antenna
-from calibray.tracing.arrays import aligned
+from calibray.tracing.gain_table import GainTable, read_gain_table
+from calibray.tracing.settings import Antenna
+from calibray.tracing.sionna.arrays import aligned
 
 
 def patterns_of(antenna: Antenna) -> list:

@@ -12,9 +12,9 @@ import numpy as np
 from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
-from calibray.launches import Launch, directions, repeated
 from calibray.paths import Kind
-from calibray.tracing.arrays import aligned, per_interaction, vertices_of
+from calibray.tracing.launches import Launch, directions, repeated
+from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,12 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from calibray.calibration import Progress as Report
-from calibray.convergence import Convergence
-from calibray.dispersion import PARAMETER_BOUNDS
-from calibray.launches import Plan
+from calibray.calibration.calibration import Progress as Report
+from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.result import Result
+from calibray.tracing.convergence import Convergence
+from calibray.tracing.launches import Plan
 
 LONG: Final = 20_000_000  # rays x interactions x receivers that take some seconds
 LISTED: Final = 12  # rows named one by one before the rest is only counted

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibray import engines
-from calibray.calibration import Problem, from_search, search_slope, to_search, usual_options
+from calibray.calibration.calibration import Problem, from_search, search_slope, to_search, usual_options
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, landscapes

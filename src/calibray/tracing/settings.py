@@ -8,7 +8,7 @@ from math import isfinite
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.gain_table import is_gain_file, read_gain_table
+from calibray.tracing.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calibray import engines
-from calibray.calibration import Progress, calibrate
+from calibray.calibration.calibration import Progress, calibrate
 from calibray.files import check_folder, write_text
 from calibray.report import figures
 from calibray.result import Result

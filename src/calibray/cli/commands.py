@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from calibray.measurements import Measurements
-    from calibray.terminal import Enclosed
-    from calibray.tracing import Tracer
+    from calibray.report.terminal import Enclosed
+    from calibray.tracing.sionna import Tracer
 
 PREDICTED: Final = "path_loss_db"  # the column that `predict` adds
 
@@ -85,7 +85,7 @@ def calibray(
 @app.command()
 def doctor() -> None:
     """Tell what is installed, try whether tracing and replay work here, and say what to do if not."""
-    from calibray.doctor import examine, render
+    from calibray.cli.doctor import examine, render
 
     with log.status("Trying Dr.Jit, Sionna RT and JAX"):
         diagnosis = examine()
@@ -109,8 +109,8 @@ def demo(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
 ) -> None:
     """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
-    from calibray import terminal
-    from calibray.demo import FIGURES, run_demo, tables
+    from calibray.comparison.experiment import FIGURES, run_demo, tables
+    from calibray.report import terminal
 
     with terminal.progress_bars(log) as progress:
         finished = run_demo(out, engine, seed, progress)
@@ -149,12 +149,12 @@ def run(
     ] = False,
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
-    from calibray import terminal
-    from calibray.calibration import calibrate
+    from calibray.calibration.calibration import calibrate
     from calibray.engines import make_tracer, open_executor
+    from calibray.report import terminal
+    from calibray.report.terminal import Enclosed
     from calibray.result import FILES
     from calibray.study import Study
-    from calibray.terminal import Enclosed
 
     study = Study.load(study_file).replace(engine=engine)
     with open_executor(workers, scheduler) as executor, terminal.progress_bars(log) as progress:
@@ -198,10 +198,10 @@ def compare(
             f"{library}_NUM_THREADS", "1"
         )  # read when NumPy is loaded, here and in the workers
 
-    from calibray import terminal
-    from calibray.arena import study_arena
-    from calibray.comparison import compare as run_all
+    from calibray.comparison.arena import study_arena
+    from calibray.comparison.comparison import compare as run_all
     from calibray.report import comparison as report
+    from calibray.report import terminal
 
     names = [name.strip() for name in methods.split(",") if name.strip()]
     with terminal.progress_bars(log) as progress:
@@ -231,10 +231,11 @@ def trace(
     ] = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
-    from calibray import convergence, terminal
     from calibray.engines import make_tracer
     from calibray.files import check_file
+    from calibray.report import terminal
     from calibray.study import Study
+    from calibray.tracing import convergence
 
     study = Study.load(study_file)
     _refuse_idleness(out, check)
@@ -299,9 +300,9 @@ def predict(
     """Predict path loss at links that were never measured, with the calibrated scene."""
     import numpy as np
 
-    from calibray import terminal
     from calibray.files import check_table, write_table
     from calibray.measurements import read_links
+    from calibray.report import terminal
     from calibray.result import Result
 
     result = Result.load(folder)
@@ -346,9 +347,9 @@ def ledger(
     """List or export the RT calls that were paid for."""
     from contextlib import closing
 
-    from calibray import terminal
     from calibray.engines import open_ledger
     from calibray.files import check_table, write_table
+    from calibray.report import terminal
 
     if out is not None:
         check_table(out)
@@ -365,7 +366,7 @@ def ledger(
 
 def _enclosed(tracer: Tracer, links: Measurements) -> Enclosed:
     """Which antennas of some links stand inside closed bodies."""
-    from calibray.terminal import Enclosed
+    from calibray.report.terminal import Enclosed
 
     return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
 

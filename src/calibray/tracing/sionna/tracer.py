@@ -4,9 +4,9 @@ Sionna's solver is a chain of stages: candidates by shooting and bouncing, exact
 The first two never depend on what is calibrated, so their result is kept (`Trace`) and compiled into a path program.
 The third stage remains at hand as the rival that replay is measured and tested against.
 
-Receivers, and rays if need be, are shared out over launches (`calibray.launches`): Sionna's path buffer is shared by
-all receivers of a source, and its memory grows with samples x depth x receivers (NVlabs/sionna#1172). A buffer that
-filled up is traced again, larger.
+Receivers, and rays if need be, are shared out over launches (`calibray.tracing.launches`): Sionna's path buffer is
+shared by all receivers of a source, and its memory grows with samples x depth x receivers (NVlabs/sionna#1172). A
+buffer that filled up is traced again, larger.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from calibray.errors import EngineError, InputError
-from calibray.geometry import Chains, compile_chains, zenith_azimuth
-from calibray.launches import Launch, Plan, paths_that_fit, plan
 from calibray.materials import Material
-from calibray.memory import available
 from calibray.paths import Paths, concatenate
-from calibray.scene import Scene, check_material_name, read_scene
-from calibray.settings import Antenna, TraceSettings, as_antenna
-from calibray.tracing.antennas import jones_vectors, patterns_of, turned
-from calibray.tracing.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
-from calibray.tracing.chunks import Chunk, share_of_rays, without_repeats
-from calibray.tracing.loading import load, scattering_pattern, shape_materials
+from calibray.paths.chains import Chains, compile_chains, zenith_azimuth
+from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan
+from calibray.tracing.memory import available
+from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
+from calibray.tracing.sionna.antennas import jones_vectors, patterns_of, turned
+from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
+from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
+from calibray.tracing.sionna.loading import load, scattering_pattern, shape_materials
 
 LANES: Final = 20_000_000  # samples x depth x receivers of one launch
 BUFFER: Final = 1_000_000  # paths that the buffer of one launch holds at first

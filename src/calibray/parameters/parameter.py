@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final, Literal, get_args
 
-from calibray.dispersion import CONSTANT, LAWS, PARAMETER_BOUNDS, steady_law
 from calibray.errors import InputError
 from calibray.materials import (
     DEFAULT_REVISION,
@@ -18,6 +17,7 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
+from calibray.parameters.laws import CONSTANT, LAWS, PARAMETER_BOUNDS, steady_law
 from calibray.spelling import did_you_mean
 
 Scale = Literal["linear", "log"]

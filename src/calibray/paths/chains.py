@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.constants import speed_of_light
 
-from calibray.paths import Diffraction, Diffuse, Kind
+from calibray.paths.program import Diffraction, Diffuse, Kind
 
 
 @dataclass(frozen=True)

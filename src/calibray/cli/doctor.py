@@ -14,9 +14,9 @@ import sys
 from dataclasses import dataclass
 from importlib import metadata
 
-from calibray import llvm
 from calibray.errors import InputError
-from calibray.llvm import Llvm
+from calibray.tracing import llvm
+from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
 """Longest time [s] that one check may take; the first import on a slow disk is what takes long."""

@@ -14,7 +14,7 @@ import numpy as np
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.paths import Paths
-from calibray.tracing import Links, Tracer
+from calibray.tracing.sionna import Links, Tracer
 
 
 @dataclass(frozen=True)

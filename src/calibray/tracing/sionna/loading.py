@@ -11,7 +11,7 @@ from sionna.rt.scene import load_scene_from_string
 
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.scene import Scene
+from calibray.scenes import Scene
 
 
 def load(scene: Scene) -> rt.Scene:

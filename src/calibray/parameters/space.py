@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.dispersion import LAWS, PARAMETER_BOUNDS, check_law, power, steady_law
 from calibray.errors import InputError
 from calibray.materials import FIELDS, ItuLaw, Material, constants
-from calibray.parameter import Parameter, check_material
+from calibray.parameters.laws import LAWS, PARAMETER_BOUNDS, check_law, power, steady_law
+from calibray.parameters.parameter import Parameter, check_material
 
 _NO_LAW: Final = steady_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300

@@ -19,8 +19,8 @@ import numpy as np
 
 from calibray.errors import InputError
 from calibray.paths import SCHEMA_VERSION, Paths
-from calibray.scene import Scene
-from calibray.settings import Antenna, TraceSettings
+from calibray.scenes import Scene
+from calibray.tracing.settings import Antenna, TraceSettings
 
 VARIABLE: Final = "CALIBRAY_CACHE"
 

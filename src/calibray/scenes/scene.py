@@ -17,7 +17,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from calibray.dispersion import steady_law
 from calibray.errors import InputError
 from calibray.files import write_text
 from calibray.materials import (
@@ -29,6 +28,7 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
+from calibray.parameters.laws import steady_law
 from calibray.spelling import did_you_mean
 
 BUNDLED_PREFIX: Final = "sionna:"

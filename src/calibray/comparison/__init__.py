@@ -1,0 +1,1 @@
+"""Comparison: methods side by side from many seeds at equal budgets."""

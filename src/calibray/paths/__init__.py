@@ -1,0 +1,14 @@
+"""Paths: the path program, and the chains of interactions that any tracer hands over to make one."""
+
+from calibray.paths.program import (
+    SCHEMA_VERSION,
+    Diffraction,
+    Diffuse,
+    Kind,
+    Paths,
+    concatenate,
+    take,
+    take_links,
+)
+
+__all__ = ["SCHEMA_VERSION", "Diffraction", "Diffuse", "Kind", "Paths", "concatenate", "take", "take_links"]

@@ -1,0 +1,28 @@
+"""Progress: how long work tells how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+Progress = Callable[[str, int, int | None], None]
+"""Called with the stage ("tracing", "calibrating", ...), how much is done, and out of how much; None if unknown."""
+
+
+def staged(progress: Progress | None, stage: str) -> Progress | None:
+    """Tell progress under another stage's name.
+
+    Args:
+        progress: Whom to tell; None for nobody.
+        stage: The name in place of that of the work itself, as "checking" for a trace that checks another.
+
+    Returns:
+        What the work calls.
+
+    Example:
+        >>> told = staged(lambda *parts: print(*parts), "checking")
+        >>> told("tracing", 3, 40)
+        checking 3 40
+    """
+    if progress is None:
+        return None
+    return lambda _, done, total: progress(stage, done, total)
