@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from calibray.engines import Replay, make_tracer
+from calibray import engines
+from calibray.engines import Replay
 from calibray.measurements import links_from_frame
-from calibray.study import Study
+from calibray.study import Setup, Study
 
 TRUTH = {
     "concrete.relative_permittivity": 3.2,
@@ -61,9 +62,7 @@ def study(folder: Path, table: pd.DataFrame, **sections: Any) -> Study:
 def engine(blocked: bool = False) -> Replay:
     """The replay engine over the links, traced and compiled once."""
     plan = Study.from_content(content("links.csv"))
-    tracer = make_tracer(plan)
-    paths = tracer.trace(links_from_frame(links(blocked))).paths()
-    return Replay(paths, plan.parameter_set(tracer.scene.materials))
+    return engines.make(Setup.open(plan, links=links_from_frame(links(blocked))))
 
 
 def path_loss(values: Mapping[str, float] = TRUTH, blocked: bool = False) -> np.ndarray:

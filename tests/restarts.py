@@ -23,7 +23,7 @@ from calibray.engines.ledger import Ledger
 # Imports once and then forks a process for each run, which takes hundredths of a second instead of many seconds.
 RUNNER = """
 import os, sys
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.engines import open_executor
 from calibray.study import Study
 for line in sys.stdin:

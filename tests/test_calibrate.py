@@ -10,13 +10,8 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
-from calibray.calibration.calibration import (
-    calibrate,
-    from_search,
-    make_optimizer,
-    search_slope,
-    to_search,
-)
+from calibray.calibration import calibrate
+from calibray.calibration.methods import make_optimizer
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
@@ -255,12 +250,12 @@ def test_the_search_space_is_the_logarithm_where_asked_for():
         )
     )
     values = np.array([[5.0, 0.1], [12.0, 1.0]])
-    points = to_search(parameters, values)
+    points = parameters.to_search(values)
     assert points.tolist() == [[5.0, np.log(0.1)], [12.0, 0.0]]
-    assert from_search(parameters, points) == pytest.approx(values)
+    assert parameters.from_search(points) == pytest.approx(values)
     step = 1e-6
-    slope = (from_search(parameters, points + step) - from_search(parameters, points - step)) / (2 * step)
-    assert search_slope(parameters, values)[0] == pytest.approx(slope[0])
+    ahead, behind = (parameters.from_search(points + each) for each in (step, -step))
+    assert parameters.search_slope(values)[0] == pytest.approx((ahead - behind)[0] / (2 * step))
     assert make_optimizer("gwo", parameters, 0).ask()[:, 1].max() <= 0.0
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from calibray import engines
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.engines import ReplayCarriers
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
@@ -24,7 +24,7 @@ from calibray.materials import itu_law
 from calibray.paths import Paths, take_links
 from calibray.result import Result
 from calibray.scenes import read_scene
-from calibray.study import Study
+from calibray.study import Setup, Study
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from small_scenes import block, write_scene
@@ -114,7 +114,7 @@ def traced_at_ten(folder: Path) -> Paths:
     plan = study(folder)
     links = plan.measurements()
     ten = links.select(links.frequency == 10e9)
-    return engines.traced_paths(plan, engines.make_scene(plan), ten)
+    return Setup.open(plan, links=ten).trace()
 
 
 # The physics at another carrier
@@ -195,7 +195,7 @@ def test_replay_is_that_of_the_fields_at_each_carrier_in_the_links_order(
     """Constants by hand from the law; the others from ITU-R at the carrier."""
     plan = study(folder)
     links = plan.measurements()
-    paths = engines.traced_paths(plan, engines.make_scene(plan), links)
+    paths = plan.opened().trace()
     for frequency in CARRIERS:
         materials = read_scene(folder / "scene.xml", frequency).materials
         ghz = frequency / 1e9
@@ -224,14 +224,14 @@ def test_links_that_differ_in_their_carrier_alone_are_traced_once(
     seen: list[int] = []
     original: Callable = Tracer.trace
 
-    def trace(self: Tracer, links: Any, progress: Any = None) -> Any:
+    def trace(self: Tracer, links: Any, progress: Any = None, materials: Any = None) -> Any:
         seen.append(len(links.rx))
-        return original(self, links, progress)
+        return original(self, links, progress, materials)
 
     monkeypatch.setattr(Tracer, "trace", trace)
     plan = study(folder)
     links = plan.measurements()
-    paths = engines.traced_paths(plan, engines.make_scene(plan), links)
+    paths = plan.opened().trace()
     assert seen == [len(receivers())]
     np.testing.assert_array_equal(paths.rx_position, links.rx)
     assert paths.num_links == len(links) == 3 * len(receivers())
@@ -243,11 +243,10 @@ def test_one_carrier_in_a_column_is_the_same_as_none(folder: Path) -> None:
     plan, laws = study(folder, parameters=constants), study(folder)
     links = plan.measurements()
     ten = links.select(links.frequency == 10e9)
-    scene, paths = engines.make_scene(plan), traced_at_ten(folder)
+    paths = traced_at_ten(folder)
     alone = replace(ten, frequency=None)
     single, several = (
-        engines.make_replay(plan, paths, each, engines.make_parameters(plan, scene, each))
-        for each in (alone, ten)
+        engines.make(Setup.open(plan, links=each), "replay", paths=paths) for each in (alone, ten)
     )
     assert isinstance(single, engines.Replay)
     point = np.array([[5.5, 0.2]])
@@ -255,7 +254,7 @@ def test_one_carrier_in_a_column_is_the_same_as_none(folder: Path) -> None:
         several.path_loss_and_jacobian(point), single.path_loss_and_jacobian(point), strict=True
     ):
         np.testing.assert_array_equal(mine, theirs)
-    lawful = engines.make_replay(laws, paths, alone, engines.make_parameters(laws, scene, alone))
+    lawful, scene = engines.make(Setup.open(laws, links=alone), "replay", paths=paths), plan.opened().scene
     same = single.path_loss([[6.1 * 10**-0.07, scene.materials["soil"].conductivity]])
     wall = {**TRUTH, "walls.itu_c": scene.materials["walls"].conductivity, "walls.itu_d": 0.0}
     np.testing.assert_allclose(lawful.path_loss(vector(wall)[None]), same, atol=1e-9)
@@ -302,8 +301,7 @@ def test_a_program_gets_the_carrier_of_every_link_and_the_constants_there(folder
 def test_fingerprint_tells_carriers_and_fixed_coefficients_apart(folder: Path) -> None:
     def mark(**sections: Any) -> str:
         plan = study(folder, **sections)
-        scene, links = engines.make_scene(plan), plan.measurements()
-        return fingerprint(plan, scene, links, engines.make_parameters(plan, scene, links), "command")
+        return fingerprint(plan.opened())
 
     few = {name: LAW[name] for name in ("walls.itu_a", "walls.itu_c")}
     other = {"walls": {"itu": "concrete", "revision": "P.2040-1"}}  # another exponent of the conductivity

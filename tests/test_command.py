@@ -15,7 +15,7 @@ import pytest
 import planted
 import programs
 from calibray import engines
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.engines import Engine, Ledger
 from calibray.engines.exchange import Unusable, read_answer
 from calibray.errors import EngineError, InputError

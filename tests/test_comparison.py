@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import planted
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.cli.commands import app
 from calibray.comparison import comparison as module
 from calibray.comparison.arena import landscape_arena, study_arena

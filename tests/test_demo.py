@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from scipy.optimize import minimize
 
 from calibray import engines
-from calibray.calibration.calibration import Problem
+from calibray.calibration.problem import Problem
 from calibray.comparison.experiment import FIGURES, METHODS, run_demo, tables
 from calibray.errors import InputError
 from calibray.scenarios import demo_study_path
@@ -24,8 +24,8 @@ def demo(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def problem():
-    study = Study.load(demo_study_path())
-    return Problem.of(study, study.measurements(), engines.make(study, "replay"))
+    setup = Study.load(demo_study_path()).opened()
+    return Problem.of(setup, engines.make(setup, "replay"))
 
 
 def test_rt_calls_are_the_papers(demo):

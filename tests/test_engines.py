@@ -7,9 +7,10 @@ import pytest
 
 import planted
 from calibray import engines
-from calibray.engines import Engine, Replay, Retrace, make_scene, make_tracer
+from calibray.engines import Engine, Replay, Retrace
 from calibray.errors import InputError
 from calibray.fields import path_loss
+from calibray.study import Setup
 
 TRUTH = np.array([list(planted.TRUTH.values())])
 
@@ -108,14 +109,16 @@ def test_candidates_that_are_none_are_refused_and_not_counted(retrace, wrong, me
         assert engine.calls == calls
 
 
-def test_an_unknown_engine_is_refused_before_anything_is_read(study):
+def test_an_unknown_engine_is_refused(study):
     with pytest.raises(InputError, match="engine 'replya': must be one of replay, retrace"):
         engines.make(study, "replya")
 
 
 def test_the_scene_is_traced_with_the_starts_unless_told_otherwise(tmp_path):
     start = {"marble.scattering_coefficient": {"bounds": [0.0, 0.9], "start": 0.7}}
-    study = planted.study(tmp_path, planted.campaign(), parameters=start)
-    assert make_scene(study).materials["marble"].scattering_coefficient == 0.7
-    calibrated = make_scene(study).materials | {"marble": make_scene(study).materials["wood"]}
-    assert make_tracer(study, calibrated).scene.materials["marble"].scattering_coefficient == 0.0
+    setup = Setup.open(planted.study(tmp_path, planted.campaign(), parameters=start))
+    assert setup.scene.materials["marble"].scattering_coefficient == 0.7
+    assert setup.trace().materials == setup.scene.materials
+    calibrated = setup.scene.materials | {"marble": setup.scene.materials["wood"]}
+    assert setup.trace(calibrated).materials["marble"].scattering_coefficient == 0.0
+    assert setup.trace().materials == setup.scene.materials

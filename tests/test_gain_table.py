@@ -12,7 +12,6 @@ import pytest
 from sionna.rt import antenna_pattern
 
 import calibray as cb
-from calibray.engines import make_scene
 from calibray.engines.exchange import Request, Surroundings
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
@@ -259,9 +258,10 @@ def study(tmp_path: Path) -> Study:
 
 def prints(study: Study) -> tuple[str, str]:
     """The digest of the trace and the fingerprint of a study's RT calls."""
-    scene, links = make_scene(study), study.measurements()
-    trace = cache.trace_digest(scene, FREQUENCY, study.trace, study.antenna_pair, links.tx, links.rx)
-    return trace, fingerprint(study, scene, links, study.parameter_set(scene.materials), "command")
+    setup = study.opened()
+    scene, links = setup.scene, setup.links
+    trace = cache.trace_digest({}, scene, FREQUENCY, study.trace, study.antenna_pair, links.tx, links.rx)
+    return trace, fingerprint(setup)
 
 
 def test_file_lies_beside_the_study_and_counts_by_what_it_holds(study: Study, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import planted
 import programs
 import restarts
 from calibray import engines
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.cli.commands import app
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint
@@ -228,9 +228,7 @@ def test_calls_are_shared_by_methods_seeds_bounds_and_measured_values(tmp_path):
 
 def problem(study: Study) -> str:
     """The fingerprint of a study's problem."""
-    scene = engines.make_scene(study)
-    parameters = study.parameter_set(scene.materials)
-    return fingerprint(study, scene, study.measurements(), parameters, study.engine.name)
+    return fingerprint(study.opened())
 
 
 @pytest.mark.parametrize(

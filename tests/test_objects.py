@@ -69,6 +69,7 @@ def test_a_split_scene_traces_alike_and_one_object_changes_alone(tmp_path):
         split.material == list(split.materials).index(touched[0])]])  # fmt: skip
     moved = np.abs(path_loss(split, changed) - path_loss(split)) > 1e-9
     assert set(np.flatnonzero(moved)) == set(through)
-    export_scene(CANYON, {**split.materials, **changed}, tmp_path / "scene.xml", {"own/*": "building_*"})
+    scene = read_scene(CANYON, FREQUENCY, split={"own/*": "building_*"})
+    export_scene(scene, {**split.materials, **changed}, tmp_path / "scene.xml")
     again = trace(tmp_path / "scene.xml", links, **settings)
     np.testing.assert_allclose(path_loss(again), path_loss(split, changed), atol=1e-3)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibray import engines
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.errors import EngineError
 from calibray.study import Study
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import planted
-from calibray.calibration.calibration import calibrate
+from calibray.calibration import calibrate
 from calibray.errors import InputError
 from calibray.result import FILES, Result
 from calibray.scenes import read_scene

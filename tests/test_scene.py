@@ -243,7 +243,7 @@ def test_exported_scene_traces_to_the_same_path_loss(tmp_path: Path) -> None:
     }
     target = tmp_path / "deep" / "calibrated.xml"
     target.parent.mkdir()
-    export_scene(source, new, target)
+    export_scene(read_scene(source, frequency), new, target)
     expected = cb.path_loss(original, new)
 
     again = cb.trace(target, links, frequency=frequency, **options)
@@ -270,14 +270,14 @@ def test_exported_material_avoids_names_that_sionna_keeps_for_itu(tmp_path: Path
     target = tmp_path / "out.xml"
     scene = read_scene("sionna:floor_wall", 3.5e9)
     assert set(scene.materials) <= set(ITU_MATERIALS["P.2040-3"])
-    export_scene("sionna:floor_wall", scene.materials, target)
+    export_scene(scene, scene.materials, target)
     assert set(read_scene(target, 3.5e9).materials) == {f"calibrated-{name}" for name in scene.materials}
 
 
 def test_exported_scene_keeps_its_meshes_when_exported_from_a_folder_to_another(tmp_path: Path) -> None:
     file = write_scene(tmp_path / "here", {"house": block((-1, -1, 0), (1, 1, 2)), **FLOOR})
     (tmp_path / "there").mkdir()
-    export_scene(file, {"stone": Material(3.0, 0.2, 0.1)}, tmp_path / "there" / "scene.xml")
+    export_scene(read_scene(file, 1e9), {"stone": Material(3.0, 0.2, 0.1)}, tmp_path / "there" / "scene.xml")
     scene = read_scene(tmp_path / "there" / "scene.xml", 1e9)
     assert scene.materials == {"stone": Material(3.0, 0.2, 0.1)}
     assert [entry.name for entry in scene.objects] == ["house", "floor"]
@@ -285,5 +285,9 @@ def test_exported_scene_keeps_its_meshes_when_exported_from_a_folder_to_another(
 
 def test_export_needs_every_material(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no constants for the material 'brick'"):
-        export_scene("sionna:floor_wall", {"concrete": Material(3.0, 0.2, 0.1)}, tmp_path / "scene.xml")
+        export_scene(
+            read_scene("sionna:floor_wall", 3.5e9),
+            {"concrete": Material(3.0, 0.2, 0.1)},
+            tmp_path / "scene.xml",
+        )
     assert not list(tmp_path.iterdir())

@@ -3,12 +3,9 @@
 Names are loaded when first used, so that importing the package costs nothing.
 """
 
-from __future__ import annotations
+from calibray.lazy import lazily
 
-from importlib import import_module
-from typing import Any
-
-_HOME = {
+_HOMES = {
     "Material": "calibray.materials",
     "itu_material": "calibray.materials",
     "Measurements": "calibray.measurements",
@@ -20,23 +17,12 @@ _HOME = {
     "path_gains": "calibray.fields",
     "path_loss": "calibray.fields",
     "Study": "calibray.study",
+    "Setup": "calibray.study",
     "Result": "calibray.result",
-    "calibrate": "calibray.calibration",
+    "calibrate": "calibray.calibration.calibrate",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
 }
 
-__all__ = sorted(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'calibray' has no attribute {name!r}")
-    module = import_module(_HOME[name])
-    value = module if _HOME[name] == f"calibray.{name}" else getattr(module, name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+__all__ = sorted(_HOMES)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from calibray import fields
-from calibray.engines import make_parameters, make_replay, make_scene, traced_paths
 from calibray.errors import InputError
 from calibray.files import check_folder, write_text
 from calibray.inference.likelihood import Interval
 from calibray.materials import Material
-from calibray.measurements import Measurements, links_from_frame
-from calibray.scenes import export_scene
+from calibray.measurements import Measurements
+from calibray.progress import Progress
+from calibray.scenes import Scene, export_scene, read_scene
 from calibray.study import Study
-from calibray.tracing.sionna import Progress
+from calibray.tracing.enclosed import Enclosed
 
 VERSION: Final = 1
 FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")
@@ -57,6 +56,9 @@ class Result:
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         laws: How calibrated constants follow the frequency: the coefficients itu_a to itu_d of ITU-R P.2040's law, by
             material of which one is a parameter.
+        groups_without_path: Groups that have no offset, because no link of theirs to calibrate on has a path.
+        enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
+        scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
     """
 
     study: Study
@@ -81,6 +83,26 @@ class Result:
     links: pd.DataFrame
     history: pd.DataFrame
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
+    groups_without_path: tuple[str, ...] = ()
+    enclosed: Enclosed | None = None
+    scene: Scene | None = None
+
+    @property
+    def counts(self) -> dict[str, Any]:
+        """The links of the calibration in numbers, with the rows that need a look.
+
+        Of the links held out only those count that the hold-out's RMSE is taken over.
+        """
+        has_path = self.links["has_path"].to_numpy(bool)
+        held_out = self.links["held_out"].to_numpy(bool)
+        usable = has_path | (self.study.objective.no_path == "censor")
+        return {
+            "calibrated_on": int((~held_out & usable).sum()),
+            "held_out": int((held_out & usable).sum()),
+            "rows_without_path": self.links["row"][~has_path].tolist(),
+            "rows_with_enclosed_tx": None if self.enclosed is None else list(self.enclosed.tx),
+            "rows_with_enclosed_rx": None if self.enclosed is None else list(self.enclosed.rx),
+        }
 
     def save(self, folder: str | Path) -> None:
         """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.
@@ -103,7 +125,10 @@ class Result:
             ) from None
 
     def _write(self, target: Path) -> None:
-        export_scene(self.study.scene_source, self.materials, target / SCENE_FILE, self.study.objects)
+        scene = self.scene or read_scene(
+            self.study.scene_source, self.study.scene.frequency, self.study.overrides, self.study.objects
+        )
+        export_scene(scene, self.materials, target / SCENE_FILE)
         write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.6g"))
         write_text(target / HISTORY_FILE, self.history.to_csv(index=False, float_format="%.9g"))
         write_text(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
@@ -133,6 +158,9 @@ class Result:
             "offsets_db": self.offsets_db,
             "materials": {name: asdict(material) for name, material in self.materials.items()},
             "laws": self.laws,
+            "groups_without_path": list(self.groups_without_path),
+            "links": self.counts,
+            "antennas_indoors": None if self.enclosed is None else self.enclosed.indoors,
         }
 
     @classmethod
@@ -162,18 +190,26 @@ class Result:
             )
         study = Study.from_content(content.pop("study"), content.pop("study_file"))
         del content["version"]
+        # Results of the version before say nothing of what follows.
+        counts, indoors = content.pop("links", {}), content.pop("antennas_indoors", None)
+        if indoors is not None:
+            ends = (tuple(counts[f"rows_with_enclosed_{end}"]) for end in ("tx", "rx"))
+            content["enclosed"] = Enclosed(*ends, indoors)
+        content["groups_without_path"] = tuple(content.get("groups_without_path", ()))
         content["intervals"] = {name: Interval(**entry) for name, entry in content["intervals"].items()}
         content["materials"] = {name: Material(**entry) for name, entry in content["materials"].items()}
         return cls(study=study, links=links, history=history, **content)
 
-    def predict(self, links: Measurements | pd.DataFrame, progress: Progress | None = None) -> np.ndarray:
-        """Path loss at links that were never measured, with the calibrated scene.
+    def predict(
+        self, links: Measurements | pd.DataFrame, progress: Progress | None = None
+    ) -> NDArray[np.float64]:
+        """Path loss at links that were never measured; see `calibray.inference.prediction.predict`.
 
         Args:
             links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] and the study's group
                 column, if it has one. The study's column of frequencies gives the links' carriers; without it all
                 links have the scene's.
-            progress: Called with (receivers traced, receivers in all) after every chunk.
+            progress: Called with the stage "tracing" after every launch.
 
         Returns:
             Path loss, offsets included [n], [dB]; +inf where no path leads.
@@ -181,29 +217,6 @@ class Result:
         Raises:
             InputError: A column is missing, a position cannot be used, or a group has no calibrated offset.
         """
-        per = self.study.offset.per if self.study.offset else None
-        if not isinstance(links, Measurements):
-            links = links_from_frame(links, group=per, frequency=self.study.links.frequency)
-        offset = self._offset(links)
-        paths = traced_paths(self.study, make_scene(self.study, self.materials), links, progress)
-        if links.frequency is not None:
-            parameters = make_parameters(self.study, make_scene(self.study), links)
-            values = np.array([[self.parameters[name] for name in parameters.names]])
-            return make_replay(self.study, paths, links, parameters).path_loss(values)[0] + offset
-        objective = self.study.objective
-        return fields.path_loss(paths, None, objective.combining, self.study.scene.bandwidth) + offset
+        from calibray.inference.prediction import predict
 
-    def _offset(self, links: Measurements) -> np.ndarray:
-        if not self.offsets_db:
-            return np.zeros(len(links))
-        unknown = [name for name in links.group_names if name not in self.offsets_db]
-        if unknown:
-            raise InputError(
-                f"{links.source}: group {unknown[0]!r} has no calibrated offset; known: {', '.join(self.offsets_db)}"
-            )
-        return np.array([self.offsets_db[name] for name in links.group_names])[links.group_index]
-
-
-def by_group(names: tuple[str, ...], values: np.ndarray) -> Mapping[str, float]:
-    """Values by group name."""
-    return {name: float(value) for name, value in zip(names, values, strict=True)}
+        return predict(self, links, progress)

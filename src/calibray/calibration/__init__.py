@@ -1,5 +1,5 @@
-"""Calibration: the one loop around an engine."""
+"""Calibration: the one loop around an engine, and what it needs and leaves behind."""
 
-from calibray.calibration.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 
 __all__ = ["calibrate"]

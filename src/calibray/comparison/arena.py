@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from calibray import engines
-from calibray.calibration.calibration import Problem, from_search, search_slope, to_search, usual_options
+from calibray.calibration.methods import usual_options
+from calibray.calibration.problem import Evaluation, Problem
+from calibray.calibration.search import Evaluate
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, landscapes
-from calibray.study import Study
-
-Told = tuple[np.ndarray, np.ndarray, np.ndarray | None]
-"""Objective [n], residuals [n, m], and their derivatives [n, m, d] or None."""
+from calibray.study import Setup, Study
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +32,7 @@ class Arena:
         options: Settings of methods that the problem suggests, by method.
         large: Whether an evaluation is so dear that searches from few starts have to do.
         minimum: Lowest objective known beforehand; +inf if none is.
-        evaluate: Points [n, d], and whether derivatives are wanted, to what an optimizer is told.
+        evaluate: What is searched.
     """
 
     name: str
@@ -45,7 +43,7 @@ class Arena:
     options: dict[str, dict[str, Any]]
     large: bool
     minimum: float
-    evaluate: Callable[[np.ndarray, bool], Told]
+    evaluate: Evaluate
 
 
 def study_arena(path: str | Path) -> Arena:
@@ -61,35 +59,33 @@ def study_arena(path: str | Path) -> Arena:
         InputError: The study cannot be used, or its engine is an external program.
     """
     study = Study.load(path)
-    if study.engine.name == "command":
+    if study.engine.external:
         raise InputError(
-            f"{path}: engine 'command' is too dear for hundreds of runs; methods are compared on stored paths: "
-            "set engine.name to 'replay'"
+            f"{path}: engine {study.engine.name!r} is too dear for hundreds of runs; methods are compared on stored "
+            "paths: set engine.name to 'replay'"
         )
-    links, scene = study.measurements(), engines.make_scene(study)
-    engine = engines.make(study, "replay")
-    problem = Problem.of(study, links, engine)
-    objective, parameters = problem.objective, engine.parameters
-    lower, upper = to_search(parameters, parameters.lower), to_search(parameters, parameters.upper)
-
-    def evaluate(points: np.ndarray, derivatives: bool) -> Told:
-        candidates = from_search(parameters, points)
-        if not derivatives:
-            loss = engine.path_loss(candidates)
-            return objective.rmse(loss), objective.residuals(loss), None
-        loss, slope = engine.path_loss_and_jacobian(candidates)
-        slope = slope * search_slope(parameters, candidates)[:, None, :]
-        return objective.rmse(loss), objective.residuals(loss), objective.jacobian(loss, slope)
-
-    digest = hashlib.sha256(fingerprint(study, scene, links, parameters, "replay").encode())
+    setup = Setup.open(study.replace(engine="replay"))
+    engine = engines.make(setup)
+    problem = Problem.of(setup, engine)
+    objective, parameters, links = problem.objective, problem.parameters, setup.links
+    lower, upper = parameters.search_bounds
+    digest = hashlib.sha256(fingerprint(setup).encode())
     for part in (lower, upper, objective.measured, objective.weight, objective.group, objective.bounds):
         digest.update(np.asarray(part, dtype="<f8").tobytes())
     digest.update(repr((objective.num_groups, objective.ceiling_db)).encode())
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
-    start = to_search(parameters, parameters.start)
+    start = parameters.to_search(parameters.start)
     options = {name: usual_options(name, parameters, engine.interactions) for name in METHODS}
     return Arena(
-        Path(path).stem, digest.hexdigest(), lower, upper, start, options, engine.large, np.inf, evaluate
+        Path(path).stem,
+        digest.hexdigest(),
+        lower,
+        upper,
+        start,
+        options,
+        engine.large,
+        np.inf,
+        problem.evaluate,
     )
 
 
@@ -104,13 +100,13 @@ def landscape_arena(name: str) -> Arena:
     """
     land: landscapes.Landscape = getattr(landscapes, name)()
 
-    def evaluate(points: np.ndarray, derivatives: bool) -> Told:
+    def evaluate(points: np.ndarray, derivatives: bool) -> Evaluation:
         value, residuals, jacobian = land.evaluate(points)
-        return value, residuals, jacobian if derivatives else None
+        return Evaluation(value, residuals, jacobian if derivatives else None, residuals)
 
     known = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)
     digest = hashlib.sha256(name.encode())
-    for part in (land.lower, land.upper, *evaluate(middle[None], True)):
+    for part in (land.lower, land.upper, *evaluate(middle[None], True)[:3]):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
     return Arena(name, digest.hexdigest(), land.lower, land.upper, middle, {}, False, known, evaluate)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from calibray import engines
-from calibray.calibration.calibration import Progress, calibrate
+from calibray.calibration import calibrate
 from calibray.files import check_folder, write_text
+from calibray.progress import Progress, staged
 from calibray.report import figures
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
-from calibray.study import Study
+from calibray.study import Setup, Study
 
 METHODS: Final = ("gwo", "sgwo-im")
 AUTO: Final = "auto"
@@ -94,17 +95,18 @@ def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progres
     check_folder(out)
     study = Study.load(demo_study_path())
     started = time.perf_counter()
-    replay = engines.make(study, "replay", progress=_staged(progress, "tracing"))
+    setup = Setup.open(study)
+    replay = engines.make(setup, "replay", progress)
     trace_seconds = time.perf_counter() - started
-    chosen = replay if engine == "replay" else engines.make(study, engine)
+    chosen = replay if engine == "replay" else engines.make(setup, engine)
     results = {
         method: calibrate(
-            study, method, seed, engine=chosen, progress=_named(progress, figures.label(method))
+            setup, method, seed, engine=chosen, progress=staged(progress, figures.label(method))
         )
         for method in METHODS
     }
     results[AUTO] = calibrate(
-        study, AUTO, seed, engine=replay, progress=_named(progress, figures.label(AUTO))
+        setup, AUTO, seed, engine=replay, progress=staged(progress, figures.label(AUTO))
     )
     truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
     demo = Demo(
@@ -196,11 +198,3 @@ def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
 def _paper(method: str, *keys: str) -> list[str]:
     known: Mapping[str, float] = PAPER.get(method, {})
     return [f"{known[key]:g}" if key in known else "-" for key in keys]
-
-
-def _named(progress: Progress | None, name: str) -> Progress | None:
-    return None if progress is None else lambda _, done, total: progress(name, done, total)
-
-
-def _staged(progress: Progress | None, name: str) -> engines.Progress | None:
-    return None if progress is None else lambda done, total: progress(name, done, total)

@@ -5,50 +5,30 @@
 - `Command` asks any external program.
 - `Recorded` puts a `Ledger` before one of the latter two, so that no RT call is paid for twice.
 
-A run of one candidate over all links is an RT call. It is counted here, where the engine runs.
+A run of one candidate over all links is an RT call. It is counted here, where the engine runs. What a study may say
+of an engine stands in `engines.kinds`, light enough to be read with the study; the engines themselves are loaded when
+they are used.
 """
 
-from calibray.engines.assembly import (
-    ENGINES,
-    compressed_paths,
-    make,
-    make_parameters,
-    make_replay,
-    make_scene,
-    make_tracer,
-    traced_paths,
-)
-from calibray.engines.carriers import ReplayCarriers
-from calibray.engines.command import Command
-from calibray.engines.ledger import LEDGER_FILE, Ledger, open_ledger
-from calibray.engines.pool import open_executor
-from calibray.engines.protocol import Answer, Answering, Differentiable, Engine, Progress, check_candidates
-from calibray.engines.recorded import Recorded
-from calibray.engines.replay import Replay
-from calibray.engines.retrace import Retrace
+from calibray.lazy import lazily
 
-__all__ = [
-    "ENGINES",
-    "LEDGER_FILE",
-    "Answer",
-    "Answering",
-    "Command",
-    "Differentiable",
-    "Engine",
-    "Ledger",
-    "Progress",
-    "Recorded",
-    "Replay",
-    "ReplayCarriers",
-    "Retrace",
-    "check_candidates",
-    "compressed_paths",
-    "make",
-    "make_parameters",
-    "make_replay",
-    "make_scene",
-    "make_tracer",
-    "open_executor",
-    "open_ledger",
-    "traced_paths",
-]
+_HOMES = {
+    "LEDGER_FILE": "calibray.engines.ledger",
+    "Answer": "calibray.engines.protocol",
+    "Answering": "calibray.engines.protocol",
+    "Command": "calibray.engines.command",
+    "Differentiable": "calibray.engines.protocol",
+    "Engine": "calibray.engines.protocol",
+    "Ledger": "calibray.engines.ledger",
+    "Recorded": "calibray.engines.recorded",
+    "Replay": "calibray.engines.replay",
+    "ReplayCarriers": "calibray.engines.carriers",
+    "Retrace": "calibray.engines.retrace",
+    "check_candidates": "calibray.engines.protocol",
+    "make": "calibray.engines.making",
+    "open_executor": "calibray.engines.pool",
+    "open_ledger": "calibray.engines.ledger",
+}
+
+__all__ = sorted(_HOMES)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

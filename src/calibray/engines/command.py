@@ -11,10 +11,11 @@ import numpy as np
 
 from calibray.engines.exchange import Request, Surroundings
 from calibray.engines.program import Outcome, Program
-from calibray.engines.protocol import Answer, Progress, check_candidates, gather
+from calibray.engines.protocol import Answer, check_candidates, gather
 from calibray.errors import EngineError
 from calibray.materials import Material
 from calibray.parameters import Parameters
+from calibray.progress import Progress
 
 
 class Command:
@@ -30,7 +31,7 @@ class Command:
         materials: The scene's materials before calibration.
         parameters: What the candidates' components stand for.
         executor: What runs the calls of a batch; one after the other if None.
-        progress: Called with (candidates run, candidates asked for) after every one.
+        progress: Called with the stage "running" after every candidate of a batch.
         source: The study file, for messages.
         carriers: The scene's materials before calibration at each carrier of the links [Hz]; none where all links have
             the study's.
@@ -94,7 +95,7 @@ class Command:
         for done, (index, outcome) in enumerate(outcomes, start=1):
             self.calls += 1
             if self._progress is not None:
-                self._progress(done, len(requests))
+                self._progress("running", done, len(requests))
             failure = self._place(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure)
             self._failed = self._failed + 1 if failure else 0

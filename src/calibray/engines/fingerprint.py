@@ -6,47 +6,34 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from importlib.metadata import version
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from calibray.materials import Material
-from calibray.measurements import Measurements
-from calibray.parameters import Parameters
 from calibray.scenes import Scene
-from calibray.study import Study
 from calibray.tracing.cache import meshes
 
-TRACER: tuple[str, ...] = ("sionna-rt", "mitsuba", "drjit")
+if TYPE_CHECKING:
+    from calibray.study.setup import Setup
 
 
-def fingerprint(
-    study: Study,
-    scene: Scene,
-    links: Measurements,
-    parameters: Parameters,
-    engine: str,
-    carriers: Mapping[float, Mapping[str, Material]] | None = None,
-) -> str:
+def fingerprint(setup: Setup) -> str:
     """The problem that an engine solves for each candidate.
 
     Method and seed do not count, nor do measured values, bounds and starts: calls are shared by all that vary them.
     For re-tracing the versions of the tracer count; a program's own version cannot be known, its words count.
 
     Args:
-        study: The study.
-        scene: Its scene.
-        links: Its links.
-        parameters: What the candidates' components stand for.
-        engine: Name of the engine.
-        carriers: The scene's materials at each carrier of the links [Hz]; none where all links have the study's.
+        setup: The opened study; its engine counts.
 
     Returns:
         SHA-256 in hexadecimal.
     """
+    study, scene, links, parameters = setup.study, setup.scene, setup.links, setup.parameters
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     record = {
-        "engine": engine,
-        "made by": [version(name) for name in TRACER] if engine == "retrace" else study.engine.command,
+        "engine": study.engine.name,
+        "made by": study.engine.answers_by,
         "frequency": study.scene.frequency,
         "bandwidth": study.scene.bandwidth,
         "combining": study.objective.combining,
@@ -61,8 +48,10 @@ def fingerprint(
             name: {key: value for key, value in entry.items() if f"{name}.{key}" not in parameters.names}
             for name, entry in law.items()
         }
-    if carriers:
-        record["carriers"] = {str(each): _fixed(materials, free) for each, materials in carriers.items()}
+    if setup.carriers:
+        record["carriers"] = {
+            str(each): _fixed(materials, free) for each, materials in setup.carriers.items()
+        }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     digest.update(_geometry(scene))
     for mesh in meshes(scene):

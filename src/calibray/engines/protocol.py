@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -11,8 +11,6 @@ import numpy as np
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.parameters import Parameters
-
-Progress = Callable[[int, int], None]
 
 
 @runtime_checkable

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibray import fields
-from calibray.engines.protocol import Answer, Progress, check_candidates
+from calibray.engines.protocol import Answer, check_candidates
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
+from calibray.progress import Progress
 from calibray.tracing.sionna import Tracer
 
 
@@ -41,7 +42,7 @@ class Retrace:
         parameters: What the candidates' components stand for.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        progress: Called with (candidates run, candidates asked for) after every one.
+        progress: Called with the stage "running" after every candidate of a batch.
     """
 
     def __init__(
@@ -92,7 +93,7 @@ class Retrace:
                 loss[part.index] = self._one(part, candidate)
             self.calls += 1
             if self._progress is not None:
-                self._progress(index + 1, len(candidates))
+                self._progress("running", index + 1, len(candidates))
             yield Answer(index, loss, time.perf_counter() - started)
 
     def _one(self, part: CarrierTracer, candidate: np.ndarray) -> np.ndarray:

@@ -172,13 +172,28 @@ class Measurements:
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.
         """
+        held_out = self.held_out(holdout)
+        return self.select(~held_out), self.select(held_out)
+
+    def held_out(self, holdout: str) -> NDArray[np.bool_]:
+        """The mask [links] of the links that a filter holds out.
+
+        Args:
+            holdout: Filter over the source table's columns.
+
+        Returns:
+            The mask [links], true for some links and not for all.
+
+        Raises:
+            InputError: The filter is not valid, or one of the parts would be empty.
+        """
         held_out = self.where(holdout)
         for part, mask in (("the hold-out", held_out), ("calibration", ~held_out)):
             if not mask.any():
                 raise InputError(
                     f"{self.source}: where = {holdout!r} leaves no link for {part}; change the filter"
                 )
-        return self.select(~held_out), self.select(held_out)
+        return held_out
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int, ...], dtype: type = np.float64) -> NDArray:

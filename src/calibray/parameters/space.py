@@ -89,6 +89,14 @@ class Parameters:
         """Whether each parameter [parameters] is searched on a logarithmic scale."""
         return np.array([parameter.scale == "log" for parameter in self.items])
 
+    def named(self, candidate: ArrayLike) -> dict[str, float]:
+        """The values of a candidate [parameters] by the parameters' names.
+
+        Raises:
+            InputError: The candidate has another length.
+        """
+        return dict(zip(self.names, self._components(candidate).tolist(), strict=True))
+
     def entries(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -279,14 +287,49 @@ class Parameters:
         batch[..., rows, columns] = values
         return batch
 
-    def to_unit(self, candidates: ArrayLike) -> NDArray[np.float64]:
-        """Candidates [..., parameters] scaled so that the bounds become 0 and 1.
+    @property
+    def search_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The lower and the upper bounds [parameters] of the search space."""
+        return self.to_search(self.lower), self.to_search(self.upper)
+
+    def to_search(self, candidates: ArrayLike) -> NDArray[np.float64]:
+        """Candidates [..., parameters] as optimizers see them: some as logarithms, where the search is to span decades.
+
+        Others keep their physical unit, as in the paper.
 
         Raises:
             InputError: The candidates have another length.
         """
-        lower, span = self._scaled_bounds()
-        return (self._scaled(self._components(candidates)) - lower) / span
+        values = self._components(candidates)
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
+
+    def from_search(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Candidates [..., parameters] in the fields' units from points of the search space; never beyond the bounds.
+
+        Raises:
+            InputError: The points have another length.
+        """
+        values = self._components(points)
+        values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, values, 0.0)), values)
+        # Rounding of exp and log would otherwise leave the bounds by an ulp.
+        return np.clip(values, self.lower, self.upper)
+
+    def search_slope(self, candidates: ArrayLike) -> NDArray[np.float64]:
+        """Derivatives [..., parameters] of the fields' units by the search coordinates, at candidates.
+
+        Raises:
+            InputError: The candidates have another length.
+        """
+        return np.where(self.logarithmic, self._components(candidates), 1.0)
+
+    def to_unit(self, candidates: ArrayLike) -> NDArray[np.float64]:
+        """Candidates [..., parameters] of the search space, scaled so that the bounds become 0 and 1.
+
+        Raises:
+            InputError: The candidates have another length.
+        """
+        lower, upper = self.search_bounds
+        return (self.to_search(candidates) - lower) / (upper - lower)
 
     def from_unit(self, unit: ArrayLike) -> NDArray[np.float64]:
         """Candidates [..., parameters] from values in which the bounds are 0 and 1; never beyond the bounds.
@@ -294,11 +337,8 @@ class Parameters:
         Raises:
             InputError: The values have another length.
         """
-        lower, span = self._scaled_bounds()
-        values = lower + self._components(unit) * span
-        values[..., self.logarithmic] = np.exp(values[..., self.logarithmic])
-        # Rounding of exp and log would otherwise leave the bounds by an ulp.
-        return np.clip(values, self.lower, self.upper)
+        lower, upper = self.search_bounds
+        return self.from_search(lower + self._components(unit) * (upper - lower))
 
     def _components(self, values: ArrayLike) -> NDArray[np.float64]:
         array = np.asarray(values, dtype=np.float64)
@@ -307,12 +347,3 @@ class Parameters:
                 f"candidates: shape {array.shape}, must end in {len(self)}, one value per parameter"
             )
         return array
-
-    def _scaled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled = values.copy()
-        scaled[..., self.logarithmic] = np.log(values[..., self.logarithmic])
-        return scaled
-
-    def _scaled_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        lower = self._scaled(self.lower)
-        return lower, self._scaled(self.upper) - lower

@@ -8,7 +8,6 @@ constants itself (NVlabs/sionna-rt#71, #72), and steps around Sionna's rules on 
 
 from __future__ import annotations
 
-import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -18,11 +17,9 @@ from pathlib import Path
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.files import write_text
 from calibray.materials import (
     BOUNDS,
     DEFAULT_REVISION,
-    ITU_MATERIALS,
     ItuLaw,
     Material,
     itu_law,
@@ -32,7 +29,12 @@ from calibray.parameters.laws import steady_law
 from calibray.spelling import did_you_mean
 
 BUNDLED_PREFIX: Final = "sionna:"
-DEFAULT_THICKNESS: Final = 0.1  # [m], Sionna's default for a material without one
+DEFAULT_THICKNESS: Final = 0.1
+"""Sionna's default for a material without one [m]."""
+
+TRACED: Final = "mat-calibray-"
+"""What the ids of materials begin with in a scene for the tracer; their place in `Scene.materials` follows."""
+
 _MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
 
 
@@ -115,7 +117,7 @@ def read_scene(
             bsdf = definitions.get(original)
             materials[name] = _material(name, original, bsdf, constants, frequency, path)
             laws[name] = _law(materials[name], original, bsdf, constants, frequency)
-        _refer(shape, f"mat-calibray-{list(materials).index(name)}")
+        _refer(shape, f"{TRACED}{list(materials).index(name)}")
         objects.append(SceneObject(_object_name(shape), name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
@@ -130,7 +132,7 @@ def read_scene(
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
     for index, material in enumerate(materials.values()):
-        root.insert(index, _bsdf(f"mat-calibray-{index}", material))
+        root.insert(index, material_element(f"{TRACED}{index}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
     return Scene(str(source), path, materials, tuple(objects), xml, laws)
 
@@ -357,7 +359,16 @@ def _refer(shape: ElementTree.Element, identifier: str) -> None:
     ElementTree.SubElement(shape, "ref", {"id": identifier, "name": "bsdf"})
 
 
-def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
+def material_element(identifier: str, material: Material) -> ElementTree.Element:
+    """The BSDF of a material: the constants that Sionna's scene files know.
+
+    Args:
+        identifier: Its id.
+        material: The constants.
+
+    Returns:
+        The XML element.
+    """
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
     for name in (
         "relative_permittivity",
@@ -368,49 +379,3 @@ def _bsdf(identifier: str, material: Material) -> ElementTree.Element:
     ):
         ElementTree.SubElement(bsdf, "float", {"name": name, "value": repr(getattr(material, name))})
     return bsdf
-
-
-def export_scene(
-    source: str | Path,
-    materials: Mapping[str, Material],
-    target: Path,
-    split: Mapping[str, str] | None = None,
-) -> None:
-    """Write a scene file with other constants; it refers to the meshes of the original.
-
-    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `calibrated-NAME`. Its
-    scene files know no scattering pattern but the Lambertian one; another has to be set by who loads the scene.
-
-    Args:
-        source: The original: a path, or `sionna:NAME`.
-        materials: Constants by material name.
-        target: File to write.
-        split: Materials made for some objects, as in `read_scene`.
-
-    Raises:
-        InputError: The original cannot be read, or a material of it is missing.
-    """
-    path = _scene_path(str(source))
-    root = _parse(path, str(source))
-    definitions = _bsdf_definitions(root)
-    names = {name: f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}" for name in materials}
-    for shape in root.findall("shape"):
-        _, name = _materials_of(shape, definitions, split or {}, path)
-        if name not in names:
-            raise InputError(f"{path}: there are no constants for the material {name!r}; export all of them")
-        _refer(shape, names[name])
-        filename = shape.find("string[@name='filename']")
-        if filename is not None:
-            mesh = (path.parent / filename.get("value", "")).resolve()
-            filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
-    for bsdf in root.findall("bsdf"):
-        root.remove(bsdf)
-    for index, (name, material) in enumerate(materials.items()):
-        root.insert(index, _bsdf(names[name], material))
-    ElementTree.indent(root)
-    write_text(target, ElementTree.tostring(root, encoding="unicode") + "\n")
-
-
-def _is_itu_name(name: str) -> bool:
-    names = {known for table in ITU_MATERIALS.values() for known in table}
-    return name in names or name.startswith(("itu_", "itu-"))

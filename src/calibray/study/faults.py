@@ -20,6 +20,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "greater_than": "must be greater than {gt:g}",
     "less_than_equal": "must be at most {le:g}",
     "literal_error": "must be one of {expected}",
+    "union_tag_invalid": "must be one of {expected_tags}",
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
     "float_type": "must be a number",
@@ -36,7 +37,11 @@ _WORDS: Final[Mapping[str, str]] = {
 
 
 def explain(
-    error: ValidationError, model: type[BaseModel], content: Mapping[str, Any], source: str
+    error: ValidationError,
+    model: type[BaseModel],
+    content: Mapping[str, Any],
+    source: str,
+    tagged: Sequence[str] = (),
 ) -> InputError:
     """One message for all faults, a line each: file, dotted key, value, bound.
 
@@ -45,29 +50,45 @@ def explain(
         model: The model that the content was validated against; its keys are offered for misspelled ones.
         content: The content.
         source: Name of the file, for the message.
+        tagged: Tables of which there are several kinds, told apart by their `name`.
 
     Returns:
         The error to raise.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():
-        path = _path(fault["loc"], content)
+        location = fault["loc"]
+        if location[0] in tagged:
+            # The kind stands behind the table's name, which is no key.
+            location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
+        path = _path(location, content)
         key = dotted(path)
-        context = fault.get("ctx", {})
         if fault["type"] in _UNKNOWN:
             line = f"{key}: unknown key; {did_you_mean(str(path[-1]), _keys(model, path[:-1]))}"
         elif fault["type"] == "missing":
             line = f"{key}: {_WORDS['missing']}"
-        elif isinstance(cause := context.get("error"), InputError):
-            # A message about a whole table names the key itself.
-            text = str(cause)
-            line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
         else:
-            words = _WORDS.get(fault["type"], fault["msg"]).format(**context)
-            line = f"{key}{_shown(path, content)}: {words}"
+            text = words(fault)
+            # A message about a whole table names the key itself.
+            line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
         # A value that fits none of several types has one fault per type; the first says enough.
         lines.setdefault(key, line)
     return InputError("\n".join(f"{source}: {line}" for line in lines.values()))
+
+
+def words(fault: Mapping[str, Any]) -> str:
+    """What is wrong with a value, without the value.
+
+    Args:
+        fault: One of the errors that Pydantic lists.
+
+    Returns:
+        The message.
+    """
+    context = fault.get("ctx", {})
+    if isinstance(cause := context.get("error"), InputError):
+        return str(cause)
+    return _WORDS.get(fault["type"], fault["msg"]).format(**context)
 
 
 def dotted(path: Sequence[str | int]) -> str:
@@ -107,12 +128,17 @@ def _shown(path: Sequence[str | int], content: Any) -> str:
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
-    """The keys that a model knows at a path."""
+    """The keys that a model knows at a path, of whichever kind it may be there."""
+    models = [model]
     for part in path:
-        model = (
-            _table(_annotations(model).get(str(part))) if _annotations(model) else _table(get_args(model)[1])
-        )
-    return list(_annotations(model))
+        models = [
+            table
+            for each in models
+            for table in _tables(
+                _annotations(each).get(str(part)) if _annotations(each) else get_args(each)[1]
+            )
+        ]
+    return list(dict.fromkeys(key for each in models for key in _annotations(each)))
 
 
 def _annotations(model: Any) -> dict[str, Any]:
@@ -121,7 +147,7 @@ def _annotations(model: Any) -> dict[str, Any]:
     return {field.name: field.type for field in fields(model)} if is_dataclass(model) else {}
 
 
-def _table(annotation: Any) -> Any:
-    """The table among the types that a key may have."""
+def _tables(annotation: Any) -> list[Any]:
+    """The tables among the types that a key may have."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
-    return next((option for option in options if option is not type(None)), None)
+    return [option for option in options if option is not type(None)]

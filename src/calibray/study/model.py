@@ -9,19 +9,23 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
+from calibray.closed import Section, Text
+from calibray.engines.kinds import DEFAULT, KINDS, AnyEngine
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
+from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
     AntennasSection,
-    EngineSection,
     FidelitySection,
     HoldoutSection,
     LinksSection,
@@ -31,11 +35,12 @@ from calibray.study.sections import (
     OffsetSection,
     ParameterSection,
     SceneSection,
-    Section,
-    Text,
     TraceSection,
 )
 from calibray.tracing.settings import Antenna
+
+if TYPE_CHECKING:
+    from calibray.study.setup import Setup
 
 VERSION: Final = 1
 """The version of the study file that this module reads."""
@@ -77,9 +82,10 @@ class Study(Section):
     holdout: HoldoutSection | None = None
     fidelity: FidelitySection = Field(default_factory=FidelitySection)
     method: MethodSection = Field(default_factory=MethodSection)
-    engine: EngineSection = Field(default_factory=EngineSection)
+    engine: AnyEngine = Field(default_factory=KINDS[DEFAULT])
 
     _path: Path = PrivateAttr(default=Path("study.toml"))
+    _other_engines: dict[str, Any] = PrivateAttr(default_factory=dict)
 
     @field_validator("version")
     @classmethod
@@ -154,12 +160,14 @@ class Study(Section):
             InputError: A key is unknown or a value impossible; one line for each fault.
         """
         _refuse_unquoted_names(content.get("parameters"), path)
+        own, others = part_engine(content.get("engine", {}), str(path))
+        content = {**content, "engine": own}
         try:
             # By way of JSON, where lists pass for tuples and yet nothing is converted: "4" is no number.
             study = cls.model_validate_json(json.dumps(content, default=str))
         except ValidationError as error:
-            raise explain(error, cls, content, str(path)) from None
-        study._path = Path(path)
+            raise explain(error, cls, content, str(path), tagged=("engine",)) from None
+        study._path, study._other_engines = Path(path), others
         return study
 
     @property
@@ -213,6 +221,28 @@ class Study(Section):
         """
         links = self.links.model_dump(exclude={"file"})
         return read_measurements(self.links_path, group=self.offset.per if self.offset else None, **links)
+
+    def held_out(self, measurements: Measurements) -> NDArray[np.bool_]:
+        """Which links are held out; none without ``[holdout]``.
+
+        Args:
+            measurements: Links with the columns that the hold-out's filter names.
+
+        Returns:
+            The mask [links].
+
+        Raises:
+            InputError: The filter is not valid, or one of the parts would be empty.
+        """
+        if self.holdout is None:
+            return np.zeros(len(measurements), dtype=bool)
+        return measurements.held_out(self.holdout.where)
+
+    def opened(self) -> Setup:
+        """The study opened: its links, scene and parameters read (see `Setup.open`)."""
+        from calibray.study.setup import Setup
+
+        return Setup.open(self)
 
     def split(self, measurements: Measurements) -> tuple[Measurements, Measurements | None]:
         """Part links into those to calibrate on and those held out, None without ``[holdout]``.
@@ -282,7 +312,9 @@ class Study(Section):
 
     def content(self) -> dict[str, Any]:
         """The study as plain values, every default written out; `from_content` takes it back."""
-        return self.model_dump(mode="json", exclude_none=True)
+        content = self.model_dump(mode="json", exclude_none=True)
+        content["engine"] |= self._other_engines
+        return content
 
     def digest(self) -> str:
         """A fingerprint of the study: SHA-256 of its content, the same however the file is laid out.

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass as checked
 
+from calibray.closed import CLOSED, Section, Text
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
 from calibray.parameters import Scale
 from calibray.tracing.settings import Antenna, TraceSettings
 
-_CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-_Antenna = checked(Antenna, config=_CLOSED, frozen=True)
-TraceSection = checked(TraceSettings, config=_CLOSED, frozen=True)
+_Antenna = checked(Antenna, config=CLOSED, frozen=True)
+TraceSection = checked(TraceSettings, config=CLOSED, frozen=True)
 
-Text = Annotated[str, Field(min_length=1)]
 Coordinate = float | str
-
-
-class Section(BaseModel):
-    """What all sections share: no unknown keys, no conversions, no change."""
-
-    model_config = ConfigDict(**_CLOSED, frozen=True)
 
 
 class SceneSection(Section):
@@ -224,40 +217,3 @@ class MethodSection(Section):
     name: Text = "auto"
     seed: Annotated[int, Field(ge=0)] = 0
     options: dict[str, Any] = Field(default_factory=dict)
-
-
-class EngineSection(Section):
-    """``[engine]``: what turns candidates into path loss.
-
-    Attributes:
-        name: "replay", "retrace" or "command".
-        command: The program that "command" calls, and its arguments.
-        timeout: Time that one attempt of the program may take [s].
-        retries: How often the program is tried again after a failure.
-        format: Format of the files exchanged with the program: "json" or "hdf5".
-        give_up_after: Failed calls one after the other that end the run.
-        compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
-    """
-
-    name: Literal["replay", "retrace", "command"] = "replay"
-    command: tuple[Text, ...] | None = None
-    timeout: Annotated[float, Field(gt=0)] = 3600.0
-    retries: Annotated[int, Field(ge=0)] = 2
-    format: Literal["json", "hdf5"] = "json"
-    give_up_after: Annotated[int, Field(ge=1)] = 10
-    compress_db: Annotated[float, Field(gt=0)] | None = None
-
-    @field_validator("command")
-    @classmethod
-    def _named(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        if value is not None and not value:
-            raise InputError("must name the program to call")
-        return value
-
-    @model_validator(mode="after")
-    def _command_where_called(self) -> Self:
-        if self.name == "command" and self.command is None:
-            raise InputError(
-                'name = \'command\' needs command, the program and its arguments, as ["octave-cli", "model.m"]'
-            )
-        return self

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -32,6 +32,7 @@ def trace_digest(
     antennas: tuple[Antenna, Antenna],
     tx: np.ndarray,
     rx: np.ndarray,
+    tracer: Mapping[str, str],
 ) -> str:
     """What a trace depends on, as a fingerprint.
 
@@ -42,18 +43,13 @@ def trace_digest(
         antennas: Transmit and receive antenna.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
+        tracer: Versions of what traces, by name.
 
     Returns:
         SHA-256 in hexadecimal.
     """
     record = {
-        "versions": [
-            version("calibray"),
-            version("sionna-rt"),
-            version("mitsuba"),
-            version("drjit"),
-            SCHEMA_VERSION,
-        ],
+        "versions": [version("calibray"), dict(tracer), SCHEMA_VERSION],
         "frequency": frequency,
         "settings": settings.record(),
         "antennas": [antenna.record() for antenna in antennas],
@@ -67,6 +63,11 @@ def trace_digest(
     for position in (tx, rx):
         digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
     return digest.hexdigest()
+
+
+def sionna_versions() -> dict[str, str]:
+    """Versions of Sionna RT and of what it is built on, by package; none of them is imported."""
+    return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
 
 
 def find(digest: str) -> Paths | None:

@@ -1,0 +1,77 @@
+"""Calibrate a study: open it, search, trace again, and tell what was found."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Executor
+from pathlib import Path
+
+from calibray import engines
+from calibray.calibration.methods import check_method, choose
+from calibray.calibration.outcome import outcome
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import search
+from calibray.calibration.settle import settle
+from calibray.engines.ledger import LEDGER_FILE
+from calibray.engines.protocol import Engine
+from calibray.files import check_folder
+from calibray.progress import Progress
+from calibray.result import Result
+from calibray.study import Setup, Study
+from calibray.tracing.factory import SIONNA
+from calibray.tracing.protocol import TracerFactory
+
+
+def calibrate(
+    study: Study | Setup,
+    method: str | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    *,
+    engine: Engine | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    tracer: TracerFactory = SIONNA,
+) -> Result:
+    """Calibrate a scene's materials against measurements.
+
+    Args:
+        study: The study, opened or not.
+        method: Method in place of the study's: "auto", "sgwo-im", "gwo", ...
+        seed: Seed in place of the study's.
+        out: Folder to save the result in; checked before anything is computed. The ledger of RT calls lies there,
+            and a run that was killed repeats none of them when it is started again.
+        engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
+        executor: What runs the calls of a batch on the engine "command".
+        progress: Called as the work goes on.
+        tracer: What opens the scene in a ray tracer; a study that is open brings its own.
+
+    Returns:
+        The result.
+
+    Raises:
+        InputError: Something in the study, the method or the folder cannot be used.
+        EngineError: The engine failed.
+    """
+    study = study.replace(method=method, seed=seed)
+    setup = study if isinstance(study, Setup) else None
+    check_method((setup.study if setup else study).method.name)
+    if out is not None:
+        check_folder(out)
+    started = time.perf_counter()
+    looked_for = setup is not None
+    setup = setup or Setup.open(study, tracer)
+    if engine is None:
+        ledger = None if out is None else Path(out) / LEDGER_FILE
+        engine = engines.make(setup, None, progress, ledger, executor)
+        looked_for = True
+    problem = Problem.of(setup, engine)
+    # Before anything is calibrated on them; a ready engine may stand where no ray tracer can be loaded.
+    enclosed = setup.enclosed if looked_for else None
+    traced = time.perf_counter()
+    trail = search(problem, choose(problem), progress)
+    problem, trail, gap = settle(problem, trail, progress)
+    result = outcome(problem, trail, gap, enclosed, time.perf_counter() - traced, traced - started)
+    if out is not None:
+        result.save(out)
+    return result

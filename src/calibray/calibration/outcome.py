@@ -1,0 +1,121 @@
+"""From a finished search to its result: accuracy beside its rivals, intervals, and a row for every link."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import Trail
+from calibray.calibration.settle import largest
+from calibray.inference.likelihood import Interval, LogDistance, intervals
+from calibray.measurements import Measurements
+from calibray.result import Result
+from calibray.tracing.enclosed import Enclosed
+
+
+def outcome(
+    problem: Problem,
+    trail: Trail,
+    gap: NDArray[np.float64] | None,
+    enclosed: Enclosed | None,
+    seconds: float,
+    trace_seconds: float,
+) -> Result:
+    """What a calibration found.
+
+    Args:
+        problem: The problem, on the last trace calibrated on.
+        trail: Its search.
+        gap: Change of every link's path loss on tracing again [L], [dB]; None where nothing was checked.
+        enclosed: Antennas inside closed bodies; None where nothing was looked for.
+        seconds: Time that the method took [s].
+        trace_seconds: Time that tracing and loading took before [s].
+
+    Returns:
+        The result.
+    """
+    setup, objective, parameters = problem.setup, problem.objective, problem.parameters
+    study, links, held_out = setup.study, setup.links, setup.held_out
+    before, best, counted = problem.before, trail.best_modelled, objective.weight > 0
+    reached = np.isfinite(before) & np.isfinite(best)
+    judged = held_out & (reached | (objective.ceiling_db is not None))
+    offsets = objective.offsets(best[None])[0] if objective.num_groups else np.zeros(0)
+    offset_only, after = objective.model(np.stack([before, best]))
+    rival = _log_distance(links, objective.weight, study.scene.frequency)
+
+    def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
+        if not mask.any():
+            return None
+        return float(np.sqrt(np.average((model - links.path_loss_db)[mask] ** 2, weights=links.weight[mask])))
+
+    table = pd.DataFrame(
+        {
+            "row": links.row,
+            "measured_db": links.path_loss_db,
+            "before_db": before,
+            "after_db": best + (offsets[objective.group] if objective.num_groups else 0.0),
+            "log_distance_db": rival,
+            "has_path": reached,
+            "held_out": held_out,
+            "retrace_gap_db": np.nan if gap is None else gap,
+        }
+    )
+    determined = np.unique(objective.group[counted]) if objective.num_groups else np.zeros(0, dtype=int)
+    lost = np.setdiff1d(np.arange(objective.num_groups), determined)
+    return Result(
+        study=study,
+        parameters=parameters.named(trail.best),
+        initial_parameters=parameters.named(parameters.start),
+        intervals=_intervals(problem, trail.best),
+        materials=parameters.materials(trail.best, problem.engine.materials),
+        offsets_db={links.group_names[k]: float(offsets[k]) for k in determined},
+        groups_without_path=tuple(links.group_names[k] for k in lost),
+        rmse_db=trail.best_rmse_db,
+        initial_rmse_db=rmse(objective.capped(before), counted),
+        offset_only_rmse_db=rmse(offset_only, counted) if objective.num_groups else None,
+        holdout_rmse_db=rmse(after, judged),
+        initial_holdout_rmse_db=rmse(objective.capped(before), judged),
+        offset_only_holdout_rmse_db=rmse(offset_only, judged) if objective.num_groups else None,
+        log_distance_rmse_db=rmse(rival, counted),
+        log_distance_holdout_rmse_db=rmse(rival, judged),
+        retrace_gap_db=largest(gap, counted),
+        rt_calls=trail.rt_calls,
+        ledger_hits=trail.ledger_hits,
+        seconds=seconds,
+        trace_seconds=trace_seconds,
+        links=table,
+        history=trail.history(),
+        laws=parameters.law(trail.best),
+        enclosed=enclosed,
+        scene=setup.scene,
+    )
+
+
+def _log_distance(links: Measurements, weight: NDArray[np.float64], frequency: float) -> NDArray[np.float64]:
+    """Path loss [L], [dB] of the log-distance model fitted to links; over carriers it rises as in free space."""
+    rise = 0.0 if links.frequency is None else 20 * np.log10(links.frequency / frequency)
+    model = LogDistance.fit(links.distance, links.path_loss_db - rise, weight)
+    return model.path_loss(links.distance) + rise
+
+
+def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interval]:
+    """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
+    if not problem.differentiable:
+        return {}
+    parameters, objective = problem.parameters, problem.objective
+    point = parameters.to_search(best)
+    told = problem.evaluate(point[None], derivatives=True)
+    found = intervals(
+        point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, objective.num_groups
+    )
+    lower, upper = (
+        parameters.from_search(np.array(ends))
+        for ends in zip(*((each.lower, each.upper) for each in found), strict=True)
+    )
+    unit = parameters.search_slope(best)
+    return {
+        name: Interval(each.standard_error * float(unit[k]), float(lower[k]), float(upper[k]), each.verdict)
+        for k, (name, each) in enumerate(zip(parameters.names, found, strict=True))
+    }

@@ -1,0 +1,133 @@
+"""The one loop (paper Fig. 1): ask for candidates, run the engine, compare with the measurements, tell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from calibray.calibration.problem import Evaluation, Problem
+from calibray.engines.protocol import Engine
+from calibray.engines.recorded import Recorded
+from calibray.errors import InputError
+from calibray.optimizers import Optimizer
+from calibray.progress import Progress
+
+Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
+"""Points of the search space [n, d], and whether derivatives are wanted, to what an optimizer is told."""
+
+
+def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
+    """Run an optimizer until it is done.
+
+    Args:
+        optimizer: The optimizer.
+        evaluate: What it searches.
+
+    Yields:
+        The candidates of every round [n, d], as points of the search space, and what was told of them.
+    """
+    derivatives = "jacobian" in optimizer.uses
+    # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
+    with threadpool_limits(1, user_api="blas"):
+        while not optimizer.done:
+            points = optimizer.ask()
+            told = evaluate(points, derivatives)
+            optimizer.tell(points, told.value, residuals=told.residuals, jacobian=told.jacobian)
+            yield points, told
+
+
+@dataclass
+class Trail:
+    """What a search has seen: every RT call in order, what the engine answered to the best, and its count.
+
+    Attributes:
+        candidates: The candidates in the fields' units, each [d].
+        rmse_db: Their objectives [dB].
+        iteration: The round that each belongs to.
+        seconds: When each was known, since the start [s].
+        best: The best candidate [d].
+        best_modelled: What the engine answered to it [L].
+        best_rmse_db: Its objective [dB].
+        rt_calls: RT calls that the search spent, now or in an earlier run that left them in the ledger.
+        ledger_hits: How many of them the ledger answered.
+    """
+
+    candidates: list[NDArray[np.float64]] = field(default_factory=list)
+    rmse_db: list[float] = field(default_factory=list)
+    iteration: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    best: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    best_modelled: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    best_rmse_db: float = np.inf
+    rt_calls: int = 0
+    ledger_hits: int = 0
+
+    def add(self, candidates: NDArray[np.float64], told: Evaluation, iteration: int, now: float) -> None:
+        """Record one round.
+
+        Args:
+            candidates: Its candidates in the fields' units [n, d].
+            told: What was told of them.
+            iteration: Its number, from 1.
+            now: Time since the start [s].
+        """
+        self.candidates += list(candidates)
+        self.rmse_db += told.value.tolist()
+        self.iteration += [iteration] * len(told.value)
+        self.seconds += [now] * len(told.value)
+        leader = int(np.argmin(told.value))
+        if told.value[leader] < self.best_rmse_db:
+            self.best, self.best_modelled = candidates[leader], told.modelled[leader]
+            self.best_rmse_db = float(told.value[leader])
+
+    def history(self) -> pd.DataFrame:
+        """One row per RT call: number, iteration, RMSE, best so far, seconds since the start."""
+        return pd.DataFrame(
+            {
+                "call": np.arange(1, len(self.rmse_db) + 1),
+                "iteration": self.iteration,
+                "rmse_db": self.rmse_db,
+                "best_db": np.minimum.accumulate(self.rmse_db),
+                "seconds": self.seconds,
+            }
+        )
+
+
+def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = None) -> Trail:
+    """Run an optimizer on a problem until it is done.
+
+    Args:
+        problem: The problem.
+        optimizer: The optimizer, over the search space of the problem's parameters.
+        progress: Called with the stage "calibrating" after every round.
+
+    Returns:
+        What it saw.
+
+    Raises:
+        InputError: No candidate could be evaluated.
+    """
+    engine, trail = problem.engine, Trail()
+    started, calls, hits = time.perf_counter(), engine.calls, _hits(engine)
+    for iteration, (points, told) in enumerate(rounds(optimizer, problem.evaluate), start=1):
+        trail.add(problem.parameters.from_search(points), told, iteration, time.perf_counter() - started)
+        if progress is not None:
+            progress("calibrating", len(trail.rmse_db), optimizer.budget)
+    trail.ledger_hits = _hits(engine) - hits
+    # What the ledger answered was paid for before, so that a run ends alike however often it was started again.
+    trail.rt_calls = engine.calls - calls + trail.ledger_hits
+    if not np.isfinite(trail.best_rmse_db):
+        raise InputError(
+            "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
+        )
+    return trail
+
+
+def _hits(engine: Engine) -> int:
+    return engine.hits if isinstance(engine, Recorded) else 0

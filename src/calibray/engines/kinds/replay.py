@@ -1,0 +1,95 @@
+"""Replay: paths are traced once and evaluated for any candidate, with derivatives."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from calibray.engines.section import EngineSection
+from calibray.errors import InputError
+from calibray.paths import Paths, take_links
+from calibray.progress import Progress
+
+if TYPE_CHECKING:
+    from calibray.engines.carriers import ReplayCarriers
+    from calibray.engines.replay import Replay
+    from calibray.study.setup import Setup
+
+
+@final
+class ReplaySection(EngineSection):
+    """``[engine]`` with ``name = "replay"``.
+
+    Attributes:
+        name: "replay".
+        compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
+    """
+
+    dear: ClassVar[bool] = False
+    external: ClassVar[bool] = False
+
+    name: Literal["replay"] = "replay"
+    compress_db: Annotated[float, Field(gt=0)] | None = None
+
+    @property
+    def answers_by(self) -> None:
+        """Nothing: what is replayed is kept with the paths."""
+        return
+
+    def open(
+        self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
+    ) -> Replay | ReplayCarriers:
+        """The replay of a study's links; see `EngineSection.open`.
+
+        Raises:
+            InputError: Compression does not suit the study, or its links cannot be traced.
+        """
+        # Before anything is traced.
+        self._check_compressible(setup)
+        return replay(setup, setup.trace(progress=progress) if paths is None else paths, self.compress_db)
+
+    def _check_compressible(self, setup: Setup) -> None:
+        study = setup.study
+        if self.compress_db is not None and (
+            study.objective.combining != "power"
+            or setup.links.frequency is not None
+            or setup.parameters.has_laws
+        ):
+            raise InputError(
+                f"{study.path}: engine.compress_db = {self.compress_db:g} needs objective.combining = 'power' and "
+                "a single carrier without coefficients of laws; remove it"
+            )
+
+
+def replay(setup: Setup, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
+    """The replay of an opened study on stored paths.
+
+    Args:
+        setup: The opened study.
+        paths: The paths of its links, at the study's carrier.
+        compress_db: Largest error of path loss [dB] for which few weighted paths stand for all; all are kept if None.
+
+    Returns:
+        The engine; with a program for each carrier where the links have carriers of their own.
+    """
+    from calibray.engines.carriers import CarrierPaths, ReplayCarriers
+    from calibray.engines.compression import compress
+    from calibray.engines.replay import Replay
+
+    study, links, parameters = setup.study, setup.links, setup.parameters
+    options = study.objective.combining, study.scene.bandwidth
+    if compress_db is not None:
+        paths = compress(paths, parameters, compress_db).paths
+    if links.frequency is None and not parameters.has_laws:
+        return Replay(paths, parameters, *options)
+    if links.frequency is None:
+        carriers = [CarrierPaths(paths, np.arange(len(links)))]
+    else:
+        carriers = [
+            CarrierPaths(take_links(paths, index).at(frequency, setup.carriers[frequency]), index)
+            for frequency, index in links.carriers
+        ]
+    return ReplayCarriers(carriers, parameters, paths.materials, *options)

@@ -1,0 +1,59 @@
+"""A scene written with other constants, for Sionna RT or whatever else reads Mitsuba scenes."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+
+from calibray.errors import InputError
+from calibray.files import write_text
+from calibray.materials import ITU_MATERIALS, Material
+from calibray.scenes.scene import TRACED, Scene, material_element
+
+
+def export_scene(scene: Scene, materials: Mapping[str, Material], target: Path) -> None:
+    """Write a scene file with other constants; it refers to the meshes of the original.
+
+    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `calibrated-NAME`. Its
+    scene files know no scattering pattern but the Lambertian one; another has to be set by who loads the scene.
+
+    Args:
+        scene: The scene as it was read.
+        materials: Constants by material name.
+        target: File to write.
+
+    Raises:
+        InputError: A material of the scene is missing.
+    """
+    missing = [name for name in scene.materials if name not in materials]
+    if missing:
+        raise InputError(
+            f"{scene.path}: there are no constants for the material {missing[0]!r}; export all of them"
+        )
+    root = ElementTree.fromstring(scene.xml)
+    for bsdf in root.findall("bsdf"):
+        root.remove(bsdf)
+    written = {f"{TRACED}{index}": _written(name) for index, name in enumerate(scene.materials)}
+    for shape in root.findall("shape"):
+        for reference in shape.findall("ref"):
+            reference.set("id", written[reference.get("id", "")])
+        filename = shape.find("string[@name='filename']")
+        if filename is not None:
+            mesh = (scene.path.parent / filename.get("value", "")).resolve()
+            filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
+    for index, (name, material) in enumerate(materials.items()):
+        root.insert(index, material_element(_written(name), material))
+    ElementTree.indent(root)
+    write_text(target, ElementTree.tostring(root, encoding="unicode") + "\n")
+
+
+def _written(name: str) -> str:
+    """The id under which a material is written."""
+    return f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}"
+
+
+def _is_itu_name(name: str) -> bool:
+    names = {known for table in ITU_MATERIALS.values() for known in table}
+    return name in names or name.startswith(("itu_", "itu-"))

@@ -1,0 +1,179 @@
+"""A study, opened: its links, its scene and its parameters, each read once, and the tracer that finds their paths."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.materials import Material
+from calibray.measurements import Measurements
+from calibray.parameters import Parameters
+from calibray.paths import Paths, take_links
+from calibray.progress import Progress
+from calibray.scenes import Scene, read_scene
+from calibray.study.model import Study
+from calibray.tracing import cache
+from calibray.tracing.enclosed import Enclosed
+from calibray.tracing.factory import SIONNA
+from calibray.tracing.protocol import Tracer, TracerFactory
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A study, opened once: what engines, fingerprints, problems and predictions take.
+
+    Attributes:
+        study: The study.
+        links: All its links, those held out included.
+        scene: Its scene, with the parameters' starts: what is sampled while tracing follows the materials.
+        parameters: What a candidate's components stand for.
+        held_out: Which links are held out [links].
+        factory: What opens the scene in a ray tracer.
+    """
+
+    study: Study
+    links: Measurements
+    scene: Scene
+    parameters: Parameters
+    held_out: NDArray[np.bool_]
+    factory: TracerFactory
+
+    @classmethod
+    def open(cls, study: Study, tracer: TracerFactory = SIONNA, links: Measurements | None = None) -> Setup:
+        """Read what a study names; nothing is traced yet.
+
+        Args:
+            study: The study.
+            tracer: What opens the scene in a ray tracer.
+            links: Links in place of the study's; none of them is held out.
+
+        Returns:
+            The opened study.
+
+        Raises:
+            InputError: The links, the scene, the parameters or the hold-out cannot be used.
+        """
+        held_out = None
+        if links is None:
+            links = study.measurements()
+            held_out = study.held_out(links)
+        scene = read_scene(study.scene_source, study.scene.frequency, study.overrides, study.objects)
+        parameters = study.parameter_set(scene.materials, scene.laws)
+        parameters.check_carriers([frequency for frequency, _ in links.carriers])
+        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
+        if held_out is None:
+            held_out = np.zeros(len(links), dtype=bool)
+        return cls(study, links, scene, parameters, held_out, tracer)
+
+    def opened(self) -> Setup:
+        """Itself: what takes a study or one that is open calls this on either."""
+        return self
+
+    def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
+        """The same with another method, seed or engine; nothing is read again (see `Study.replace`).
+
+        Args:
+            method: Name of the method, or None to keep it.
+            seed: Seed, or None to keep it.
+            engine: Name of the engine, or None to keep it.
+
+        Returns:
+            The changed setup.
+
+        Raises:
+            InputError: A value is impossible.
+        """
+        changed = replace(self, study=self.study.replace(method, seed, engine))
+        # A tracer that is loaded serves on: none of the three has a say in it.
+        if "tracer" in self.__dict__:
+            changed.__dict__["tracer"] = self.tracer
+        return changed
+
+    @cached_property
+    def tracer(self) -> Tracer:
+        """The ray tracer with the scene at the study's carrier, loaded when first used."""
+        return self._tracer(self.scene, self.study.scene.frequency)
+
+    @cached_property
+    def carriers(self) -> dict[float, dict[str, Material]]:
+        """The scene's materials before calibration by carrier of the links [Hz]; none where all have the study's."""
+        return {frequency: self._scene_at(frequency).materials for frequency, _ in self.links.carriers}
+
+    @cached_property
+    def enclosed(self) -> Enclosed | None:
+        """Antennas that stand inside closed bodies of the scene; None where a program outside answers."""
+        if self.study.engine.external:
+            return None
+        tracer, links = self.tracer, self.links
+        return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+
+    def tracer_at(self, frequency: float) -> Tracer:
+        """The ray tracer with the scene at another carrier.
+
+        Args:
+            frequency: The carrier [Hz].
+
+        Returns:
+            The tracer, loaded anew.
+        """
+        return self._tracer(self._scene_at(frequency), frequency)
+
+    def trace(
+        self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
+    ) -> Paths:
+        """The paths of the links, from the cache if they were traced before.
+
+        Links that differ in their carrier alone are traced once.
+
+        Args:
+            materials: All materials to trace with, by name; the scene's own if None.
+            progress: Called with the stage "tracing" after every launch.
+
+        Returns:
+            The path program.
+
+        Raises:
+            InputError: The tracer cannot be used.
+            EngineError: There are more paths than fit into memory.
+        """
+        if self.links.frequency is None:
+            return self._trace(self.links, materials, progress)
+        ends = np.hstack([self.links.tx, self.links.rx])
+        _, first, place = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+        once = replace(self.links.select(np.isin(np.arange(len(self.links)), first)), frequency=None)
+        # `select` keeps the links' order, `unique` sorts them.
+        order = np.argsort(np.argsort(first))
+        return take_links(self._trace(once, materials, progress), order[place.reshape(-1)])
+
+    def _trace(
+        self, links: Measurements, materials: Mapping[str, Material] | None, progress: Progress | None
+    ) -> Paths:
+        study = self.study
+        scene = self.scene if materials is None else replace(self.scene, materials=dict(materials))
+        digest = cache.trace_digest(
+            self.factory.versions,
+            scene,
+            study.scene.frequency,
+            study.trace,
+            study.antenna_pair,
+            links.tx,
+            links.rx,
+        )
+        paths = cache.find(digest)
+        if paths is None:
+            paths = self.tracer.trace(links, progress, scene.materials)
+            cache.keep(digest, paths)
+        return paths
+
+    def _scene_at(self, frequency: float) -> Scene:
+        study, parameters = self.study, self.parameters
+        scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+        starts = parameters.materials(parameters.start, scene.materials, frequency)
+        return replace(scene, materials=starts)
+
+    def _tracer(self, scene: Scene, frequency: float) -> Tracer:
+        return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
