@@ -62,7 +62,7 @@ def engine(blocked: bool = False) -> Replay:
     """The replay engine over the links, traced and compiled once."""
     plan = Study.from_content(content("links.csv"))
     tracer = make_tracer(plan)
-    paths = tracer.trace(links_from_frame(links(blocked))).paths()
+    paths = tracer.trace(links_from_frame(links(blocked)))
     return Replay(paths, plan.parameter_set(tracer.scene.materials))
 
 

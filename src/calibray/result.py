@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import fields
-from calibray.engines import make_parameters, make_replay, make_scene, traced_paths
+from calibray.engines import Progress, make_parameters, make_replay, make_scene, traced_paths
 from calibray.errors import InputError
 from calibray.files import check_folder, write_text
 from calibray.inference.likelihood import Interval
@@ -20,7 +20,6 @@ from calibray.materials import Material
 from calibray.measurements import Measurements, links_from_frame
 from calibray.scenes import export_scene
 from calibray.study import Study
-from calibray.tracing.sionna import Progress
 
 VERSION: Final = 1
 FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")

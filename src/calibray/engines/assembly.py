@@ -27,8 +27,8 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, read_scene
 from calibray.study import Study
-from calibray.tracing import cache
-from calibray.tracing.sionna import Tracer
+from calibray.tracing.factory import SIONNA, kept_trace
+from calibray.tracing.protocol import Tracer
 
 ENGINES: Final = ("replay", "retrace", "command")
 
@@ -234,21 +234,8 @@ def traced_paths(study: Study, scene: Scene, links: Measurements, progress: Prog
     Returns:
         The path program.
     """
-    if links.frequency is not None:
-        _, first, place = np.unique(
-            np.hstack([links.tx, links.rx]), axis=0, return_index=True, return_inverse=True
-        )
-        once = replace(links.select(np.isin(np.arange(len(links)), first)), frequency=None)
-        order = np.argsort(np.argsort(first))  # `select` keeps the links' order, `unique` sorts them
-        return take_links(traced_paths(study, scene, once, progress), order[place.reshape(-1)])
-    digest = cache.trace_digest(
-        scene, study.scene.frequency, study.trace, study.antenna_pair, links.tx, links.rx
-    )
-    paths = cache.find(digest)
-    if paths is None:
-        paths = _tracer(study, scene).trace(links, progress).paths()
-        cache.keep(digest, paths)
-    return paths
+    told = None if progress is None else lambda _, done, total: progress(done, total)
+    return kept_trace(SIONNA, scene, study.scene.frequency, study.trace, study.antenna_pair, links, told)
 
 
 def make_scene(study: Study, materials: dict[str, Material] | None = None) -> Scene:
@@ -289,4 +276,4 @@ def make_tracer(study: Study, materials: dict[str, Material] | None = None) -> T
 
 
 def _tracer(study: Study, scene: Scene, frequency: float | None = None) -> Tracer:
-    return Tracer(scene, frequency or study.scene.frequency, study.trace, *study.antenna_pair)
+    return SIONNA(scene, frequency or study.scene.frequency, study.trace, *study.antenna_pair)

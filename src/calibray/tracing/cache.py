@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +26,7 @@ VARIABLE: Final = "CALIBRAY_CACHE"
 
 
 def trace_digest(
+    versions: Mapping[str, str],
     scene: Scene,
     frequency: float,
     settings: TraceSettings,
@@ -36,6 +37,7 @@ def trace_digest(
     """What a trace depends on, as a fingerprint.
 
     Args:
+        versions: The tracer's programs and their versions.
         scene: The scene; its materials count, because they steer which rays are followed.
         frequency: Carrier frequency [Hz].
         settings: The tracer's switches.
@@ -47,13 +49,9 @@ def trace_digest(
         SHA-256 in hexadecimal.
     """
     record = {
-        "versions": [
-            version("calibray"),
-            version("sionna-rt"),
-            version("mitsuba"),
-            version("drjit"),
-            SCHEMA_VERSION,
-        ],
+        "calibray": version("calibray"),
+        "schema": SCHEMA_VERSION,
+        "tracer": dict(versions),
         "frequency": frequency,
         "settings": settings.record(),
         "antennas": [antenna.record() for antenna in antennas],
@@ -83,7 +81,8 @@ def find(digest: str) -> Paths | None:
         return None
     try:
         return Paths.load(path)
-    except InputError:  # left by another version, or damaged: trace again
+    # Left by another version, or damaged: trace again.
+    except InputError:
         path.unlink(missing_ok=True)
         return None
 
