@@ -57,7 +57,7 @@ def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
     rx = outdoors(munich, receivers)
     links = SimpleNamespace(tx=np.repeat(MASTS, len(rx), axis=0), rx=np.tile(rx, (len(MASTS), 1)))
     start = time.perf_counter()
-    trace = munich.trace(links)
+    trace = munich.find(links)
     traced = time.perf_counter() - start
     paths = trace.paths()
     compiled = time.perf_counter() - start - traced
@@ -77,7 +77,7 @@ def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
             for has in (True, False)
         ]
     )
-    alone = np.array([path_loss(munich.trace(one(links, link)).paths())[0] for link in sample])
+    alone = np.array([path_loss(munich.trace(one(links, link)))[0] for link in sample])
     same = np.isinf(alone) & np.isinf(loss[sample])
     change = np.abs(np.where(same, 0, alone) - np.where(same, 0, loss[sample]))
     print(
@@ -111,7 +111,7 @@ def paths(samples: int, depth: int, receivers: int) -> None:
     """Trace and compile very many paths."""
     rough = make_tracer(CANYON, ROUGH, samples=samples, max_depth=depth, diffuse_reflection=True)
     before = resident()
-    found = rough.trace(canyon_links(receivers)).paths()
+    found = rough.trace(canyon_links(receivers))
     taken = (resident() - before) / found.num_paths
     print(f"depth {depth}, {found.num_paths:>9,} paths: {taken:.0f} bytes a path")
 

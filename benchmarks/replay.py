@@ -17,7 +17,7 @@ import numpy as np
 from calibray import engines
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
-from calibray.tracing.sionna import Trace
+from calibray.tracing.sionna import Trace, Tracer
 from timing import seconds
 
 
@@ -33,8 +33,7 @@ def field_stage(trace: Trace, engine: engines.Replay, points: np.ndarray) -> Cal
     turn = iter(np.tile(points, (100, 1)))
 
     def call() -> object:
-        trace.tracer.set_materials(engine.parameters.materials(next(turn), engine.materials))
-        return trace.path_gains()
+        return trace.path_gains(engine.parameters.materials(next(turn), engine.materials))
 
     return call
 
@@ -47,7 +46,9 @@ def main() -> None:
     print(f"demo district: {replay.paths.num_links} links, {replay.paths.num_paths} paths, "
           f"{replay.paths.num_interactions} interactions")  # fmt: skip
     turn = iter(np.tile(points, (10, 1)))
-    stored = engines.make_tracer(study).trace(study.measurements())
+    stored = Tracer(engines.make_scene(study), study.scene.frequency, study.trace, *study.antenna_pair).find(
+        study.measurements()
+    )
     rows = [
         ("re-trace with Sionna RT", seconds(lambda: retrace.path_loss(next(turn)[None]), 3)),
         ("Sionna's field stage on stored paths", seconds(field_stage(stored, replay, points), 9)),

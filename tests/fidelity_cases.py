@@ -195,7 +195,7 @@ def run(case: Case, samples: int = 20_000) -> Campaign:
     settings = TraceSettings(samples=samples, **case.settings)
     tracer = Tracer(scene, case.frequency, settings, case.tx_antenna, case.rx_antenna)
     rx = np.random.default_rng(0).uniform(case.low, case.high, (case.receivers, 3))
-    trace = tracer.trace(SimpleNamespace(tx=np.tile(np.array(case.tx, dtype=float), (len(rx), 1)), rx=rx))
+    trace = tracer.find(SimpleNamespace(tx=np.tile(np.array(case.tx, dtype=float), (len(rx), 1)), rx=rx))
     return Campaign(case, tracer, trace, trace.paths())
 
 
@@ -247,9 +247,11 @@ def compare(campaign: Campaign, materials: Mapping[str, Material], program: Path
     Returns:
         The errors.
     """
-    campaign.tracer.set_materials(materials)
     return difference(
-        campaign, campaign.trace.path_gains(), path_gains(program or campaign.paths, materials), materials
+        campaign,
+        campaign.trace.path_gains(materials),
+        path_gains(program or campaign.paths, materials),
+        materials,
     )
 
 

@@ -19,8 +19,9 @@ import programs
 from calibray.cli.commands import app
 from calibray.paths import Paths
 from calibray.report import terminal
-from calibray.report.terminal import Enclosed, render_result, render_table, rows_text, summary
+from calibray.report.terminal import render_result, render_table, rows_text, summary
 from calibray.result import FILES, Result
+from calibray.tracing.enclosed import Enclosed
 
 LOST_ROW = planted.INSIDE + 2  # the header is row 1
 
@@ -123,7 +124,7 @@ def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeyp
     def refuse(*_: object) -> None:
         pytest.fail("the ray tracer was loaded")
 
-    monkeypatch.setattr("calibray.engines.assembly.Tracer", refuse)
+    monkeypatch.setattr("calibray.tracing.factory.Sionna.__call__", refuse)
     arguments = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", "2")
     first = calibray(*arguments)
     assert first.exit_code == 0, first.output

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,8 +43,8 @@ def tracer(file, materials=None, **settings) -> Tracer:
 
 def test_enough_rays_change_nothing(yard, links):
     enough = tracer(yard, samples=100_000)
-    before = enough.trace(links).paths()
-    found = check(enough, links, before)
+    before = enough.trace(links)
+    found = check(enough, links, before, path_loss)
     np.testing.assert_allclose(found.change_db, 0, atol=1e-6)
     np.testing.assert_array_equal(found.paths_before, found.paths_after)
     assert found.paths_before.sum() == before.num_paths > 5
@@ -53,7 +54,7 @@ def test_enough_rays_change_nothing(yard, links):
 
 def test_too_few_rays_of_a_diffuse_trace_are_told(yard, links):
     coarse = tracer(yard, ROUGH, samples=60, diffuse_reflection=True, line_of_sight=False)
-    found = check(coarse, links, coarse.trace(links).paths())
+    found = check(coarse, links, coarse.trace(links), path_loss)
     assert found.quantile(1) > 2
     assert not found.converged(0.5)
     assert len(found.gained)
@@ -61,18 +62,18 @@ def test_too_few_rays_of_a_diffuse_trace_are_told(yard, links):
 
 def test_the_change_is_that_of_a_trace_with_twice_the_rays(yard, links):
     coarse = tracer(yard, ROUGH, samples=500, diffuse_reflection=True)
-    before = coarse.trace(links).paths()
-    finer = tracer(yard, ROUGH, samples=1000, seed=2, diffuse_reflection=True).trace(links).paths()
+    before = coarse.trace(links)
+    finer = tracer(yard, ROUGH, samples=1000, seed=2, diffuse_reflection=True).trace(links)
     loss = [path_loss(paths, None, "band", 50e6)[:3] for paths in (before, finer)]
-    found = check(coarse, links, before, combining="band", bandwidth=50e6)
+    found = check(coarse, links, before, partial(path_loss, combining="band", bandwidth=50e6))
     np.testing.assert_allclose(found.change_db, [*(loss[1] - loss[0]), 0], atol=1e-9)
     assert np.abs(found.change_db).max() > 0.01
     assert coarse.settings == TraceSettings(max_depth=2, samples=500, diffuse_reflection=True)
 
 
 def test_links_reached_in_one_trace_alone_are_infinite_changes(yard, links):
-    few, many = (tracer(yard, samples=n, line_of_sight=False).trace(links).paths() for n in (3, 20_000))
-    gained, lost = compare(few, many, 3), compare(many, few, 3)
+    few, many = (tracer(yard, samples=n, line_of_sight=False).trace(links) for n in (3, 20_000))
+    gained, lost = compare(few, many, 3, path_loss), compare(many, few, 3, path_loss)
     reached = np.bincount(many.link, minlength=4) > 0
     assert reached.tolist() == [True, False, True, False]
     alone = reached & (gained.paths_before == 0)
@@ -111,7 +112,7 @@ def test_the_text_names_rows_and_what_to_do():
 
 def test_traces_of_other_links_are_refused(yard, links):
     some = tracer(yard, samples=10)
-    before = some.trace(links).paths()
+    before = some.trace(links)
     moved = replace(before, rx_position=before.rx_position + 1)
     with pytest.raises(InputError, match="compare traces of the same links"):
-        compare(before, moved, 10)
+        compare(before, moved, 10, path_loss)

@@ -110,7 +110,7 @@ def test_candidates_that_are_none_are_refused_and_not_counted(retrace, wrong, me
 
 
 def test_an_unknown_engine_is_refused(study):
-    with pytest.raises(InputError, match="engine 'replya': must be one of replay, retrace"):
+    with pytest.raises(InputError, match="engine 'replya': must be one of command, replay, retrace"):
         engines.make(study, "replya")
 
 

@@ -92,7 +92,7 @@ def test_table_of_a_pattern_acts_like_the_pattern(
     found = []
     for name in (pattern, tables[pattern]):
         tx, rx = Antenna(name, polarization, TILTED), Antenna(name, "VH", (0.0, 0.2, 0.0))
-        found.append(path_gains(tracer(scene, tx, rx).trace(LINKS).paths()))
+        found.append(path_gains(tracer(scene, tx, rx).trace(LINKS)))
     assert found[0].shape == found[1].shape
     assert len(found[0]) > 20
     error = np.abs(found[1] - found[0]).max(axis=(1, 2)) / np.abs(found[0]).max(axis=(1, 2))
@@ -103,7 +103,7 @@ def test_table_of_a_pattern_acts_like_the_pattern(
 
 def test_sionna_itself_gives_the_same_with_the_table(scene: cb.scene.Scene, tables: dict[str, str]) -> None:
     antennas = Antenna(tables["tr38901"], "cross", TILTED), Antenna(tables["dipole"], "H", (0.0, 0.2, 0.5))
-    trace = tracer(scene, *antennas).trace(LINKS)
+    trace = tracer(scene, *antennas).find(LINKS)
     theirs, ours = trace.path_gains(), path_gains(trace.paths())
     assert ours.shape == theirs.shape
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4 * np.abs(theirs).max())
@@ -113,7 +113,7 @@ def test_turned_table_gives_other_gains_unless_the_antenna_is_turned_back(
     scene: cb.scene.Scene, tables: dict[str, str]
 ) -> None:
     def gains(name: str, yaw: float) -> np.ndarray:
-        return path_gains(tracer(scene, Antenna(name, "V", (yaw, 0, 0)), Antenna()).trace(LINKS).paths())
+        return path_gains(tracer(scene, Antenna(name, "V", (yaw, 0, 0)), Antenna()).trace(LINKS))
 
     plain, turned, back = (
         gains("tr38901", 0.0),

@@ -240,3 +240,47 @@ def test_links_without_a_path_are_listed_and_infinitely_weak(paths: Paths) -> No
     loss = path_loss(none)
     assert np.isposinf(loss[0])
     assert np.isfinite(loss[1])
+
+
+# What a screen shows
+
+
+def test_paths_fit_a_screen_and_say_what_matters(paths: Paths) -> None:
+    paths = replace(paths, link=np.zeros_like(paths.link))
+    kinds = {kind.name.lower(): int((paths.kind == kind).sum()) for kind in Kind}
+    assert min(kinds.values()) > 0
+    for shown in (repr(paths), paths._repr_html_()):
+        for text in (
+            "2, 1 of them without a path",
+            f"{paths.num_paths}",
+            f"{paths.num_interactions}: ",
+            *(f"{count} {name}" for name, count in kinds.items()),
+            ", ".join(paths.materials),
+            f"{paths.frequency / 1e9:g} GHz",
+            " KiB",
+        ):
+            assert text in shown
+    lines = repr(paths).splitlines()
+    assert len(lines) == 7
+    assert max(map(len, lines)) <= 80
+
+
+def test_many_and_odd_names_of_materials_are_shown_in_part_and_as_text(paths: Paths) -> None:
+    material = next(iter(paths.materials.values()))
+    names = ["<b>", *(f"material-number-{k}" for k in range(200))]
+    odd = replace(paths, materials=dict.fromkeys(names, material))
+    assert max(map(len, repr(odd).splitlines())) <= 80
+    assert "201: <b>, material-number-0" in repr(odd)
+    assert "&lt;b&gt;" in odd._repr_html_()
+
+
+@pytest.mark.parametrize(("count", "text"), [(8, "64 B"), (1 << 17, "1.0 MiB"), (3 << 27, "3.0 GiB")])
+def test_memory_is_that_of_all_arrays(paths: Paths, count: int, text: str) -> None:
+    empty = take(paths, np.zeros(0, dtype=int))
+    held = sum(part.nbytes for part in (empty.tx_position, empty.rx_position, empty.first))
+    wide = replace(
+        empty, delay=np.broadcast_to(0.0, count), tx_position=empty.tx_position[:0], first=empty.first[:0],
+        rx_position=empty.rx_position[:0],
+    )  # fmt: skip
+    assert held > 0
+    assert repr(wide).splitlines()[-1].split(maxsplit=1)[1] == text

@@ -452,7 +452,7 @@ def test_knife_edge_against_itu_r_p526(tmp_path: Path) -> None:
     height, distance = np.array([5.0, 3.0, 2.0, 1.0, 0.5, -0.3, -2.0]), 100.0
     ends = [np.stack([0 * height + x, 0 * height, -height], axis=1) for x in (-distance, distance)]
     tracer = Tracer(scene, 1e9, settings, antennas[1], antennas[1])
-    paths = tracer.trace(SimpleNamespace(tx=ends[0], rx=ends[1])).paths()
+    paths = tracer.trace(SimpleNamespace(tx=ends[0], rx=ends[1]))
     wavelength = speed_of_light / 1e9
     phase = np.exp(-2j * np.pi * paths.frequency * paths.delay)
     nu = height * np.sqrt(2 / wavelength * (2 / distance))  # eq. 26

@@ -54,7 +54,7 @@ def receivers() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def together(canyon: Tracer, receivers: np.ndarray) -> Paths:
-    return canyon.trace(links([-20, 2, 15], receivers)).paths()
+    return canyon.trace(links([-20, 2, 15], receivers))
 
 
 def assert_same(one: Paths, other: Paths) -> None:
@@ -72,7 +72,7 @@ def test_one_receiver_at_a_time_gives_what_all_at_once_give(
 ) -> None:
     """NVlabs/sionna#1172: a receiver's paths do not depend on which others are traced with it."""
     monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", MIXED["samples"] * MIXED["max_depth"])
-    trace = canyon.trace(links([-20, 2, 15], receivers))
+    trace = canyon.find(links([-20, 2, 15], receivers))
     assert len(trace.chunks) == len(receivers)
     alone = trace.paths()
     assert alone.num_paths == together.num_paths > 500
@@ -84,15 +84,15 @@ def test_one_receiver_at_a_time_gives_what_all_at_once_give(
 
 
 def test_order_of_the_links_is_kept(canyon: Tracer, receivers: np.ndarray, together: Paths) -> None:
-    backwards = canyon.trace(links([-20, 2, 15], receivers[::-1])).paths()
+    backwards = canyon.trace(links([-20, 2, 15], receivers[::-1]))
     np.testing.assert_allclose(path_loss(backwards)[::-1], path_loss(together), atol=1e-6)
     np.testing.assert_array_equal(backwards.rx_position, receivers[::-1])
 
 
 def test_several_transmitters_in_any_order(canyon: Tracer, receivers: np.ndarray, together: Paths) -> None:
     masts = np.array([[-20.0, 2, 15], [25.0, -3, 12]])
-    other = canyon.trace(links(masts[1], receivers)).paths()
-    mixed = canyon.trace(links(masts[[0, 1] * 6], np.repeat(receivers, 2, axis=0))).paths()
+    other = canyon.trace(links(masts[1], receivers))
+    mixed = canyon.trace(links(masts[[0, 1] * 6], np.repeat(receivers, 2, axis=0)))
     assert (np.diff(mixed.link) >= 0).all()
     np.testing.assert_allclose(path_loss(mixed)[0::2], path_loss(together), atol=1e-6)
     np.testing.assert_allclose(path_loss(mixed)[1::2], path_loss(other), atol=1e-6)
@@ -102,7 +102,7 @@ def test_full_buffer_is_traced_again_with_the_same_result(
     canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
-    assert_same(canyon.trace(links([-20, 2, 15], receivers)).paths(), together)
+    assert_same(canyon.trace(links([-20, 2, 15], receivers)), together)
 
 
 def test_paths_that_memory_cannot_hold_are_an_error(
@@ -119,10 +119,10 @@ def test_paths_that_memory_cannot_hold_are_an_error(
 def test_same_seed_same_paths_and_another_seed_others(
     canyon: Tracer, receivers: np.ndarray, together: Paths
 ) -> None:
-    assert_same(canyon.trace(links([-20, 2, 15], receivers)).paths(), together)
+    assert_same(canyon.trace(links([-20, 2, 15], receivers)), together)
     settings = TraceSettings(**MIXED, seed=2)
     other = Tracer(canyon.scene, FREQUENCY, settings, canyon.tx_antenna, canyon.rx_antenna)
-    found = other.trace(links([-20, 2, 15], receivers)).paths()
+    found = other.trace(links([-20, 2, 15], receivers))
     assert not np.array_equal(np.sort(found.delay), np.sort(together.delay))
     np.testing.assert_allclose(path_loss(found), path_loss(together), atol=1.0)
 
@@ -138,7 +138,7 @@ def test_progress_counts_receivers(
 
 def test_stored_paths_hold_on_to_nothing_else(canyon: Tracer, receivers: np.ndarray) -> None:
     """What Dr.Jit has still to compute keeps its inputs: all rays' candidates, for every launch."""
-    (chunk,) = canyon.trace(links([-20, 2, 15], receivers)).chunks
+    (chunk,) = canyon.find(links([-20, 2, 15], receivers)).chunks
     buffer = chunk.buffer
     kept = [buffer.vertices_x.array, buffer.k_tx.x, buffer.shapes.array, buffer.probs.array]
     assert {array.state for array in kept} == {dr.VarState.Evaluated}
@@ -164,7 +164,7 @@ def split(canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
             "calibray.tracing.sionna.tracer.LANES",
             lanes or -(-settings["samples"] * settings["max_depth"] // 7),
         )
-        traces.append(tracer.trace(links([-20, 2, 15], receivers)))
+        traces.append(tracer.find(links([-20, 2, 15], receivers)))
     assert [len(trace.chunks) for trace in traces] == [1, 7 * len(receivers)]
     return traces
 
@@ -237,7 +237,7 @@ def test_points_inside_buildings_are_told_from_those_outside(house: Tracer) -> N
 
 
 def test_links_without_a_path_are_told_and_infinitely_weak(house: Tracer) -> None:
-    paths = house.trace(links([-20, 0, 3], [[0, 0, 2], [-10, 3, 2], [16, 0, 2]])).paths()
+    paths = house.trace(links([-20, 0, 3], [[0, 0, 2], [-10, 3, 2], [16, 0, 2]]))
     assert paths.links_without_path.tolist() == [0, 2]
     loss = path_loss(paths)
     assert np.isposinf(loss[[0, 2]]).all()
@@ -245,7 +245,7 @@ def test_links_without_a_path_are_told_and_infinitely_weak(house: Tracer) -> Non
 
 
 def test_campaign_without_any_path(house: Tracer) -> None:
-    trace = house.trace(links([-20, 0, 3], [[0, 0, 2], [1, 1, 2]]))
+    trace = house.find(links([-20, 0, 3], [[0, 0, 2], [1, 1, 2]]))
     paths = trace.paths()
     assert paths.num_paths == paths.num_interactions == 0
     assert paths.links_without_path.tolist() == [0, 1]
@@ -330,7 +330,7 @@ def test_options_that_cannot_be_used(house: Tracer, options: dict, message: str)
 
 def test_tracer_refuses_a_material_that_its_scene_lacks(house: Tracer) -> None:
     with pytest.raises(InputError, match="the scene has no material 'glass'; there are: stone"):
-        house.set_materials({"glass": cb.Material(6.0, 0.0, 0.01)})
+        house.trace(links([-20, 0, 3], [[-10, 3, 2]]), materials={"glass": cb.Material(6.0, 0.0, 0.01)})
 
 
 def test_nothing_is_written(house: Tracer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

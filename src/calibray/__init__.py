@@ -13,7 +13,7 @@ _HOMES = {
     "Paths": "calibray.paths",
     "channel_statistics": "calibray.fields.channel",
     "power_delay_profile": "calibray.fields.channel",
-    "trace": "calibray.tracing.sionna",
+    "trace": "calibray.study.tracing",
     "path_gains": "calibray.fields",
     "path_loss": "calibray.fields",
     "Study": "calibray.study",

@@ -43,17 +43,17 @@ def outcome(
     judged = held_out & (reached | (objective.ceiling_db is not None))
     offsets = objective.offsets(best[None])[0] if objective.num_groups else np.zeros(0)
     offset_only, after = objective.model(np.stack([before, best]))
-    rival = _log_distance(links, objective.weight, study.scene.frequency)
+    rival = _log_distance(links, objective, study.scene.frequency)
 
     def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
         if not mask.any():
             return None
-        return float(np.sqrt(np.average((model - links.path_loss_db)[mask] ** 2, weights=links.weight[mask])))
+        return float(np.sqrt(np.average((model - objective.measured)[mask] ** 2, weights=links.weight[mask])))
 
     table = pd.DataFrame(
         {
             "row": links.row,
-            "measured_db": links.path_loss_db,
+            "measured_db": objective.measured,
             "before_db": before,
             "after_db": best + (offsets[objective.group] if objective.num_groups else 0.0),
             "log_distance_db": rival,
@@ -93,10 +93,10 @@ def outcome(
     )
 
 
-def _log_distance(links: Measurements, weight: NDArray[np.float64], frequency: float) -> NDArray[np.float64]:
+def _log_distance(links: Measurements, objective: Objective, frequency: float) -> NDArray[np.float64]:
     """Path loss [L], [dB] of the log-distance model fitted to links; over carriers it rises as in free space."""
     rise = 0.0 if links.frequency is None else 20 * np.log10(links.frequency / frequency)
-    model = LogDistance.fit(links.distance, links.path_loss_db - rise, weight)
+    model = LogDistance.fit(links.distance, objective.measured - rise, objective.weight)
     return model.path_loss(links.distance) + rise
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +76,7 @@ class Problem:
             bounds=study.offset.bounds if study.offset else None,
             ceiling_db=study.objective.ceiling_db,
         )
+        objective = replace(objective, measured=observable.measured(links))
         _check_groups(links, objective, held_out & np.isfinite(before))
         return cls(setup, engine, objective, before, observable)
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from calibray.measurements import Measurements
-    from calibray.report.terminal import Enclosed
-    from calibray.tracing.sionna import Tracer
+    from calibray.tracing.enclosed import Enclosed
+    from calibray.tracing.protocol import Tracer
 
 PREDICTED: Final = "path_loss_db"  # the column that `predict` adds
 
@@ -149,19 +149,15 @@ def run(
     ] = False,
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
-    from calibray.calibration.calibration import calibrate
-    from calibray.engines import make_tracer, open_executor
+    from calibray.calibration import calibrate
+    from calibray.engines import open_executor
     from calibray.report import terminal
-    from calibray.report.terminal import Enclosed
     from calibray.result import FILES
     from calibray.study import Study
 
     study = Study.load(study_file).replace(engine=engine)
     with open_executor(workers, scheduler) as executor, terminal.progress_bars(log) as progress:
         result = calibrate(study, method, seed, out, executor=executor, progress=progress)
-    # What an external program makes of the scene is its own affair.
-    external = study.engine.name == "command"
-    enclosed = Enclosed() if external else _enclosed(make_tracer(study), study.measurements())
     if as_json:
         typer.echo(json.dumps(result.content() | {"links": terminal.summary(result, enclosed)}, indent=2))
     else:
@@ -231,8 +227,12 @@ def trace(
     ] = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
+    from functools import partial
+
     from calibray.engines import make_tracer
+    from calibray.fields import path_loss
     from calibray.files import check_file
+    from calibray.progress import staged
     from calibray.report import terminal
     from calibray.study import Study
     from calibray.tracing import convergence
@@ -245,18 +245,20 @@ def trace(
     if told := terminal.render_plan(tracer.plan(links), len(links)):
         typer.echo(told, err=True)
     with terminal.progress_bars(log) as progress:
-        paths = tracer.trace(links, lambda done, total: progress("tracing", done, total)).paths()
+        paths = tracer.trace(links, progress)
         if out is not None:
             paths.save(out)
         found = (
             convergence.check(
-                tracer, links, paths,
-                combining=study.objective.combining, bandwidth=study.scene.bandwidth,
-                progress=lambda done, total: progress("checking", done, total),
+                tracer,
+                links,
+                paths,
+                partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth),
+                staged(progress, "checking"),
             )
             if check
             else None
-        )  # fmt: skip
+        )
     typer.echo(terminal.render_paths(paths, links.row, _enclosed(tracer, links)))
     if found is not None:
         typer.echo("\n" + terminal.render_convergence(found, links.row, study.fidelity.tolerance_db))
@@ -366,7 +368,7 @@ def ledger(
 
 def _enclosed(tracer: Tracer, links: Measurements) -> Enclosed:
     """Which antennas of some links stand inside closed bodies."""
-    from calibray.report.terminal import Enclosed
+    from calibray.tracing.enclosed import Enclosed
 
     return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
 

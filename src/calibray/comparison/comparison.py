@@ -20,12 +20,12 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from calibray.calibration.calibration import Progress
 from calibray.comparison.arena import Arena
 from calibray.comparison.runs import Run, Runs
 from calibray.errors import InputError
 from calibray.files import check_folder
 from calibray.optimizers import METHODS, Optimizer
+from calibray.progress import Progress
 from calibray.spelling import did_you_mean
 
 LEAST_BUDGET: Final = 24  # below, the pack of SGWO-IM would have no three leaders

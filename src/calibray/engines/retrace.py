@@ -15,7 +15,7 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.progress import Progress
-from calibray.tracing.sionna import Tracer
+from calibray.tracing.protocol import Tracer
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +98,9 @@ class Retrace:
 
     def _one(self, part: CarrierTracer, candidate: np.ndarray) -> np.ndarray:
         tracer = part.tracer
-        tracer.set_materials(self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency))
-        trace = tracer.trace(part.links)
-        gain, link, delay = trace.path_gains(), trace.link(), trace.delay()
+        materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
+        solution = tracer.solve(part.links, materials)
+        gain, link, delay = solution.gain, solution.link, solution.delay
         offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
         parts = tuple(jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
         power = fields.link_power(

@@ -9,12 +9,12 @@ place of the traced one after a reflection) are followed, so that path gains agr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.constants import speed_of_light
 
-from calibray.paths.program import Diffraction, Diffuse, Kind
+from calibray.paths.interactions import Diffraction, Diffuse, Kind
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Chains:
     kind: np.ndarray
     material: np.ndarray
     probability: np.ndarray
-    samples: int
-    edge: np.ndarray
-    normal_n: np.ndarray
-    edge_lengths: np.ndarray
+    samples: int = 1
+    edge: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    normal_n: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    edge_lengths: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)
@@ -96,27 +96,30 @@ def compile_chains(chains: Chains) -> Program:
     present = chains.kind != 0
     length = present.sum(axis=1)
     stop = np.concatenate([chains.vertex, np.zeros((count, 1, 3))], axis=1)
-    stop[np.arange(count), length] = chains.target  # the target follows the last interaction
+    # The target follows the last interaction.
+    stop[np.arange(count), length] = chains.target
     ahead = np.concatenate([stop[:, :1] - chains.source[:, None], np.diff(stop, axis=1)], axis=1)
     segment = np.linalg.norm(ahead, axis=2) * (np.arange(depth + 1) <= length[:, None])
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
 
-    out_of = np.tile(
-        [1.0, 0.0], (count, 1)
-    )  # rotation from the last interaction's frame into the basis (theta, phi)
+    # Rotation from the last interaction's frame into the basis (theta, phi).
+    out_of = np.tile([1.0, 0.0], (count, 1))
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[np.ndarray, ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
-    tube_start = np.zeros(count)  # length already travelled when the present ray tube began
-    spread = np.zeros(count)  # set where an edge diffracts
+    # Length already travelled when the present ray tube began.
+    tube_start = np.zeros(count)
+    # Set where an edge diffracts.
+    spread = np.zeros(count)
     travelled = segment[:, 0].copy()
     for step in range(depth):
         row = np.flatnonzero(present[:, step])
         incident, leaving = direction[row, step], direction[row, step + 1]
         normal = chains.normal[row, step]
-        normal = normal * _sign(_dot(normal, -incident))[:, None]  # towards the incident wave
+        # Normals point towards the incident wave.
+        normal = normal * _sign(_dot(normal, -incident))[:, None]
         cosine[row, step] = np.abs(_dot(incident, normal))
         solid_angle[row] *= _inverse(chains.probability[row, step])
         kind = chains.kind[row, step]
@@ -200,9 +203,8 @@ def spherical_basis(direction: np.ndarray, pole_reference: bool = True) -> np.nd
         return theta
     reference = np.array([-1.0, 0.0, 0.0])
     fallback = reference - _dot(direction, reference)[..., None] * direction
-    near = np.abs(np.float32(z)) > np.float32(
-        1 - 5e-7
-    )  # the bound is met in single precision, as Sionna computes it
+    # The bound is met in single precision, as Sionna computes it.
+    near = np.abs(np.float32(z)) > np.float32(1 - 5e-7)
     return np.where(near[..., None], _unit(np.where(near[..., None], fallback, reference)), theta)
 
 
@@ -287,9 +289,8 @@ def _wedge(
     phi_in = _unit(np.cross(incident, edge))
     turns = []
     for normal in (normal_0, normal_n):
-        mirrored = (
-            incident - 2 * _dot(incident, normal)[:, None] * normal
-        )  # direction of the reflection boundary
+        # Direction of the reflection boundary.
+        mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
         face = transverse_electric(incident, normal)
         boundary = -_unit(np.cross(mirrored, edge))
         turns += [rotate(incident, phi_in, face), rotate(mirrored, face, boundary)]
@@ -323,7 +324,8 @@ def _in_path_order(parts: list[tuple[np.ndarray, ...]], empty: Diffuse | Diffrac
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((step, path))
     columns = [column[order] for column in columns]
-    if isinstance(empty, Diffuse):  # the solid angle was gathered last, after the directions
+    # The solid angle was gathered last, after the directions.
+    if isinstance(empty, Diffuse):
         rotation, scattered, specular, backward, solid_angle = columns
         return [rotation, solid_angle, scattered, specular, backward]
     return columns

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
-from enum import IntEnum
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,80 +19,17 @@ import numpy as np
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material
+from calibray.paths.interactions import Diffraction, Diffuse, Kind
+from calibray.paths.summary import as_html, as_text
 
 SCHEMA = "calibray/paths"
 SCHEMA_VERSION = 1
 
 
-class Kind(IntEnum):
-    """Kinds of interaction, with Sionna's codes."""
-
-    SPECULAR = 1
-    DIFFUSE = 2
-    REFRACTION = 4
-    DIFFRACTION = 8
-
-
-@dataclass(frozen=True)
-class Diffuse:
-    """What a diffuse reflection needs beyond the common arrays; one row per diffuse interaction, in their order.
-
-    Attributes:
-        rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
-            of the incident direction, in which the XPD matrix acts [D, 2].
-        solid_angle: Ray tube's solid angle over the sampling probability at trace time [D], [sr].
-        cos_scattered: Cosine between the scattered direction and the normal [D].
-        cos_specular: Cosine between the scattered and the specular direction [D].
-        cos_backward: Cosine between the scattered direction and the way back to the source [D].
-    """
-
-    rotation: np.ndarray
-    solid_angle: np.ndarray
-    cos_scattered: np.ndarray
-    cos_specular: np.ndarray
-    cos_backward: np.ndarray
-
-    @classmethod
-    def empty(cls) -> Diffuse:
-        """No diffuse interaction."""
-        return cls(np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)))
-
-
-@dataclass(frozen=True)
-class Diffraction:
-    """What a diffraction needs beyond the common arrays; one row per diffraction, in their order.
-
-    The 0-face's cosine of incidence is in `Paths.cos_incidence`.
-
-    Attributes:
-        cos_incidence_n: Cosine of the angle of incidence on the n-face [W].
-        exterior_angle: Exterior angle of the wedge [W], [rad].
-        azimuth_in: Azimuth phi' of the incident ray around the edge, from the 0-face [W], [rad].
-        azimuth_out: Azimuth phi of the diffracted ray [W], [rad].
-        sin_edge: Sine of the angle beta_0 between ray and edge [W].
-        distance: L = s s' sin^2(beta_0) / (s + s') [W], [m].
-        rotations: (cos, sin) of the four rotations between the edge-fixed frames and the transverse electric frames
-            of the faces: in 0, out 0, in n, out n [W, 4, 2].
-    """
-
-    cos_incidence_n: np.ndarray
-    exterior_angle: np.ndarray
-    azimuth_in: np.ndarray
-    azimuth_out: np.ndarray
-    sin_edge: np.ndarray
-    distance: np.ndarray
-    rotations: np.ndarray
-
-    @classmethod
-    def empty(cls) -> Diffraction:
-        """No diffraction."""
-        return cls(*(np.zeros(0) for _ in range(6)), np.zeros((0, 4, 2)))
-
-
 Table = TypeVar("Table", Diffuse, Diffraction)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Paths:
     """A traced campaign as a path program.
 
@@ -140,6 +76,12 @@ class Paths:
     diffuse: Diffuse = field(default_factory=Diffuse.empty)
     diffraction: Diffraction = field(default_factory=Diffraction.empty)
     settings: Mapping[str, object] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
 
     @property
     def num_paths(self) -> int:

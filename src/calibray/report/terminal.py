@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import StringIO
 from typing import Any, Final
 
@@ -23,45 +22,16 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from calibray.calibration.calibration import Progress as Report
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.paths import Paths
+from calibray.progress import Progress as Report
 from calibray.result import Result
 from calibray.tracing.convergence import Convergence
+from calibray.tracing.enclosed import Enclosed
 from calibray.tracing.launches import Plan
 
 LONG: Final = 20_000_000  # rays x interactions x receivers that take some seconds
 LISTED: Final = 12  # rows named one by one before the rest is only counted
-
-
-@dataclass(frozen=True)
-class Enclosed:
-    """Antennas that stand inside closed bodies of the scene.
-
-    Attributes:
-        tx: Lines in the source file of the links whose transmitter is enclosed.
-        rx: The same for receivers.
-        indoors: Whether most are, as they are in a building's inside; then none is suspect.
-    """
-
-    tx: tuple[int, ...] = ()
-    rx: tuple[int, ...] = ()
-    indoors: bool = False
-
-    @classmethod
-    def of(cls, row: np.ndarray, tx: np.ndarray, rx: np.ndarray) -> Enclosed:
-        """Sort out which antennas are enclosed.
-
-        Args:
-            row: Line of every link in the source file [L].
-            tx: Whether its transmitter is enclosed [L].
-            rx: Whether its receiver is enclosed [L].
-
-        Returns:
-            The lines of the links concerned.
-        """
-        indoors = bool(np.mean(tx | rx) > 0.5)
-        return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)
 
 
 def summary(result: Result, enclosed: Enclosed) -> dict[str, Any]:
@@ -117,7 +87,7 @@ def render_plan(plan: Plan, links: int) -> str:
     Returns:
         The line; empty if one small launch does it all.
     """
-    if len(plan.launches) == 1 and plan.lanes <= LONG:
+    if len(plan.launches) <= 1 and plan.lanes <= LONG:
         return ""
     return (
         f"Tracing {links:,} links in {len(plan.launches):,} launches of up to {plan.lanes:,} rays x interactions x "

@@ -14,7 +14,7 @@ from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.progress import Progress
-from calibray.scenes import Scene, read_scene
+from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.study.model import Study
 from calibray.tracing import cache
 from calibray.tracing.enclosed import Enclosed
@@ -130,30 +130,30 @@ class Setup:
         Links that differ in their carrier alone are traced once.
 
         Args:
-            materials: All materials to trace with, by name; the scene's own if None.
+            materials: Constants in place of the scene's, by material name.
             progress: Called with the stage "tracing" after every launch.
 
         Returns:
             The path program.
 
         Raises:
-            InputError: The tracer cannot be used.
+            InputError: The tracer cannot be used, or the scene lacks a material.
             EngineError: There are more paths than fit into memory.
         """
+        for name in materials or {}:
+            check_material_name(name, self.scene.materials, "materials")
+        scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
-            return self._trace(self.links, materials, progress)
+            return self._trace(self.links, scene, progress)
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, place = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         once = replace(self.links.select(np.isin(np.arange(len(self.links)), first)), frequency=None)
         # `select` keeps the links' order, `unique` sorts them.
         order = np.argsort(np.argsort(first))
-        return take_links(self._trace(once, materials, progress), order[place.reshape(-1)])
+        return take_links(self._trace(once, scene, progress), order[place.reshape(-1)])
 
-    def _trace(
-        self, links: Measurements, materials: Mapping[str, Material] | None, progress: Progress | None
-    ) -> Paths:
+    def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
         study = self.study
-        scene = self.scene if materials is None else replace(self.scene, materials=dict(materials))
         digest = cache.trace_digest(
             self.factory.versions,
             scene,

@@ -26,30 +26,32 @@ VARIABLE: Final = "CALIBRAY_CACHE"
 
 
 def trace_digest(
+    versions: Mapping[str, str],
     scene: Scene,
     frequency: float,
     settings: TraceSettings,
     antennas: tuple[Antenna, Antenna],
     tx: np.ndarray,
     rx: np.ndarray,
-    tracer: Mapping[str, str],
 ) -> str:
     """What a trace depends on, as a fingerprint.
 
     Args:
+        versions: The tracer's programs and their versions.
         scene: The scene; its materials count, because they steer which rays are followed.
         frequency: Carrier frequency [Hz].
         settings: The tracer's switches.
         antennas: Transmit and receive antenna.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
-        tracer: Versions of what traces, by name.
 
     Returns:
         SHA-256 in hexadecimal.
     """
     record = {
-        "versions": [version("calibray"), dict(tracer), SCHEMA_VERSION],
+        "calibray": version("calibray"),
+        "schema": SCHEMA_VERSION,
+        "tracer": dict(versions),
         "frequency": frequency,
         "settings": settings.record(),
         "antennas": [antenna.record() for antenna in antennas],
@@ -63,11 +65,6 @@ def trace_digest(
     for position in (tx, rx):
         digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
     return digest.hexdigest()
-
-
-def sionna_versions() -> dict[str, str]:
-    """Versions of Sionna RT and of what it is built on, by package; none of them is imported."""
-    return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
 
 
 def find(digest: str) -> Paths | None:
@@ -84,7 +81,8 @@ def find(digest: str) -> Paths | None:
         return None
     try:
         return Paths.load(path)
-    except InputError:  # left by another version, or damaged: trace again
+    # Left by another version, or damaged: trace again.
+    except InputError:
         path.unlink(missing_ok=True)
         return None
 

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.fields import path_loss
 from calibray.paths import Paths
-from calibray.tracing.sionna import Links, Tracer
+from calibray.progress import Progress
+from calibray.tracing.protocol import Links, Tracer
 
 
 @dataclass(frozen=True)
@@ -30,22 +31,22 @@ class Convergence:
     """
 
     samples: int
-    change_db: np.ndarray
-    paths_before: np.ndarray
-    paths_after: np.ndarray
+    change_db: NDArray[np.float64]
+    paths_before: NDArray[np.int64]
+    paths_after: NDArray[np.int64]
 
     @property
-    def gained(self) -> np.ndarray:
+    def gained(self) -> NDArray[np.int64]:
         """Links that have more paths than before [links]."""
         return np.flatnonzero(self.paths_after > self.paths_before)
 
     @property
-    def lost(self) -> np.ndarray:
+    def lost(self) -> NDArray[np.int64]:
         """Links that have fewer paths than before [links]."""
         return np.flatnonzero(self.paths_after < self.paths_before)
 
     @property
-    def largest(self) -> np.ndarray:
+    def largest(self) -> NDArray[np.int64]:
         """Links by size of change, the largest first [L]."""
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
@@ -65,23 +66,24 @@ class Convergence:
         return self.quantile(1.0) <= tolerance_db
 
 
-def compare(
-    before: Paths, after: Paths, samples: int, combining: str = "power", bandwidth: float | None = None
-) -> Convergence:
+PathLoss = Callable[[Paths], NDArray[np.float64]]
+"""Path loss of every link [L], [dB], of a path program; as `calibray.path_loss`."""
+
+
+def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> Convergence:
     """Compare two traces of the same links.
 
     Args:
         before: The paths found first.
         after: The paths found with more samples.
         samples: Rays per transmitter of the first trace.
-        combining: How the paths of a link combine (see `calibray.path_loss`).
-        bandwidth: Bandwidth [Hz], for "band".
+        path_loss: Computes the path loss to compare.
 
     Returns:
         The change of every link.
 
     Raises:
-        InputError: The links differ, or the combining is unknown.
+        InputError: The links differ.
     """
     for name in ("tx_position", "rx_position"):
         if not np.array_equal(getattr(before, name), getattr(after, name)):
@@ -89,7 +91,7 @@ def compare(
                 f"the traces have {before.num_links} and {after.num_links} links that differ in {name}; "
                 "compare traces of the same links"
             )
-    one, other = (path_loss(paths, combining=combining, bandwidth=bandwidth) for paths in (before, after))
+    one, other = path_loss(before), path_loss(after)
     neither = np.isinf(one) & np.isinf(other)
     return Convergence(
         samples=samples,
@@ -100,13 +102,7 @@ def compare(
 
 
 def check(
-    tracer: Tracer,
-    links: Links,
-    before: Paths,
-    *,
-    combining: str = "power",
-    bandwidth: float | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    tracer: Tracer, links: Links, before: Paths, path_loss: PathLoss, progress: Progress | None = None
 ) -> Convergence:
     """Trace some links again with twice the samples and the next seed, and compare.
 
@@ -114,23 +110,16 @@ def check(
         tracer: What traced them.
         links: The links.
         before: The paths that it found.
-        combining: How the paths of a link combine (see `calibray.path_loss`).
-        bandwidth: Bandwidth [Hz], for "band".
-        progress: Called with (receivers traced, receivers in all) while tracing.
+        path_loss: Computes the path loss to compare.
+        progress: Called with ("tracing", receivers traced, receivers in all).
 
     Returns:
         The change of every link.
 
     Raises:
-        InputError: The combining is unknown, or `before` holds other links.
+        InputError: `before` holds other links.
         EngineError: There are more paths than the tracer can hold.
     """
     settings = tracer.settings
-    finer = Tracer(
-        tracer.scene,
-        tracer.frequency,
-        replace(settings, samples=2 * settings.samples, seed=settings.seed + 1),
-        tracer.tx_antenna,
-        tracer.rx_antenna,
-    )
-    return compare(before, finer.trace(links, progress).paths(), settings.samples, combining, bandwidth)
+    finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=settings.seed + 1))
+    return compare(before, finer.trace(links, progress), settings.samples, path_loss)

@@ -1,10 +1,11 @@
-"""Antennas that stand inside closed bodies of a scene."""
+"""Enclosed antennas: links whose ends stand inside closed bodies of the scene, most often by a wrong position."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Enclosed:
     indoors: bool = False
 
     @classmethod
-    def of(cls, row: np.ndarray, tx: np.ndarray, rx: np.ndarray) -> Enclosed:
+    def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> Enclosed:
         """Sort out which antennas are enclosed.
 
         Args:

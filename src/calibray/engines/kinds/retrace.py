@@ -10,7 +10,7 @@ import numpy as np
 from calibray.engines.section import EngineSection
 from calibray.paths import Paths
 from calibray.progress import Progress
-from calibray.tracing.cache import sionna_versions
+from calibray.tracing.factory import SIONNA
 
 if TYPE_CHECKING:
     from calibray.engines.retrace import Retrace
@@ -33,7 +33,7 @@ class RetraceSection(EngineSection):
     @property
     def answers_by(self) -> list[str]:
         """The versions of the ray tracer."""
-        return list(sionna_versions().values())
+        return list(SIONNA.versions.values())
 
     def open(
         self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None

@@ -2,8 +2,10 @@
 
 from calibray.tracing import llvm
 
-llvm.prepare()  # before Dr.Jit loads an LLVM that would abort the process
+# Before Dr.Jit loads an LLVM that would abort the process.
+llvm.prepare()
 
-from calibray.tracing.sionna.tracer import FLOATS, Links, Progress, Trace, Tracer, trace  # noqa: E402
+from calibray.tracing.sionna.stored import Trace  # noqa: E402
+from calibray.tracing.sionna.tracer import FLOATS, Tracer  # noqa: E402
 
-__all__ = ["FLOATS", "Links", "Progress", "Trace", "Tracer", "trace"]
+__all__ = ["FLOATS", "Trace", "Tracer"]

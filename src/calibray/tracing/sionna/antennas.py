@@ -1,4 +1,4 @@
-"""Antenna patterns as Sionna RT evaluates them, and the Jones vectors of paths that leave or arrive."""
+"""Antenna patterns as functions for Sionna's own field stage."""
 
 from __future__ import annotations
 
@@ -7,12 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from sionna.rt.antenna_pattern import (
-    PolarizedAntennaPattern,
-    antenna_pattern_registry,
-    antenna_pattern_to_world_implicit,
-)
-from sionna.rt.utils import rotation_matrix
+from sionna.rt.antenna_pattern import PolarizedAntennaPattern, antenna_pattern_registry
 
 from calibray.tracing.gain_table import GainTable, read_gain_table
 from calibray.tracing.settings import Antenna
@@ -61,40 +56,3 @@ def tabulated(table: GainTable) -> Callable[[mi.Float, mi.Float], mi.Complex2f]:
         return mi.Complex2f(dr.power(10.0, dr.lerp(low, high, u) / 20), 0)
 
     return pattern
-
-
-def jones_vectors(antenna: Antenna, patterns: list, direction: np.ndarray, way: str) -> np.ndarray:
-    """Jones vectors of an antenna in the basis (theta, phi) of the wave.
-
-    Args:
-        antenna: The antenna.
-        patterns: Its pattern functions.
-        direction: Directions, seen from the antenna [P, 3].
-        way: "out" for waves that leave, "in" for waves that arrive.
-
-    Returns:
-        The vectors by port [P, ports, 2], complex.
-    """
-    if not len(direction):
-        return np.zeros((0, antenna.ports, 2), dtype=complex)
-    to_world = rotation_matrix(mi.Point3f(*antenna.orientation))
-    look = mi.Vector3f(*(aligned(axis, np.float32) for axis in direction.T))
-    fields = [antenna_pattern_to_world_implicit(pattern, to_world, look, way) for pattern in patterns]
-    parts = np.array([np.array(field, dtype=float) for field in fields])  # [ports, (re, re, im, im), P]
-    return np.moveaxis(parts[:, :2] + 1j * parts[:, 2:], 2, 0)
-
-
-def turned(field: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Jones vectors in a frame that is rotated against theirs.
-
-    Args:
-        field: The vectors [P, ports, 2].
-        rotation: (cos, sin) of the rotation [P, 2].
-
-    Returns:
-        The vectors [P, ports, 2].
-    """
-    cos, sin = rotation[:, None, 0], rotation[:, None, 1]
-    return np.stack(
-        [cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1
-    )

@@ -11,15 +11,15 @@ buffer that filled up is traced again, larger.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Final, Protocol
+from collections.abc import Mapping
+from copy import copy
+from typing import Final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
+from numpy.typing import NDArray
 from sionna.rt.path_solvers.field_calculator import FieldCalculator
 from sionna.rt.path_solvers.image_method import ImageMethod
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
@@ -27,19 +27,27 @@ from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGene
 
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
-from calibray.paths import Paths, concatenate
-from calibray.paths.chains import Chains, compile_chains, zenith_azimuth
-from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.paths import Paths
+from calibray.paths.chains import Chains
+from calibray.progress import Progress
+from calibray.scenes import Scene, check_material_name
+from calibray.tracing.antennas import Radiator
+from calibray.tracing.compilation import compile_paths
+from calibray.tracing.factory import SIONNA
 from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan
 from calibray.tracing.memory import available
-from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
-from calibray.tracing.sionna.antennas import jones_vectors, patterns_of, turned
+from calibray.tracing.protocol import Links, Solution, positions
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
 from calibray.tracing.sionna.loading import load, scattering_pattern, shape_materials
+from calibray.tracing.sionna.stored import Trace
 
-LANES: Final = 20_000_000  # samples x depth x receivers of one launch
-BUFFER: Final = 1_000_000  # paths that the buffer of one launch holds at first
+LANES: Final = 20_000_000
+"""Samples x depth x receivers of one launch."""
+BUFFER: Final = 1_000_000
+"""Paths that the buffer of one launch holds at first."""
 # Candidates whose hashes meet in Sionna's table pass for one, and the others are lost: with its million entries 16 of
 # 6,030 (100 receivers in Munich, 25 at once), with this many none. A prime: the lowest bits of FNV hashes differ least.
 SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
@@ -50,66 +58,6 @@ FLOATS: Final = (
     "scattering_coefficient",
     "xpd_coefficient",
 )
-
-Progress = Callable[[int, int], None]
-
-
-class Links(Protocol):
-    """Anything with transmitter and receiver positions [L, 3], [m]; `Measurements` above all."""
-
-    @property
-    def tx(self) -> np.ndarray: ...  # noqa: D102
-    @property
-    def rx(self) -> np.ndarray: ...  # noqa: D102
-
-
-def trace(
-    scene: str | Path | Scene,
-    measurements: Links,
-    *,
-    frequency: float,
-    tx_antenna: Antenna | Mapping[str, object] | None = None,
-    rx_antenna: Antenna | Mapping[str, object] | None = None,
-    materials: Mapping[str, Material | Mapping[str, object]] | None = None,
-    progress: Progress | None = None,
-    **settings: int | bool,
-) -> Paths:
-    """Find the paths of every link and compile them.
-
-    Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read.
-        measurements: The links; their values and carriers are not looked at (for another carrier, `Paths.at`).
-        frequency: Carrier frequency [Hz].
-        tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
-        rx_antenna: Receive antenna.
-        materials: Constants in place of the scene's, by material name.
-        progress: Called with (receivers traced, receivers in all) after every launch.
-        **settings: The attributes of `TraceSettings`.
-
-    Returns:
-        The path program; `links_without_path` tells which links it cannot say anything about.
-
-    Raises:
-        InputError: The scene, an antenna, a setting or a position cannot be used.
-        EngineError: There are more paths than fit into memory.
-    """
-    tracer = Tracer(
-        scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
-        frequency,
-        _settings(settings),
-        as_antenna(tx_antenna),
-        as_antenna(rx_antenna),
-    )
-    return tracer.trace(measurements, progress).paths()
-
-
-def _settings(settings: Mapping[str, int | bool]) -> TraceSettings:
-    unknown = set(settings) - set(TraceSettings().record())
-    if unknown:
-        raise InputError(
-            f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(TraceSettings().record())}"
-        )
-    return TraceSettings(**settings)  # type: ignore[arg-type]
 
 
 class Tracer:
@@ -139,30 +87,31 @@ class Tracer:
             raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
         self.scene, self.frequency, self.settings = scene, float(frequency), settings
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
+        self._radiators = Radiator.of(tx_antenna), Radiator.of(rx_antenna)
         self._tx_patterns, self._rx_patterns = patterns_of(tx_antenna), patterns_of(rx_antenna)
         self._scene = load(scene)
         self._scene.frequency = self.frequency
         self._shape_material = shape_materials(self._scene)
         self._candidates, self._images = SBDeterministicCandidateGenerator(), ImageMethod()
         self._fields = FieldCalculator()
-        self.set_materials(scene.materials)
 
-    def set_materials(self, materials: Mapping[str, Material]) -> None:
-        """Give Sionna's materials other constants.
+    @property
+    def versions(self) -> dict[str, str]:
+        """Installed versions by package."""
+        return SIONNA.versions
+
+    def with_settings(self, settings: TraceSettings) -> Tracer:
+        """The tracer with other switches, on the same scene in Sionna's memory.
 
         Args:
-            materials: Constants by material name; materials not named keep theirs.
+            settings: The switches.
 
-        Raises:
-            InputError: The scene has no material of a name.
+        Returns:
+            Another tracer.
         """
-        names = list(self.scene.materials)
-        for name, material in materials.items():
-            check_material_name(name, self.scene.materials, "materials")
-            target = self._scene.radio_materials[f"calibray-{names.index(name)}"]
-            for constant in FLOATS:  # opaque: a literal would be compiled into the kernels
-                setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
-            target.scattering_pattern = scattering_pattern(material)
+        other = copy(self)
+        other.settings = settings
+        return other
 
     def plan(self, links: Links) -> Plan:
         """How the links will be traced.
@@ -176,23 +125,65 @@ class Tracer:
         Raises:
             InputError: There is no link, a position is not finite, or a link's ends coincide.
         """
-        return plan(_positions(links)[0], self.settings, LANES, BUFFER)
+        return plan(positions(links)[0], self.settings, LANES, BUFFER)
 
-    def trace(self, links: Links, progress: Progress | None = None) -> Trace:
-        """Find the paths of every link with the present materials.
+    def trace(
+        self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
+    ) -> Paths:
+        """Find the paths of every link.
 
         Args:
             links: The links.
-            progress: Called with (receivers traced, receivers in all) after every launch.
+            progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
+            materials: Constants in place of the scene's, by name.
+
+        Returns:
+            The path program, its materials those traced with.
+
+        Raises:
+            InputError: There is no link, a position is not finite, a link's ends coincide, or the scene lacks a
+                material.
+            EngineError: There are more paths than fit into memory.
+        """
+        return self.find(links, progress, materials).paths()
+
+    def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
+        """Find the paths of every link and compute their gains with Sionna's own field stage.
+
+        Args:
+            links: The links.
+            materials: Constants in place of the scene's, by name.
+
+        Returns:
+            The gains.
+
+        Raises:
+            InputError: As for `trace`.
+            EngineError: There are more paths than fit into memory.
+        """
+        found = self.find(links, None, materials)
+        return Solution(found.path_gains(), found.link(), found.delay())
+
+    def find(
+        self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
+    ) -> Trace:
+        """Find the paths of every link, and leave them in Sionna's buffers.
+
+        Args:
+            links: The links.
+            progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
+            materials: Constants in place of the scene's, by name.
 
         Returns:
             The paths in Sionna's buffers.
 
         Raises:
-            InputError: There is no link, a position is not finite, or a link's ends coincide.
+            InputError: There is no link, a position is not finite, a link's ends coincide, or the scene lacks a
+                material.
             EngineError: There are more paths than fit into memory.
         """
-        tx, rx = _positions(links)
+        tx, rx = positions(links)
+        constants = self.give(materials or {})
         room = paths_that_fit(available(), self.settings.max_depth)
         chunks: list[Chunk] = []
         pieces: list[Chunk] = []
@@ -205,8 +196,31 @@ class Tracer:
                 pieces = []
                 done += len(launch.links)
             if progress is not None:
-                progress(done, len(rx))
-        return Trace(self, tx, rx, tuple(chunks))
+                progress("tracing", done, len(rx))
+        return Trace(self, constants, tx, rx, tuple(chunks))
+
+    def give(self, materials: Mapping[str, Material]) -> dict[str, Material]:
+        """Give Sionna's materials the scene's constants, some of them replaced.
+
+        Args:
+            materials: Constants in place of the scene's, by name.
+
+        Returns:
+            The constants of all materials.
+
+        Raises:
+            InputError: The scene has no material of a name.
+        """
+        for name in materials:
+            check_material_name(name, self.scene.materials, "materials")
+        constants = {**self.scene.materials, **materials}
+        for index, material in enumerate(constants.values()):
+            target = self._scene.radio_materials[f"calibray-{index}"]
+            # Opaque: a literal would be compiled into the kernels.
+            for constant in FLOATS:
+                setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
+            target.scattering_pattern = scattering_pattern(material)
+        return constants
 
     def enclosed(self, points: np.ndarray) -> np.ndarray:
         """Whether points lie inside closed bodies of the scene, such as buildings.
@@ -240,7 +254,8 @@ class Tracer:
 
     def _trace_launch(self, launch: Launch, targets: np.ndarray, room: int) -> Chunk:
         settings, size = self.settings, BUFFER
-        most = (launch.rays * settings.max_depth + 1) * len(targets) + 2  # a path a lane, and the direct ones
+        # A path a lane, and the direct ones.
+        most = (launch.rays * settings.max_depth + 1) * len(targets) + 2
         src, tgt = points(launch.source[None]), points(targets)
         while True:
             with share_of_rays(launch, settings.samples):
@@ -283,47 +298,36 @@ class Tracer:
             )
             buffer.discard_invalid()
             buffer.schedule()
-            dr.eval()  # at once: what is left to be computed would hold on to all candidates and the whole buffer
+            # At once: what is left to be computed would hold on to all candidates and the whole buffer.
+            dr.eval()
         return Chunk(buffer, src, tgt, launch.links[np.array(buffer.target_indices, dtype=np.int64)])
 
-    def compile(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Paths:
+    def compile(
+        self,
+        chunk: Chunk,
+        tx: NDArray[np.float64],
+        rx: NDArray[np.float64],
+        materials: Mapping[str, Material],
+    ) -> Paths:
         """Compile one chunk into a path program.
 
         Args:
             chunk: Paths in Sionna's buffer.
             tx: Transmitter of every link [L, 3], [m].
             rx: Receiver of every link [L, 3], [m].
+            materials: The constants that they were found with.
 
         Returns:
-            The program, its paths in the buffer's order.
+            The program, its paths ordered by link.
         """
-        program = compile_chains(self._chains(chunk, tx, rx))
-        departure, arrival = program.departure_direction, program.arrival_direction
-        return Paths(
+        return compile_paths(
+            self._chains(chunk, tx, rx),
+            chunk.link,
+            tx,
+            rx,
             frequency=self.frequency,
-            materials=dict(self.scene.materials),
-            tx_position=tx,
-            rx_position=rx,
-            link=chunk.link.astype(np.int32),
-            delay=program.delay,
-            spreading=program.spreading,
-            departure=zenith_azimuth(departure),
-            arrival=zenith_azimuth(-arrival),
-            tx_field=turned(
-                jones_vectors(self.tx_antenna, self._tx_patterns, departure, "out"),
-                program.departure_rotation,
-            ),
-            rx_field=turned(
-                jones_vectors(self.rx_antenna, self._rx_patterns, -arrival, "in"),
-                program.arrival_rotation * [1, -1],
-            ),
-            first=program.first,
-            kind=program.kind,
-            material=program.material,
-            cos_incidence=program.cos_incidence,
-            rotation=program.rotation,
-            diffuse=program.diffuse,
-            diffraction=program.diffraction,
+            materials=materials,
+            antennas=self._radiators,
             settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
         )
 
@@ -364,7 +368,7 @@ class Tracer:
         )
 
     def field_stage(self, chunk: Chunk) -> np.ndarray:
-        """Sionna's own field stage on stored paths, with the present materials.
+        """Sionna's own field stage on stored paths, with the constants given last.
 
         Args:
             chunk: Paths in Sionna's buffer.
@@ -389,68 +393,8 @@ class Tracer:
             src_antenna_patterns=self._tx_patterns,
             tgt_antenna_patterns=self._rx_patterns,
         )
-        dr.eval(found.a, found.tau)  # at once: every array read on its own would run the whole stage again
-        buffer.valid = valid  # the field stage narrows it
+        # At once: every array read on its own would run the whole stage again.
+        dr.eval(found.a, found.tau)
+        # The field stage narrows it.
+        buffer.valid = valid
         return np.array([[to_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
-
-
-@dataclass(frozen=True)
-class Trace:
-    """A traced campaign in Sionna's buffers.
-
-    Attributes:
-        tracer: The tracer that found it.
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-        chunks: The paths.
-    """
-
-    tracer: Tracer
-    tx: np.ndarray
-    rx: np.ndarray
-    chunks: tuple[Chunk, ...]
-
-    def paths(self) -> Paths:
-        """Compile the paths, ordered by link."""
-        return concatenate([self.tracer.compile(chunk, self.tx, self.rx) for chunk in self.chunks])
-
-    def link(self) -> np.ndarray:
-        """Link of every path, non-decreasing [P]."""
-        return np.sort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
-
-    def delay(self) -> np.ndarray:
-        """Sionna's propagation delays in the order of `link` [P], [s]; known once `path_gains` has run."""
-        found = [
-            np.array(chunk.buffer.tau, dtype=float) if len(chunk.link) else np.zeros(0)
-            for chunk in self.chunks
-        ]
-        return np.concatenate(found)[self._order()]
-
-    def path_gains(self) -> np.ndarray:
-        """Sionna's path gains with the tracer's present materials.
-
-        Returns:
-            Gains in the order of `paths()` [P, R, T], complex.
-        """
-        return np.concatenate([self.tracer.field_stage(chunk) for chunk in self.chunks])[self._order()]
-
-    def _order(self) -> np.ndarray:
-        return np.argsort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
-
-
-def _positions(links: Links) -> tuple[np.ndarray, np.ndarray]:
-    tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
-    if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
-        raise InputError(
-            f"links: tx has the shape {tx.shape}, rx {rx.shape}; both must be [links, 3], with at least one link"
-        )
-    for name, position in (("tx", tx), ("rx", rx)):
-        bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
-        if len(bad):
-            raise InputError(f"link {bad[0]}: {name} position {position[bad[0]]} is not finite; give metres")
-    same = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < 1e-3)
-    if len(same):
-        raise InputError(
-            f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns"
-        )
-    return tx, rx
