@@ -10,8 +10,9 @@ from scipy.optimize import minimize
 
 from calibray import engines
 from calibray.calibration.calibration import Problem
-from calibray.comparison.experiment import FIGURES, METHODS, run_demo, tables
+from calibray.comparison.experiment import FIGURES, METHODS, run_demo
 from calibray.errors import InputError
+from calibray.report.demo import tables
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 
@@ -78,7 +79,7 @@ def test_files_exist_and_open(demo):
     assert content["methods"]["auto"]["excess_rmse_db"] == 0
     for method in finished.results:
         assert (out / method / "scene.xml").is_file()
-    assert all(len(row) == len(header) for _, header, rows in tables(finished) for row in rows)
+    assert [len(table.rows) for table in tables(finished)] == [3, 3, 3, 3]
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path):

@@ -12,7 +12,8 @@ from typing import Any, Final
 from calibray import engines
 from calibray.calibration.calibration import Progress, calibrate
 from calibray.files import check_folder, write_text
-from calibray.report import figures
+from calibray.report import figures, glance, records
+from calibray.report.labels import label
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
@@ -43,7 +44,7 @@ PAPER: Final = {
 """What the paper reports for its own site (its tables III and IV, and section IV-B)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Demo:
     """The finished experiment.
 
@@ -60,6 +61,17 @@ class Demo:
     truth: dict[str, float]
     engine: str
     trace_seconds: float
+
+    @property
+    def paper(self) -> Mapping[str, Mapping[str, float]]:
+        """What the paper reports for its own site, by method."""
+        return PAPER
+
+    def __repr__(self) -> str:
+        return glance.text(*records.demo(self))
+
+    def _repr_html_(self) -> str:
+        return glance.html(*records.demo(self))
 
     def content(self) -> dict[str, Any]:
         """The experiment as plain values, the paper's figures beside."""
@@ -98,14 +110,10 @@ def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progres
     trace_seconds = time.perf_counter() - started
     chosen = replay if engine == "replay" else engines.make(study, engine)
     results = {
-        method: calibrate(
-            study, method, seed, engine=chosen, progress=_named(progress, figures.label(method))
-        )
+        method: calibrate(study, method, seed, engine=chosen, progress=_named(progress, label(method)))
         for method in METHODS
     }
-    results[AUTO] = calibrate(
-        study, AUTO, seed, engine=replay, progress=_named(progress, figures.label(AUTO))
-    )
+    results[AUTO] = calibrate(study, AUTO, seed, engine=replay, progress=_named(progress, label(AUTO)))
     truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
     demo = Demo(
         results=results,
@@ -131,71 +139,6 @@ def _write(demo: Demo, out: Path) -> None:
     for method, result in demo.results.items():
         result.save(out / method)
     write_text(out / "result.json", json.dumps(demo.content(), indent=2) + "\n")
-
-
-def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The paper's tables, our figures and the paper's side by side.
-
-    Args:
-        demo: The experiment.
-
-    Returns:
-        Title, header and rows of each table.
-    """
-    cost = [
-        [
-            figures.label(method),
-            str(result.rt_calls),
-            f"{result.seconds:.2f}",
-            *_paper(method, "rt_calls", "seconds"),
-        ]
-        for method, result in demo.results.items()
-    ]
-    first = next(iter(demo.results.values()))
-    names = [name.split(".")[0] for name in first.parameters]
-    before = [f"{value:.2f}" for value in first.initial_parameters.values()]
-    permittivity = [
-        [name, start, *(f"{list(result.parameters.values())[k]:.2f}" for result in demo.results.values()),
-         f"{demo.truth[name]:.2f}", *(f"{PAPER[method][name]:.2f}" for method in METHODS)]
-        for k, (name, start) in enumerate(zip(names, before, strict=True))
-    ]  # fmt: skip
-    error = [
-        [figures.label(method), f"{result.initial_rmse_db:.2f}", f"{result.rmse_db:.3f}",
-         f"{result.rmse_db - demo.optimum_db:.4f}", *_paper(method, "rmse_db")]
-        for method, result in demo.results.items()
-    ]  # fmt: skip
-    interval = demo.results[AUTO].intervals
-    trust = [
-        [
-            name,
-            f"{demo.results[AUTO].parameters[name]:.2f}",
-            f"{entry.lower:.2f} to {entry.upper:.2f}",
-            entry.verdict,
-        ]
-        for name, entry in interval.items()
-    ]
-    return [
-        ("Cost", ["method", ">RT calls", ">time [s]", ">paper: calls", ">paper: time [s]"], cost),
-        (
-            "Relative permittivity",
-            [
-                "material",
-                "before",
-                *map(figures.label, demo.results),
-                "planted mean",
-                "paper: GWO",
-                "paper: SGWO-IM",
-            ],
-            permittivity,
-        ),
-        ("RMSE [dB]", ["method", ">before", ">after", ">excess", ">paper: after"], error),
-        ("How far to trust auto's answer", ["parameter", ">value", ">95 % interval", "verdict"], trust),
-    ]
-
-
-def _paper(method: str, *keys: str) -> list[str]:
-    known: Mapping[str, float] = PAPER.get(method, {})
-    return [f"{known[key]:g}" if key in known else "-" for key in keys]
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:
