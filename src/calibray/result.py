@@ -18,6 +18,7 @@ from calibray.files import check_folder, write_text
 from calibray.inference.likelihood import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements, links_from_frame
+from calibray.report import glance, records
 from calibray.scenes import export_scene
 from calibray.study import Study
 from calibray.tracing.sionna import Progress
@@ -27,7 +28,7 @@ FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """A finished calibration.
 
@@ -81,6 +82,12 @@ class Result:
     links: pd.DataFrame
     history: pd.DataFrame
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return glance.text(*records.result(self))
+
+    def _repr_html_(self) -> str:
+        return glance.html(*records.result(self))
 
     def save(self, folder: str | Path) -> None:
         """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.

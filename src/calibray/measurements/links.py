@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.tables import Table
+from calibray.report import glance, records
+from calibray.report.glance import named
 
 COINCIDENCE: Final = 1e-3
 """The distance [m] below which transmitter and receiver stand at the same place."""
@@ -43,6 +45,8 @@ class Measurements:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
         >>> len(links), links.distance.tolist()
         (1, [50.0])
+        >>> links
+        <1 measured links from links>
     """
 
     tx: NDArray[np.float64]
@@ -80,8 +84,11 @@ class Measurements:
 
     def __repr__(self) -> str:
         kind = "measured" if self.measured else "unmeasured"
-        groups = "" if self.group is None else f" in groups {', '.join(self.group_names)}"
-        return f"<{len(self)} {kind} links{groups} from {self.source}>"
+        groups = "" if self.group is None else f" in groups {named(self.group_names)}"
+        return glance.text(f"<{len(self)} {kind} links{groups} from {self.source}>")
+
+    def _repr_html_(self) -> str:
+        return glance.html(*records.measurements(self))
 
     @property
     def frame(self) -> pd.DataFrame:

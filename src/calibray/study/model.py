@@ -18,6 +18,7 @@ from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
+from calibray.report import glance, records
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
     AntennasSection,
@@ -161,6 +162,14 @@ class Study(Section):
             raise explain(error, cls, content, str(path)) from None
         study._path = Path(path)
         return study
+
+    def __repr__(self) -> str:
+        return glance.text(*records.study(self))
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return glance.html(*records.study(self))
 
     @property
     def path(self) -> Path:
