@@ -23,13 +23,16 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from calibray.cli.commands import log
+from calibray.figures import write
+
+from calibray.cli.console import log
+from calibray.cli.progress import progress_bars
 from calibray.comparison.arena import Arena, landscape_arena, study_arena
 from calibray.comparison.comparison import compare
+from calibray.comparison.tables import table
 from calibray.files import write_table, write_text
-from calibray.report import comparison as report
-from calibray.report import terminal
-from calibray.report.figures import write
+from calibray.report import markdown
+from calibray.report.excess import figure
 from calibray.scenarios import demo_study_path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,16 +72,16 @@ def main() -> None:
                 f"{chosen.seeds} seeds, {chosen.budget} RT calls unless the method's name says otherwise."]  # fmt: skip
     for name in chosen.problems:
         title, arena = PROBLEMS[name]
-        with terminal.progress_bars(log) as progress:
+        with progress_bars(log) as progress:
             finished = compare(
                 arena, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
                 out=chosen.runs / name, workers=chosen.workers, progress=progress,
             )  # fmt: skip
         write_table(chosen.out / f"{name}.csv", finished.table())
-        write(report.figure(finished), chosen.out / f"{name}.png")
+        write(figure(finished), chosen.out / f"{name}.png")
         sections.append(
             f"## {title}\n\nOptimum {finished.optimum:.6g} dB, found by {finished.found_by}.\n\n"
-            f"{report.markdown(finished)}\n\n![Excess RMSE over RT calls]({name}.png)"
+            f"{markdown.render(table(finished))}\n\n![Excess RMSE over RT calls]({name}.png)"
         )
         print(sections[-1], flush=True)
     write_text(chosen.out / "tables.md", "\n\n".join(sections) + "\n")

@@ -12,7 +12,8 @@ import sys
 from pathlib import Path
 
 import calibray as cb
-from calibray.report.terminal import render_table
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render
 
 BLOCKS = {
     "nist_boulder": {  # along the street in sight from west to east, and along the other from near to far
@@ -27,13 +28,9 @@ BLOCKS = {
         "north-east": "rx_x_m >= 9.25 and rx_y_m >= 9.25",
     },
 }
-HEADER = (
-    "RMSE [dB] of the block held out",
-    ">links",
-    ">before",
-    ">offset only",
-    ">after",
-    ">log-distance model",
+COLUMNS = (
+    Column("RMSE [dB] of the block held out"),
+    *map(numbers, ("links", "before", "offset only", "after", "log-distance model")),
 )
 
 
@@ -60,7 +57,7 @@ def main(file: str) -> None:
             f"{key} {value:.3g}" for key, value in (result.parameters | result.offsets_db).items()
         )
         sys.stderr.write(f"{name}: {found}\n")
-    sys.stdout.write(render_table(HEADER, rows) + "\n")
+    sys.stdout.write(render(Table("", COLUMNS, tuple(rows))) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calibray.cli.commands import app
+from calibray.cli.app import app
 
 SCENE = """<scene version="2.1.0">
   <bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="brick"/></bsdf>
@@ -186,7 +186,7 @@ def test_bad_arguments(study, arguments):
 
 def test_the_installed_program_exits_with_2_and_no_traceback(study):
     study.write_text(STUDY.replace("version = 1", "version = 2"))
-    program = [sys.executable, "-c", "from calibray.cli.commands import main; main()"]
+    program = [sys.executable, "-c", "from calibray.cli import main; main()"]
     finished = subprocess.run(
         [*program, "run", str(study), "--out", str(study.parent / "out")],
         capture_output=True,

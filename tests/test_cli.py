@@ -10,16 +10,18 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from calibray.cli import doctor
-from calibray.cli.commands import Commands, app
+from calibray import diagnosis
+from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
+from calibray.report.diagnosis import table
+from calibray.tables.text import render
 
 HEAVY = ("numpy", "scipy", "pandas", "jax", "matplotlib", "pydantic", "h5py", "drjit", "mitsuba", "sionna")
 
 
 def calibray(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs the installed command."""
-    code = "import sys; sys.argv[0] = 'calibray'; from calibray.cli.commands import main; main()"
+    code = "import sys; sys.argv[0] = 'calibray'; from calibray.cli import main; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )
@@ -52,7 +54,7 @@ def test_the_version_is_that_of_the_package():
 
 
 def test_nothing_heavy_is_imported_before_a_command_runs():
-    code = f"import sys, calibray.cli; print([name for name in {HEAVY} if name in sys.modules])"
+    code = f"import sys, calibray.cli.app; print([name for name in {HEAVY} if name in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (run.stdout, run.stderr) == ("[]\n", "")
 
@@ -92,16 +94,16 @@ def test_the_real_app_reports_failures_the_same_way(monkeypatch):
     def refuse() -> None:
         raise InputError("no")
 
-    monkeypatch.setattr(doctor, "examine", refuse)
+    monkeypatch.setattr(diagnosis, "examine", refuse)
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stdout, result.stderr) == (2, "", "Error: no\n")
 
 
 @pytest.mark.parametrize(("passed", "status"), [(True, 0), (False, 1)])
 def test_doctor_prints_its_table_and_ends_with_its_verdict(monkeypatch, passed, status):
-    check = doctor.Check("JAX", passed, "cpu:0", "install JAX")
-    diagnosis = doctor.Diagnosis((("python", "3.11"),), "llvm_ad_mono_polarized", 0, (), (check,))
-    monkeypatch.setattr(doctor, "examine", lambda: diagnosis)
+    check = diagnosis.Check("JAX", passed, "cpu:0", "install JAX")
+    found = diagnosis.Diagnosis((("python", "3.11"),), "llvm_ad_mono_polarized", 0, (), (check,))
+    monkeypatch.setattr(diagnosis, "examine", lambda: found)
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stderr) == (status, "")
-    assert result.stdout == doctor.render(diagnosis) + "\n"
+    assert result.stdout == render(table(found)) + "\n"

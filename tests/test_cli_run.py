@@ -16,11 +16,12 @@ from typer.testing import CliRunner
 
 import planted
 import programs
-from calibray.cli.commands import app
+from calibray.cli.app import app
+from calibray.cli.progress import progress_bars
 from calibray.paths import Paths
-from calibray.report import terminal
-from calibray.report.terminal import render_result, render_table, rows_text, summary
 from calibray.result import FILES, Result
+from calibray.result import tables as report
+from calibray.tables.text import render
 from calibray.tracing.enclosed import Enclosed
 
 LOST_ROW = planted.INSIDE + 2  # the header is row 1
@@ -254,39 +255,28 @@ def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
     result = Result.load(folder / "out")
     row, none = np.arange(2, 14), np.zeros(12, dtype=bool)
     few, most = np.arange(12) < 2, np.arange(12) < 11
-    told = render_result(result, Enclosed.of(row, none, few))
+    told = render(*report.tables(replace(result, enclosed=Enclosed.of(row, none, few))))
     assert re.search(
         r"transmitter inside a building +0\nreceiver inside a building +2 +rows 2, 3: check", told
     )
-    indoors = render_result(result, Enclosed.of(row, most, most))
+    indoors = render(*report.tables(replace(result, enclosed=Enclosed.of(row, most, most))))
     assert re.search(r"receiver inside a building +11 +as most are: taken for an indoor scene\n", indoors)
-    assert summary(result, Enclosed.of(row, none, few))["rows_with_enclosed_rx"] == [2, 3]
+    assert replace(result, enclosed=Enclosed.of(row, none, few)).counts["rows_with_enclosed_rx"] == [2, 3]
 
 
 def test_tables_fit_what_there_is(folder, ran):
     result = Result.load(folder / "out")
     bare = replace(result, offsets_db={}, offset_only_rmse_db=None, holdout_rmse_db=None, intervals={})
-    text = render_result(bare, Enclosed((), (), False))
+    text = render(*report.tables(bare))
     assert "Offsets" not in text
     assert "offset only" not in text
     assert "not known" in text
 
 
-def test_a_table_aligns_its_columns_and_takes_text_as_it_is():
-    text = render_table(("Name", ">[dB]"), [("[red]walls[/red]", "1.0"), ("w", "-10.0")])
-    assert text.splitlines()[2:] == ["[red]walls[/red]     1.0", "w                  -10.0"]
-
-
-def test_rows_are_named_while_they_are_few():
-    assert rows_text([]) == ""
-    assert rows_text([7]) == "row 7"
-    assert rows_text(range(1, 15)).endswith("11, 12 and 2 more")
-
-
 @pytest.mark.parametrize("watched", [True, False])
 def test_progress_is_drawn_only_where_somebody_watches(watched):
     console = Console(file=io.StringIO(), force_terminal=watched, width=80)
-    with terminal.progress_bars(console) as progress:
+    with progress_bars(console) as progress:
         progress("tracing", 5, 12)
         progress("calibrating", 30, None)
         progress("calibrating", 60, 225)

@@ -11,15 +11,17 @@ from typer.testing import CliRunner
 
 import planted
 from calibray.calibration import calibrate
-from calibray.cli.commands import app
+from calibray.cli.app import app
 from calibray.comparison import comparison as module
 from calibray.comparison.arena import landscape_arena, study_arena
 from calibray.comparison.comparison import Entry, compare, settings
 from calibray.comparison.runs import Run, Runs
+from calibray.comparison.tables import table as shown
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
-from calibray.report.comparison import FILES, FLOOR_DB, HEADINGS, figure, markdown, rows
+from calibray.report.excess import FILES, FLOOR_DB, figure
 from calibray.study import Study
+from calibray.tables import markdown
 
 STREET = partial(landscape_arena, "street")
 BOUNDS = [1.5, 12.0]
@@ -117,7 +119,8 @@ def test_what_half_of_the_runs_never_reached_has_no_median():
     row = finished.table().iloc[0]
     assert row["reached_0.05_db"] == 2
     assert np.isnan(row["calls_to_0.05_db"])
-    assert rows(finished)[0][HEADINGS.index(">calls to 0.05 dB")] == "- (2/4)"
+    cells = shown(finished)
+    assert cells.rows[0][cells.headings.index("calls to 0.05 dB")] == "- (2/4)"
 
 
 def test_finished_runs_are_not_run_again(small, monkeypatch):
@@ -198,7 +201,7 @@ def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
     row = finished.table().iloc[0]
     assert (row["failed"], row["worst_excess_db_end"]) == (2, np.inf)
     assert figure(finished).axes
-    assert "none" in markdown(finished)
+    assert "none" in shown(finished).rows[0]
 
 
 def test_a_lower_minimum_known_beforehand_is_the_optimum(tmp_path, monkeypatch):
@@ -231,7 +234,7 @@ def test_the_figure_shows_medians_and_quartiles_within_each_budget(small):
 
 
 def test_markdown_has_a_row_for_each_method(small):
-    lines = markdown(small[0]).splitlines()
+    lines = markdown.render(shown(small[0])).splitlines()
     assert len(lines) == 2 + 4
     assert len({line.count("|") for line in lines}) == 1
 

@@ -11,8 +11,9 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.fields import path_loss
-from calibray.report import terminal
+from calibray.report import trace as report
 from calibray.scenes import read_scene
+from calibray.tables.text import render
 from calibray.tracing.convergence import Convergence, check, compare
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
@@ -94,7 +95,7 @@ def test_quantiles_are_changes_of_links():
 def test_the_text_names_rows_and_what_to_do():
     change = np.array([0.0, -3.25, 0.1, -np.inf])
     found = Convergence(500, change, np.array([2, 3, 4, 0]), np.array([2, 5, 3, 1]))
-    text = terminal.render_convergence(found, np.arange(2, 6), 0.5)
+    text = render(*report.convergence(found, np.arange(2, 6), 0.5))
     lines = [line.split() for line in text.splitlines()]
     assert lines[0][:6] == ["Change", "from", "500", "to", "1,000", "samples"]
     assert ["links", "that", "gained", "paths", "2", "rows", "3,", "5"] in lines
@@ -105,7 +106,7 @@ def test_the_text_names_rows_and_what_to_do():
         "raise trace.samples to 1000 or more and check again."
     )
     still = Convergence(500, np.full(4, 0.004), np.ones(4, dtype=int), np.ones(4, dtype=int))
-    text = terminal.render_convergence(still, np.arange(2, 6), 0.5)
+    text = render(*report.convergence(still, np.arange(2, 6), 0.5))
     assert "Row" not in text
     assert text.endswith("Converged: no link changed by more than 0.5 dB (fidelity.tolerance_db).")
 

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from scipy.optimize import minimize
+from typer.testing import CliRunner
 
 from calibray import engines
 from calibray.calibration.problem import Problem
-from calibray.comparison.experiment import FIGURES, METHODS, run_demo, tables
-from calibray.errors import InputError
+from calibray.cli.app import app
+from calibray.comparison.experiment import METHODS, run_demo
+from calibray.comparison.paper import tables
+from calibray.report.demo import FIGURES, write
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 
@@ -19,7 +22,9 @@ from calibray.study import Study
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    return run_demo(out), out
+    finished = run_demo()
+    write(finished, out)
+    return finished, out
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +83,12 @@ def test_files_exist_and_open(demo):
     assert content["methods"]["auto"]["excess_rmse_db"] == 0
     for method in finished.results:
         assert (out / method / "scene.xml").is_file()
-    assert all(len(row) == len(header) for _, header, rows in tables(finished) for row in rows)
+    assert [len(table.rows) for table in tables(finished)] == [3, 3, 3, 3]
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="output folder"):
-        run_demo(tmp_path / "file" / "demo")
+    monkeypatch.setattr("calibray.comparison.experiment.run_demo", lambda *_: pytest.fail("it was run"))
+    outcome = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "file" / "demo")])
+    assert outcome.exit_code == 2
+    assert "output folder" in outcome.stderr

@@ -8,8 +8,10 @@ from importlib import metadata
 
 import pytest
 
-from calibray.cli import doctor
-from calibray.cli.doctor import Check, Diagnosis
+from calibray import diagnosis
+from calibray.diagnosis import Check, Diagnosis
+from calibray.report.diagnosis import table
+from calibray.tables.text import render
 from calibray.tracing import llvm
 
 OLD = llvm.Llvm("/usr/lib/libLLVM-15.so.1", (15,), "LLVM 15 is too old")
@@ -27,12 +29,12 @@ def here():
     """The diagnosis of the machine that runs the tests."""
     patch = pytest.MonkeyPatch()
     patch.delitem(sys.modules, "drjit", raising=False)
-    yield doctor.examine()
+    yield diagnosis.examine()
     patch.undo()
 
 
 def test_this_machine_works(here):
-    assert here.usable, doctor.render(here)
+    assert here.usable, render(table(here))
     assert [check.name for check in here.checks[-3:]] == ["Dr.Jit", "Sionna RT", "JAX"]
     assert here.checks[-2].detail == "7 paths in a closed box"
 
@@ -49,8 +51,8 @@ def test_versions_are_those_installed(here):
 def test_an_absent_package_has_its_install_command(monkeypatch):
     requirements = ["numpy>=2.0", "cma<5,>=3; extra == 'cma'", "ruff>=0.9; extra == 'lint'"]
     monkeypatch.setattr(metadata, "requires", lambda name: requirements)
-    monkeypatch.setattr(doctor, "_version", {"calibray": "0.1.0"}.get)
-    versions = dict(doctor.versions())
+    monkeypatch.setattr(diagnosis, "_version", {"calibray": "0.1.0"}.get)
+    versions = dict(diagnosis.versions())
     assert versions["numpy"] == "not installed: pip install numpy"
     assert versions["cma"] == "not installed: pip install 'calibray[cma]'"
     assert "ruff" not in versions
@@ -73,19 +75,19 @@ def test_an_absent_package_has_its_install_command(monkeypatch):
     ],
 )
 def test_a_check_that_dies_is_a_failed_check(code, detail):
-    check = doctor.run_check("Dr.Jit", code, (), "another LLVM")
+    check = diagnosis.run_check("Dr.Jit", code, (), "another LLVM")
     assert not check.passed
     assert detail in check.detail
 
 
 def test_a_check_that_hangs_is_given_up(monkeypatch):
-    monkeypatch.setattr(doctor, "CHECK_TIMEOUT", 0.2)
-    assert not doctor.run_check("Dr.Jit", "import time; time.sleep(60)", (), "").passed
+    monkeypatch.setattr(diagnosis, "CHECK_TIMEOUT", 0.2)
+    assert not diagnosis.run_check("Dr.Jit", "import time; time.sleep(60)", (), "").passed
 
 
 def test_without_llvm_nothing_that_needs_it_is_tried(monkeypatch, tmp_path):
     monkeypatch.setenv(llvm.PATH_VARIABLE, str(tmp_path / "libLLVM.so.19.1"))
-    (check,) = doctor.check_tracing("llvm_ad_mono_polarized")
+    (check,) = diagnosis.check_tracing("llvm_ad_mono_polarized")
     assert not check.passed
     assert str(tmp_path) in check.remedy
 
@@ -93,23 +95,23 @@ def test_without_llvm_nothing_that_needs_it_is_tried(monkeypatch, tmp_path):
 def test_a_library_accepted_on_trust_is_marked(monkeypatch):
     untried = llvm.judge("/usr/lib/libLLVM.so.40.1", (40, 1, 0))
     monkeypatch.setattr(llvm, "select", lambda: untried)
-    monkeypatch.setattr(doctor, "run_check", lambda name, *_: Check(name, False, "", ""))
-    checks = doctor.check_tracing("llvm_ad_mono_polarized")
+    monkeypatch.setattr(diagnosis, "run_check", lambda name, *_: Check(name, False, "", ""))
+    checks = diagnosis.check_tracing("llvm_ad_mono_polarized")
     assert [check.name for check in checks] == ["LLVM", "Dr.Jit"]
     assert "versions known to work: [19, 22]" in checks[0].detail
 
 
 def test_the_table_tells_all_and_what_to_do():
-    table = doctor.render(SOUND)
-    assert "pip install 'calibray[parquet]'" in table
-    assert f"{OLD.path}, {OLD.problem}" in table
-    assert "To do" not in table
-    assert table.splitlines()[-1].startswith("Verdict")
-    assert table.endswith("Calibray works here")
+    shown = render(table(SOUND))
+    assert "pip install 'calibray[parquet]'" in shown
+    assert f"{OLD.path}, {OLD.problem}" in shown
+    assert "To do" not in shown
+    assert shown.splitlines()[-1].startswith("Verdict")
+    assert shown.endswith("Calibray works here")
 
 
 def test_one_failed_check_makes_the_machine_unusable():
     broken = replace(SOUND, checks=(SOUND.checks[0], Check("JAX", False, "no module", "install JAX")))
     assert not broken.usable
-    assert "To do" in doctor.render(broken)
-    assert doctor.render(broken).count("install JAX") == 1
+    assert "To do" in render(table(broken))
+    assert render(table(broken)).count("install JAX") == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.report import terminal
+from calibray.report import trace as report
 from calibray.tracing import memory
 from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
 from calibray.tracing.settings import TraceSettings
@@ -117,9 +117,9 @@ def test_memory_is_the_least_that_system_and_container_have_left(tmp_path, monke
 
 def test_long_traces_are_announced():
     short = plan(MASTS[:1], TraceSettings(samples=1000, max_depth=2), 20_000_000, 1_000_000)
-    assert terminal.render_plan(short, 1) == ""
+    assert report.announcement(short, 1) == ""
     long = plan(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
-    assert terminal.render_plan(long, 11) == (
+    assert report.announcement(long, 11) == (
         "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
         "about 0.9 GiB of memory, besides that of the scene and the paths found"
     )

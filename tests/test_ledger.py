@@ -18,7 +18,7 @@ import programs
 import restarts
 from calibray import engines
 from calibray.calibration import calibrate
-from calibray.cli.commands import app
+from calibray.cli.app import app
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint
 from calibray.engines.ledger import Entry, key

@@ -17,7 +17,7 @@ from calibray.errors import InputError
 from calibray.scenarios import campaign, demo_study_path, district, sounder, world
 from calibray.scenarios.meshes import Mesh, joined, ply_bytes
 from calibray.study import Study
-from calibray.tracing.sionna import trace
+from calibray.tracing.factory import trace
 
 PACKAGED = demo_study_path().parent
 BUILDINGS = district.district()

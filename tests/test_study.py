@@ -239,7 +239,7 @@ TRACE = "max_depth = 4"
         ('no_path = "censor"', "", "ceiling_db = 150 has no effect"),
         ("bounds = [-10, 10]", "bounds = [10, -10]", "offset.bounds = [10, -10]: the lower bound"),
         ("seed = 7", "seed = -7", "method.seed = -7: must be at least 0"),
-        ('"retrace"', '"trace"', "engine.name = 'trace': must be one of 'replay', "),
+        ('"retrace"', '"trace"', "engine.name = 'trace': must be one of 'command', "),
         # Physics
         ("ness = 0.3", "ness = 0", "materials.walls: thickness = 0.0: must be"),
         ('itu = "concrete", ', "", "materials.walls: revision = 'P.2040-1' without itu"),
@@ -339,12 +339,11 @@ def keys(model, prefix=""):
         names = {name: field.annotation for name, field in model.model_fields.items()}
     for name, annotation in names.items():
         options = get_args(annotation) or (annotation,)
-        table = next(
-            (o for o in options if is_dataclass(o) or (isinstance(o, type) and issubclass(o, BaseModel))),
-            None,
-        )
+        # Several where a table is of one kind or another.
+        tables = [o for o in options if is_table(o)]
         wild = {"materials": ".NAME", "parameters": '."NAME.FIELD"'}.get(name, "")
-        yield from keys(table, f"{prefix}{name}{wild}.") if table else [f"{prefix}{name}"]
+        inner = (key for table in tables for key in keys(table, f"{prefix}{name}{wild}."))
+        yield from dict.fromkeys(inner) if tables else [f"{prefix}{name}"]
 
 
 def test_the_reference_names_every_key_and_no_other():

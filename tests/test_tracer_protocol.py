@@ -23,7 +23,7 @@ from calibray.scenes import Scene, read_scene
 from calibray.tracing import cache, convergence
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.enclosed import Enclosed
-from calibray.tracing.factory import SIONNA, kept_trace
+from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import Tracer, TracerFactory
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
 from small_scenes import write_scene
@@ -42,6 +42,7 @@ LINKS = SimpleNamespace(
 )
 COHERENT = partial(path_loss, combining="coherent")
 SETTINGS = TraceSettings(max_depth=1, samples=10_000)
+FREE = {"ground.relative_permittivity": {"bounds": [1.5, 12.0]}}
 
 
 @pytest.fixture(scope="module")
@@ -176,9 +177,11 @@ def test_lossless_antennas_radiate_the_power_they_take(pattern: str, mean: float
 # Traces kept between runs
 
 
-def kept(factory: TracerFactory, scene: Scene, frame_rows: int = 4) -> cb.Paths:
-    links = links_from_frame(planted.links().head(frame_rows))
-    return kept_trace(factory, scene, FREQUENCY, SETTINGS, (Antenna(), Antenna()), links)
+def kept(factory: TracerFactory, scene: Scene) -> cb.Paths:
+    content = planted.content("links.csv", trace=SETTINGS.record(), parameters=FREE)
+    content["scene"] = {"file": str(scene.path), "frequency": FREQUENCY}
+    links = links_from_frame(planted.links().head(4))
+    return cb.Setup.open(cb.Study.from_content(content), factory, links).trace()
 
 
 def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one(
@@ -195,16 +198,11 @@ def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one
             opened.append(self.versions["two-ray"])
             return TwoRay(*arguments)
 
-    def nameless(*arguments: Any) -> Tracer:
-        return Counting("none")(*arguments)
-
     first, second = kept(Counting("1"), plane), kept(Counting("1"), plane)
     assert opened == ["1"]
     np.testing.assert_array_equal(path_loss(first), path_loss(second))
     kept(Counting("2"), plane)
-    kept(nameless, plane)
-    kept(nameless, plane)
-    assert opened == ["1", "2", "none", "none"]
+    assert opened == ["1", "2"]
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -217,7 +215,7 @@ def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest
     told: list[tuple] = []
     paths = cb.trace(study, progress=lambda *step: told.append(step))
     assert told[-1] == ("tracing", planted.LINKS, planted.LINKS)
-    scene = cb.engines.make_scene(study)
+    scene = study.opened().scene
     same = cb.trace(scene, study.measurements(), frequency=3.5e9, **study.trace.record())
     np.testing.assert_array_equal(path_loss(paths), path_loss(same))
     assert paths.materials == same.materials == scene.materials

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import typer
 
-from calibray.cli.commands import app
+from calibray.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from calibray.cli.commands import app
+from calibray.cli.app import app
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "command-line.md"
 HEAD = """# The command line

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
-from calibray.inference.likelihood import Interval, LogDistance, intervals
+from calibray.inference.likelihood import Interval, LogDistance, Objective, intervals
 from calibray.measurements import Measurements
 from calibray.result import Result
 from calibray.tracing.enclosed import Enclosed

@@ -22,11 +22,13 @@ import pandas as pd
 
 from calibray.comparison.arena import Arena
 from calibray.comparison.runs import Run, Runs
+from calibray.comparison.tables import summary
 from calibray.errors import InputError
 from calibray.files import check_folder
 from calibray.optimizers import METHODS, Optimizer
 from calibray.progress import Progress
 from calibray.spelling import did_you_mean
+from calibray.tables import glance
 
 LEAST_BUDGET: Final = 24  # below, the pack of SGWO-IM would have no three leaders
 WOLVES: Final = 30  # the paper's population
@@ -53,6 +55,11 @@ class Entry:
     name: str
     method: str
     budget: int
+
+    @property
+    def reference(self) -> bool:
+        """Whether it is least squares, which uses derivatives and stops by itself."""
+        return self.method == REFERENCE
 
     @staticmethod
     def parse(name: str, budget: int) -> Entry:
@@ -125,7 +132,7 @@ def settings(method: str, budget: int) -> dict[str, int]:
     return {} if method == REFERENCE else {"budget": budget}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """Finished runs of methods on one problem.
 
@@ -157,6 +164,19 @@ class Comparison:
         """
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
+    def quartiles(self, name: str, calls: int) -> tuple[float, float, float]:
+        """Quartiles of `excess`.
+
+        Args:
+            name: The entry.
+            calls: Number of RT calls.
+
+        Returns:
+            The lower quartile, the median and the upper one, [dB].
+        """
+        excess = self.excess(name, calls)
+        return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
+
     def calls_to(self, name: str, excess_db: float) -> np.ndarray:
         """RT calls after which an entry's runs were within some excess.
 
@@ -179,6 +199,12 @@ class Comparison:
         """
         return pd.DataFrame([self._row(entry) for entry in self.entries])
 
+    def __repr__(self) -> str:
+        return glance.text(*summary(self))
+
+    def _repr_html_(self) -> str:
+        return glance.html(*summary(self))
+
     def _row(self, entry: Entry) -> dict[str, Any]:
         runs = self.runs[entry.name]
         row: dict[str, Any] = {
@@ -192,7 +218,7 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             place = "end" if calls is None else str(calls)
-            known = calls is None or entry.method == REFERENCE or calls <= entry.budget
+            known = calls is None or entry.reference or calls <= entry.budget
             excess = self.excess(entry.name, 2**62 if calls is None else calls)
             for label, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
                 row[f"{label}_excess_db_{place}"] = quantile(excess, share) if known else np.nan

@@ -6,22 +6,20 @@ import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from calibray import engines
 from calibray.calibration import calibrate
-from calibray.files import check_folder, write_text
+from calibray.comparison.labels import label
+from calibray.comparison.paper import summary
 from calibray.progress import Progress, staged
-from calibray.report import figures
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
+from calibray.tables import glance
 
 METHODS: Final = ("gwo", "sgwo-im")
 AUTO: Final = "auto"
-
-FIGURES: Final = ("cumulative-cost.png", "convergence.png", "path-loss.png")
 
 PAPER: Final = {
     "gwo": {
@@ -44,7 +42,7 @@ PAPER: Final = {
 """What the paper reports for its own site (its tables III and IV, and section IV-B)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Demo:
     """The finished experiment.
 
@@ -62,6 +60,17 @@ class Demo:
     engine: str
     trace_seconds: float
 
+    @property
+    def paper(self) -> Mapping[str, Mapping[str, float]]:
+        """What the paper reports for its own site, by method."""
+        return PAPER
+
+    def __repr__(self) -> str:
+        return glance.text(*summary(self))
+
+    def _repr_html_(self) -> str:
+        return glance.html(*summary(self))
+
     def content(self) -> dict[str, Any]:
         """The experiment as plain values, the paper's figures beside."""
         return {
@@ -77,11 +86,10 @@ class Demo:
         }
 
 
-def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment and write its figures and `result.json`.
+def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
+    """Run the experiment.
 
     Args:
-        out: Folder to write into; checked first.
         engine: "replay" (trace once), or "retrace" to pay for every RT call as the paper does.
         seed: Seed of the methods.
         progress: Called as the work goes on, with the method's name in front.
@@ -90,9 +98,8 @@ def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progres
         The experiment.
 
     Raises:
-        InputError: The folder cannot be written, or the engine is unknown.
+        InputError: The engine is unknown.
     """
-    check_folder(out)
     study = Study.load(demo_study_path())
     started = time.perf_counter()
     setup = Setup.open(study)
@@ -100,101 +107,15 @@ def run_demo(out: Path, engine: str = "replay", seed: int = 0, progress: Progres
     trace_seconds = time.perf_counter() - started
     chosen = replay if engine == "replay" else engines.make(setup, engine)
     results = {
-        method: calibrate(
-            setup, method, seed, engine=chosen, progress=staged(progress, figures.label(method))
-        )
+        method: calibrate(setup, method, seed, engine=chosen, progress=staged(progress, label(method)))
         for method in METHODS
     }
-    results[AUTO] = calibrate(
-        setup, AUTO, seed, engine=replay, progress=staged(progress, figures.label(AUTO))
-    )
+    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=staged(progress, label(AUTO)))
     truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
-    demo = Demo(
+    return Demo(
         results=results,
         optimum_db=results[AUTO].rmse_db,
         truth={name: entry["relative_permittivity_mean"] for name, entry in truth.items()},
         engine=engine,
         trace_seconds=trace_seconds,
     )
-    _write(demo, out)
-    return demo
-
-
-def _write(demo: Demo, out: Path) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    black_box = {method: demo.results[method] for method in METHODS}
-    drawn = (
-        figures.cumulative_cost(black_box),
-        figures.convergence(black_box, demo.optimum_db),
-        figures.path_loss_by_receiver(demo.results),
-    )
-    for name, figure in zip(FIGURES, drawn, strict=True):
-        figures.write(figure, out / name)
-    for method, result in demo.results.items():
-        result.save(out / method)
-    write_text(out / "result.json", json.dumps(demo.content(), indent=2) + "\n")
-
-
-def tables(demo: Demo) -> list[tuple[str, list[str], list[list[str]]]]:
-    """The paper's tables, our figures and the paper's side by side.
-
-    Args:
-        demo: The experiment.
-
-    Returns:
-        Title, header and rows of each table.
-    """
-    cost = [
-        [
-            figures.label(method),
-            str(result.rt_calls),
-            f"{result.seconds:.2f}",
-            *_paper(method, "rt_calls", "seconds"),
-        ]
-        for method, result in demo.results.items()
-    ]
-    first = next(iter(demo.results.values()))
-    names = [name.split(".")[0] for name in first.parameters]
-    before = [f"{value:.2f}" for value in first.initial_parameters.values()]
-    permittivity = [
-        [name, start, *(f"{list(result.parameters.values())[k]:.2f}" for result in demo.results.values()),
-         f"{demo.truth[name]:.2f}", *(f"{PAPER[method][name]:.2f}" for method in METHODS)]
-        for k, (name, start) in enumerate(zip(names, before, strict=True))
-    ]  # fmt: skip
-    error = [
-        [figures.label(method), f"{result.initial_rmse_db:.2f}", f"{result.rmse_db:.3f}",
-         f"{result.rmse_db - demo.optimum_db:.4f}", *_paper(method, "rmse_db")]
-        for method, result in demo.results.items()
-    ]  # fmt: skip
-    interval = demo.results[AUTO].intervals
-    trust = [
-        [
-            name,
-            f"{demo.results[AUTO].parameters[name]:.2f}",
-            f"{entry.lower:.2f} to {entry.upper:.2f}",
-            entry.verdict,
-        ]
-        for name, entry in interval.items()
-    ]
-    return [
-        ("Cost", ["method", ">RT calls", ">time [s]", ">paper: calls", ">paper: time [s]"], cost),
-        (
-            "Relative permittivity",
-            [
-                "material",
-                "before",
-                *map(figures.label, demo.results),
-                "planted mean",
-                "paper: GWO",
-                "paper: SGWO-IM",
-            ],
-            permittivity,
-        ),
-        ("RMSE [dB]", ["method", ">before", ">after", ">excess", ">paper: after"], error),
-        ("How far to trust auto's answer", ["parameter", ">value", ">95 % interval", "verdict"], trust),
-    ]
-
-
-def _paper(method: str, *keys: str) -> list[str]:
-    known: Mapping[str, float] = PAPER.get(method, {})
-    return [f"{known[key]:g}" if key in known else "-" for key in keys]

@@ -10,7 +10,10 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.summary import summary
 from calibray.measurements.tables import Table
+from calibray.tables import glance
+from calibray.tables.glance import named
 
 COINCIDENCE: Final = 1e-3
 """The distance [m] below which transmitter and receiver stand at the same place."""
@@ -43,6 +46,8 @@ class Measurements:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
         >>> len(links), links.distance.tolist()
         (1, [50.0])
+        >>> links
+        <1 measured links from links>
     """
 
     tx: NDArray[np.float64]
@@ -80,8 +85,11 @@ class Measurements:
 
     def __repr__(self) -> str:
         kind = "measured" if self.measured else "unmeasured"
-        groups = "" if self.group is None else f" in groups {', '.join(self.group_names)}"
-        return f"<{len(self)} {kind} links{groups} from {self.source}>"
+        groups = "" if self.group is None else f" in groups {named(self.group_names)}"
+        return glance.text(f"<{len(self)} {kind} links{groups} from {self.source}>")
+
+    def _repr_html_(self) -> str:
+        return glance.html(*summary(self))
 
     @property
     def frame(self) -> pd.DataFrame:

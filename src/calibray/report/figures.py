@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,17 +12,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calibray.result import Result
+from calibray.comparison.labels import label
+
+if TYPE_CHECKING:
+    from calibray.result import Result
 
 COLORS = {"gwo": "#4c9f70", "sgwo-im": "#2f6db5", "auto": "#c8553d"}
 MEASURED, BEFORE = "#222222", "#9a9a9a"
-
-
-def label(method: str) -> str:
-    """A method's name for a legend; one with a budget of its own is "name@calls"."""
-    name, _, calls = method.partition("@")
-    known = {"gwo": "GWO", "sgwo-im": "SGWO-IM", "auto": "auto (least squares)"}.get(name, name)
-    return f"{known}, {calls} calls" if calls else known
 
 
 def cumulative_cost(results: Mapping[str, Result]) -> Figure:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from calibray.closed import CLOSED
@@ -42,7 +42,7 @@ def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _check(place: str, field: FieldInfo, value: Any) -> None:
-    checker = TypeAdapter(Annotated[field.annotation, *field.metadata], config=CLOSED)
+    checker = TypeAdapter(Annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:
         checker.validate_json(json.dumps(value, default=str))
     except ValidationError as error:

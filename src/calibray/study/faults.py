@@ -58,7 +58,7 @@ def explain(
     lines: dict[str, str] = {}
     for fault in error.errors():
         location = fault["loc"]
-        if location[0] in tagged:
+        if location[:1] and location[0] in tagged:
             # The kind stands behind the table's name, which is no key.
             location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
         path = _path(location, content)

@@ -37,6 +37,8 @@ from calibray.study.sections import (
     SceneSection,
     TraceSection,
 )
+from calibray.study.summary import summary
+from calibray.tables import glance
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:
@@ -169,6 +171,14 @@ class Study(Section):
             raise explain(error, cls, content, str(path), tagged=("engine",)) from None
         study._path, study._other_engines = Path(path), others
         return study
+
+    def __repr__(self) -> str:
+        return glance.text(*summary(self))
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return glance.html(*summary(self))
 
     @property
     def path(self) -> Path:

@@ -17,8 +17,10 @@ from calibray.inference.likelihood import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.progress import Progress
+from calibray.result.tables import summary
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.study import Study
+from calibray.tables import glance
 from calibray.tracing.enclosed import Enclosed
 
 VERSION: Final = 1
@@ -26,7 +28,7 @@ FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """A finished calibration.
 
@@ -103,6 +105,12 @@ class Result:
             "rows_with_enclosed_tx": None if self.enclosed is None else list(self.enclosed.tx),
             "rows_with_enclosed_rx": None if self.enclosed is None else list(self.enclosed.rx),
         }
+
+    def __repr__(self) -> str:
+        return glance.text(*summary(self))
+
+    def _repr_html_(self) -> str:
+        return glance.html(*summary(self))
 
     def save(self, folder: str | Path) -> None:
         """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.

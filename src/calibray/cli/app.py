@@ -1,0 +1,78 @@
+"""The command line as a whole: its commands, and how their failures end.
+
+Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while
+running, 2 for bad input. Commands import what they need when they run, so that `--version` answers at once.
+"""
+
+from __future__ import annotations
+
+from importlib import metadata
+from typing import Annotated
+
+import typer
+from typer.core import TyperGroup
+
+from calibray.cli.compare import compare
+from calibray.cli.demo import demo
+from calibray.cli.doctor import doctor
+from calibray.cli.ledger import ledger
+from calibray.cli.predict import predict
+from calibray.cli.run import run
+from calibray.cli.trace import trace
+from calibray.errors import EngineError, InputError
+
+
+class Commands(TyperGroup):
+    """A group of commands whose expected failures are one message and an exit status, not a traceback."""
+
+    def invoke(self, ctx: typer.Context) -> object:
+        """Run the command.
+
+        Args:
+            ctx: What was parsed from the command line.
+
+        Returns:
+            What the command returns.
+
+        Raises:
+            typer.Exit: With 2 on bad input, with 1 when an engine failed.
+        """
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            typer.echo(f"Error: {error}", err=True)
+            raise typer.Exit(2) from error
+        except EngineError as error:
+            typer.echo(f"Error: {error}", err=True)
+            raise typer.Exit(1) from error
+
+
+app = typer.Typer(
+    cls=Commands,
+    name="calibray",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+"""All commands; one more is a module with a function, named below."""
+
+
+def _print_version(wanted: bool) -> None:
+    """Print the version and end, if it was asked for."""
+    if wanted:
+        typer.echo(f"calibray {metadata.version('calibray')}")
+        raise typer.Exit
+
+
+@app.callback()
+def calibray(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Calibrate the radio materials of a ray-traced scene from measurements."""
+
+
+for command in (doctor, demo, run, compare, trace, predict, ledger):
+    app.command()(command)

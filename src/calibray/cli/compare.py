@@ -1,0 +1,57 @@
+"""`calibray compare`: methods side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import StudyFile, log
+from calibray.cli.progress import progress_bars
+
+
+def compare(
+    study_file: StudyFile,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder for tables and figure; finished runs are kept there."
+        ),
+    ],
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Methods with commas between; METHOD@CALLS has a budget of its own."
+        ),
+    ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares",
+    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, from seeds 0 to N - 1.")] = 25,
+    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls of a run.")] = 225,
+    workers: Annotated[int, typer.Option(metavar="N", help="Processes that run at once.")] = 1,
+) -> None:
+    """Run methods from many seeds on a study's stored paths, at equal budgets of RT calls."""
+    import os
+    from functools import partial
+
+    # The matrices are small: threads cost more than they give, and the runs are what is spread over cores.
+    # The variables are read when NumPy is loaded, here and in the workers.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+    from calibray.comparison.arena import study_arena
+    from calibray.comparison.comparison import compare as run_all
+    from calibray.comparison.tables import optimum, table
+    from calibray.report.excess import FILES, write
+    from calibray.tables.text import render
+
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    with progress_bars(log) as progress:
+        finished = run_all(
+            partial(study_arena, study_file),
+            names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
+        )  # fmt: skip
+    write(finished, out)
+    typer.echo(render(table(finished), optimum(finished)))
+    for name, seed, failure in finished.failures():
+        typer.echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
+    typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)

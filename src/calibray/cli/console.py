@@ -1,0 +1,16 @@
+"""Where commands write, and the arguments that several of them take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+log = Console(stderr=True, highlight=False)
+"""Where progress and messages go; data goes to stdout through `typer.echo`."""
+
+StudyFile = Annotated[
+    Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
+]

@@ -1,0 +1,39 @@
+"""`calibray demo`: the paper's experiment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import log
+from calibray.cli.progress import progress_bars
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write figures and result into.")
+    ] = Path("out/demo"),
+    engine: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="replay (trace once), or retrace: run the ray tracer for every candidate, as the paper does.",
+        ),
+    ] = "replay",
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
+) -> None:
+    """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
+    from calibray.comparison.experiment import run_demo
+    from calibray.comparison.paper import tables
+    from calibray.files import check_folder
+    from calibray.report.demo import FIGURES, write
+    from calibray.tables.text import render
+
+    check_folder(out)
+    with progress_bars(log) as progress:
+        finished = run_demo(engine, seed, progress)
+    write(finished, out)
+    typer.echo(render(*tables(finished)) + "\n")
+    typer.echo(f"Written to {out}: result.json, {', '.join(FIGURES)}, and a folder for each method", err=True)

@@ -1,0 +1,75 @@
+"""`calibray predict`: path loss at links that were never measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from calibray.cli.console import log
+from calibray.cli.progress import progress_bars
+from calibray.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PREDICTED: Final = "path_loss_db"
+"""The column that `predict` adds."""
+
+
+def predict(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+    ],
+    links_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LINKS",
+            help="CSV or Parquet file with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], and the study's "
+            "group column if its offset has one; its frequency column, if it has one, gives the carriers.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="CSV or Parquet file to write instead of CSV on stdout."
+        ),
+    ] = None,
+) -> None:
+    """Predict path loss at links that were never measured, with the calibrated scene."""
+    import numpy as np
+
+    from calibray.files import check_table, write_table
+    from calibray.measurements import read_links
+    from calibray.result import Result
+    from calibray.tables.text import rows_text
+
+    result = Result.load(folder)
+    study = result.study
+    links = read_links(
+        links_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
+    )
+    _refuse_column(links_file, links.frame)
+    if out is not None:
+        check_table(out)
+    with progress_bars(log) as progress:
+        path_loss_db = result.predict(links, progress)
+    table = links.frame.assign(**{PREDICTED: path_loss_db})
+    if out is None:
+        typer.echo(table.to_csv(index=False), nl=False)
+    else:
+        write_table(out, table)
+    lost = links.row[np.isinf(path_loss_db)].tolist()
+    if lost:
+        typer.echo(
+            f"Warning: no path leads to {len(lost)} of {len(links)} links, {rows_text(lost)}",
+            err=True,
+        )
+
+
+def _refuse_column(file: Path, frame: pd.DataFrame) -> None:
+    """Refuse a table that has the column of predictions already."""
+    if PREDICTED in frame:
+        raise InputError(f"{file}: has a column {PREDICTED!r} already; rename or remove it")

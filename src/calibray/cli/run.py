@@ -1,0 +1,52 @@
+"""`calibray run`: calibrate a study."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import StudyFile, log
+from calibray.cli.progress import progress_bars
+
+
+def run(
+    study_file: StudyFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write the result into.")],
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Method in place of the study's: auto, sgwo-im, gwo, ..."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed in place of the study's.")] = None,
+    engine: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Engine in place of the study's: replay, retrace or command."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", help="Programs of the engine 'command' that run at once here.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the engine 'command'."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
+    ] = False,
+) -> None:
+    """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
+    from calibray.calibration import calibrate
+    from calibray.engines import open_executor
+    from calibray.result import FILES, tables
+    from calibray.study import Study
+    from calibray.tables.text import render
+
+    study = Study.load(study_file).replace(engine=engine)
+    with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
+        result = calibrate(study, method, seed, out, executor=executor, progress=progress)
+    if as_json:
+        typer.echo(json.dumps(result.content(), indent=2))
+    else:
+        typer.echo(render(tables.heading(result), *tables.tables(result)))
+    typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)

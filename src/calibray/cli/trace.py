@@ -1,0 +1,62 @@
+"""`calibray trace`: find paths and store them, or check that enough rays were sent out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import StudyFile, log
+from calibray.cli.progress import progress_bars
+from calibray.errors import InputError
+
+
+def trace(
+    study_file: StudyFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file to write the paths into.")
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Trace again with twice the samples and another seed, and tell what changes."
+        ),
+    ] = False,
+) -> None:
+    """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
+    from functools import partial
+
+    from calibray.fields import path_loss
+    from calibray.files import check_file
+    from calibray.progress import staged
+    from calibray.report import trace as report
+    from calibray.study import Study
+    from calibray.tables.text import render
+    from calibray.tracing import convergence
+
+    study = Study.load(study_file)
+    _refuse_idleness(out, check)
+    if out is not None:
+        check_file(out)
+    setup = study.opened()
+    links, tracer = setup.links, setup.tracer
+    if told := report.announcement(tracer.plan(links), len(links)):
+        typer.echo(told, err=True)
+    with progress_bars(log) as progress:
+        paths = tracer.trace(links, progress)
+        if out is not None:
+            paths.save(out)
+        loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
+        found = convergence.check(tracer, links, paths, loss, staged(progress, "checking")) if check else None
+    typer.echo(render(report.found(paths, links.row, setup.enclosed)))
+    if found is not None:
+        typer.echo("\n" + render(*report.convergence(found, links.row, study.fidelity.tolerance_db)))
+    if out is not None:
+        typer.echo(f"Written to {out}", err=True)
+
+
+def _refuse_idleness(out: Path | None, check: bool) -> None:
+    """Refuse to trace for nothing."""
+    if out is None and not check:
+        raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")

@@ -1,0 +1,196 @@
+"""What this machine has, whether tracing and replay work on it, and what to do if not.
+
+Nothing is concluded from versions alone: Dr.Jit, Sionna RT and JAX each do a small piece of real work, in
+processes of their own, because a libLLVM that Dr.Jit cannot use ends the process that tried.
+"""
+
+from __future__ import annotations
+
+import platform
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+
+from calibray.errors import InputError
+from calibray.tracing import llvm
+from calibray.tracing.llvm import Llvm
+
+CHECK_TIMEOUT = 300.0
+"""Longest time [s] that one check may take; the first import on a slow disk is what takes long."""
+
+# Name and, if any, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
+_REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
+
+# Extras for work on Calibray itself, which no user misses.
+_DEVELOPER_EXTRAS = frozenset({"test", "lint"})
+
+# Sum of min(0, 2) .. min(3, 2). The minimum is what an unusable LLVM cannot compile; a sum alone it can.
+_KERNEL = """
+import importlib, sys
+import drjit
+Float = importlib.import_module("drjit." + sys.argv[1].split("_")[0]).Float
+total = drjit.sum(drjit.minimum(drjit.arange(Float, 4), 2.0))[0]
+if total != 5.0:
+    sys.exit(f"the sum is {total}, not 5")
+"""
+
+# In a closed box there are the direct path and one reflection off each of the six faces.
+_TRACE = """
+import sys
+import mitsuba
+mitsuba.set_variant(sys.argv[1])
+import sionna.rt as rt
+scene = rt.load_scene(rt.scene.box)
+scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+scene.add(rt.Transmitter("tx", [0.0, 0.0, 2.0]))
+scene.add(rt.Receiver("rx", [2.0, 1.0, 2.0]))
+count = int(rt.PathSolver()(scene, max_depth=1, samples_per_src=10_000).valid.numpy().sum())
+if count != 7:
+    sys.exit(f"{count} paths in a closed box, not 7")
+print("7 paths in a closed box")
+"""
+
+_JAX = """
+import jax
+jax.numpy.arange(4.0).sum().block_until_ready()
+print(", ".join(f"{device.platform}:{device.id}" for device in jax.devices()))
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that Calibray needs, and whether it is there and works.
+
+    Attributes:
+        name: What was checked.
+        passed: Whether it can be relied on.
+        detail: What was found, or how it failed.
+        remedy: What to do if it failed.
+    """
+
+    name: str
+    passed: bool
+    detail: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that `calibray doctor` tells.
+
+    Attributes:
+        versions: Calibray, Python and each package with its version, or with the command to install it.
+        variant: The Mitsuba variant that traces.
+        cuda_devices: Number of GPUs that Mitsuba can trace on.
+        libraries: Every libLLVM found.
+        checks: What was checked, in the order in which one depends on the other.
+    """
+
+    versions: tuple[tuple[str, str], ...]
+    variant: str
+    cuda_devices: int
+    libraries: tuple[Llvm, ...]
+    checks: tuple[Check, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether Calibray works on this machine."""
+        return all(check.passed for check in self.checks)
+
+
+def examine() -> Diagnosis:
+    """Look at this machine and tries it, which takes some seconds.
+
+    Returns:
+        What was found; a machine that cannot be used gives a diagnosis too, not an exception.
+    """
+    variant = llvm.mitsuba_variant()
+    return Diagnosis(
+        versions=versions(),
+        variant=variant,
+        cuda_devices=llvm.cuda_device_count(),
+        libraries=llvm.candidates(),
+        checks=(*check_tracing(variant), run_check("JAX", _JAX, (), "pip install --force-reinstall jax")),
+    )
+
+
+def check_tracing(variant: str) -> tuple[Check, ...]:
+    """Check what tracing stands on: libLLVM where it is needed, then Dr.Jit, then Sionna RT.
+
+    Args:
+        variant: The Mitsuba variant to trace with.
+
+    Returns:
+        The checks up to the first that failed, as those after it could only fail too.
+    """
+    remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
+    checks = []
+    if variant.startswith("llvm"):
+        remedy = f"{llvm.remedy()}, or name another libLLVM in {llvm.PATH_VARIABLE}"
+        try:
+            library = llvm.select()
+        except InputError as error:
+            return (Check("LLVM", False, "none in use", str(error)),)
+        trust = "" if library.tried else f" (versions known to work: {sorted(llvm.TRIED_MAJORS)})"
+        checks.append(Check("LLVM", True, f"{library.label} at {library.path}{trust}", remedy))
+    checks.append(run_check("Dr.Jit", _KERNEL, (variant,), remedy))
+    if checks[-1].passed:
+        checks.append(run_check("Sionna RT", _TRACE, (variant,), "pip install --force-reinstall sionna-rt"))
+    return tuple(checks)
+
+
+def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
+    """Run Python code in a process of its own.
+
+    Args:
+        name: What is checked.
+        code: The code; it prints what it found, and fails with an exception, an exit status or a signal.
+        arguments: Its `sys.argv[1:]`.
+        remedy: What to do if it fails.
+
+    Returns:
+        Whether the process ended well, and the telling line of what it printed.
+    """
+    command = [sys.executable, "-c", code, *arguments]
+    try:
+        run = subprocess.run(command, capture_output=True, text=True, timeout=CHECK_TIMEOUT, check=False)
+    except subprocess.TimeoutExpired:
+        return Check(name, False, f"no answer within {CHECK_TIMEOUT:g} s", remedy)
+    if run.returncode == 0:
+        return Check(name, True, run.stdout.strip() or "works", remedy)
+    lines = run.stderr.strip().splitlines() or [f"ended with {run.returncode}, without a word"]
+    if run.returncode < 0:
+        # LLVM names its reason first and dumps its stack after it.
+        return Check(name, False, f"ended by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
+    # Of chained exceptions the first is the cause; an exit message stands alone.
+    reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
+    return Check(name, False, "; ".join(reasons), remedy)
+
+
+def versions() -> tuple[tuple[str, str], ...]:
+    """The versions of Calibray, of Python and of each package that Calibray's own metadata names.
+
+    Returns:
+        Pairs of name and version; an absent package has the command that installs it instead.
+    """
+    packages = {"calibray": "pip install calibray"}
+    requirements = metadata.requires("calibray") if _version("calibray") else None
+    for requirement in requirements or []:
+        name, extra = _REQUIREMENT.findall(requirement)[0]
+        if extra not in _DEVELOPER_EXTRAS:
+            packages.setdefault(name, f"pip install 'calibray[{extra}]'" if extra else f"pip install {name}")
+        if name == "sionna-rt":
+            packages |= {needed: "pip install --force-reinstall sionna-rt" for needed in ("mitsuba", "drjit")}
+    installed = {name: _version(name) or f"not installed: {command}" for name, command in packages.items()}
+    return ("python", platform.python_version()), *installed.items()
+
+
+def _version(package: str) -> str | None:
+    """The version of an installed package; None if it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,68 @@
+"""What a comparison of methods writes: its tables, and a figure of the excess over RT calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibray.comparison.labels import label
+from calibray.files import write_table
+from calibray.report.figures import COLORS, plain_figure
+from calibray.report.figures import write as write_figure
+
+if TYPE_CHECKING:
+    from calibray.comparison.comparison import Comparison
+
+FILES: Final = ("compare.csv", "runs.csv", "compare.png")
+FLOOR_DB: Final = 1e-4  # drawn in place of less
+PALETTE: Final = (
+    "#8e6bb0",
+    "#d99a2b",
+    "#3aa6a6",
+    "#8c5a3c",
+    "#d46a9f",
+    "#6f7f2e",
+    "#5c6bc0",
+    "#777777",
+)
+
+
+def write(comparison: Comparison, folder: Path) -> None:
+    """Write a comparison's tables and figure.
+
+    Args:
+        comparison: The comparison.
+        folder: Folder to write into, which exists.
+    """
+    write_table(folder / FILES[0], comparison.table())
+    write_table(folder / FILES[1], comparison.history())
+    write_figure(figure(comparison), folder / FILES[2])
+
+
+def figure(comparison: Comparison) -> Figure:
+    """Excess over RT calls: the median of each method and the band between its quartiles.
+
+    Args:
+        comparison: The comparison.
+
+    Returns:
+        The figure.
+    """
+    drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
+    last = max(entry.budget for entry in comparison.entries)
+    colors = iter(PALETTE * (1 + len(comparison.entries) // len(PALETTE)))
+    calls = np.arange(1, last + 1)
+    for entry in comparison.entries:
+        shown = calls if entry.reference else calls[: entry.budget]
+        quartiles = [comparison.quartiles(entry.name, call) for call in shown]
+        low, middle, high = np.maximum(quartiles, FLOOR_DB).T
+        color = COLORS.get(entry.method) or next(colors)
+        dashed = "--" if entry.reference or entry.name != entry.method else "-"
+        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(entry.name))
+        axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
+    axes.set(yscale="log", xlim=(0, last))
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return drawing

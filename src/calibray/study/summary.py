@@ -1,0 +1,43 @@
+"""What a study says of itself, in a few lines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from calibray.tables import Column, Table, numbers
+from calibray.tables.glance import hertz
+
+if TYPE_CHECKING:
+    from calibray.study.model import Study
+
+
+def summary(plan: Study) -> tuple[Table, ...]:
+    """What a study calibrates, on what, and how.
+
+    Args:
+        plan: The study.
+
+    Returns:
+        Its sections in a table, and its parameters in another.
+    """
+    rows = [
+        ("scene", plan.scene.file),
+        ("frequency", hertz(plan.scene.frequency)),
+        ("links", f"{plan.links.file}: {plan.links.value}, {plan.links.quantity}"),
+        ("combining", plan.objective.combining),
+    ]
+    if plan.offset is not None:
+        rows.append(("offset", f"per {plan.offset.per}" if plan.offset.per else "one for all links"))
+    if plan.holdout is not None:
+        rows.append(("held out", plan.holdout.where))
+    rows.append(("method", f"{plan.method.name}, seed {plan.method.seed}"))
+    rows.append(("engine", plan.engine.name))
+    bounds = tuple(
+        (name, f"{entry.bounds[0]:g}", f"{entry.bounds[1]:g}", entry.scale)
+        for name, entry in plan.parameters.items()
+    )
+    columns = (Column(), numbers("lower"), numbers("upper"), Column("scale"))
+    return (
+        Table(f"Study {plan.path.name}", (Column(), Column()), tuple(rows)),
+        Table("Parameters", columns, bounds),
+    )

@@ -1,0 +1,27 @@
+"""Tables in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from calibray.tables.table import Table
+
+_RULES = {"left": "---", "right": "---:"}
+
+
+def render(table: Table) -> str:
+    """A table in Markdown; a title that would stand above is left to the page.
+
+    Args:
+        table: The table.
+
+    Returns:
+        Its lines, without a line break at the end.
+    """
+    lines = [table.headings, [_RULES[column.align] for column in table.columns], *table.rows]
+    return "\n".join(_line(line) for line in lines)
+
+
+def _line(cells: Iterable[str]) -> str:
+    escaped = (cell.replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"

@@ -1,0 +1,107 @@
+"""Tables as data: what is said, apart from how it is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        name: What its cells are; empty where rows name themselves.
+        unit: Unit of all its cells; empty if they have none, or each its own.
+        align: Where cells stand: words "left", numbers "right".
+
+    Example:
+        >>> Column("time", "s").heading
+        'time [s]'
+    """
+
+    name: str = ""
+    unit: str = ""
+    align: Literal["left", "right"] = "left"
+
+    @property
+    def heading(self) -> str:
+        """Its name with its unit in brackets."""
+        return " ".join(part for part in (self.name, self.unit and f"[{self.unit}]") if part)
+
+
+def numbers(name: str = "", unit: str = "") -> Column:
+    """A column of numbers, aligned to the right.
+
+    Args:
+        name: What they are.
+        unit: Their unit.
+
+    Returns:
+        The column.
+    """
+    return Column(name, unit, "right")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose cells are text already.
+
+    Attributes:
+        title: What it shows; empty where its columns say that.
+        columns: Its columns.
+        rows: The cells of every row, one for each column.
+
+    Raises:
+        ValueError: A row has more or fewer cells than there are columns.
+
+    Example:
+        >>> table = Table("Cost", (Column(), numbers("time", "s")), (("tracing", "0.3"),))
+        >>> table.titled, table.headed
+        (False, True)
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"table {self.title!r}: a row of {len(row)} cells, must be {len(self.columns)}: {row}"
+                )
+
+    @property
+    def titled(self) -> bool:
+        """Whether the title stands above; else it stands over the first column, where that has no heading."""
+        return bool(self.title) and bool(self.columns[0].heading)
+
+    @property
+    def headed(self) -> bool:
+        """Whether anything stands over the columns."""
+        return bool(self.title) or any(column.heading for column in self.columns)
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """What stands over each column."""
+        first = self.columns[0].heading or self.title
+        return (first, *(column.heading for column in self.columns[1:]))
+
+    def head(self, count: int) -> Table:
+        """The first rows, and a last one that tells how many are left out.
+
+        Args:
+            count: Rows to keep, at least 1.
+
+        Returns:
+            The table, unchanged if it has no more rows.
+
+        Example:
+            >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows
+            (('a',), ('... and 2 more',))
+        """
+        if len(self.rows) <= count:
+            return self
+        left_out = (f"... and {len(self.rows) - count:,} more", *("" for _ in self.columns[1:]))
+        return replace(self, rows=(*self.rows[:count], left_out))
