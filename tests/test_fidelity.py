@@ -80,7 +80,7 @@ def test_replay_follows_the_parameters_of_scattering_patterns(street: Campaign) 
     errors = compare(street, materials)
     assert errors.within, str(errors)
     unchanged = path_gains(street.paths)
-    assert not difference(street, street.trace.path_gains(), unchanged, materials).within
+    assert not difference(street, street.trace.path_gains(materials), unchanged, materials).within
 
 
 def test_path_loss_is_the_sum_of_the_gains_powers() -> None:

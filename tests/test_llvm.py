@@ -223,7 +223,7 @@ def test_without_a_cuda_driver_there_is_no_device(monkeypatch, tmp_path):
 def test_this_machine_can_trace():
     # What `make setup` has ensured: a GPU, or an LLVM that Dr.Jit takes and that compiles fminimum.
     code = (
-        "from calibray import llvm; variant = llvm.prepare()\n"
+        "from calibray.tracing import llvm; variant = llvm.prepare()\n"
         "import importlib, drjit\n"
         "Float = importlib.import_module('drjit.' + variant.split('_')[0]).Float\n"
         "print(variant, drjit.sum(drjit.minimum(drjit.arange(Float, 4), 2.0))[0])"

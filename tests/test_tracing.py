@@ -132,8 +132,8 @@ def test_progress_counts_receivers(
 ) -> None:
     monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", 2 * MIXED["samples"] * MIXED["max_depth"])
     seen = []
-    canyon.trace(links([-20, 2, 15], receivers), lambda done, total: seen.append((done, total)))
-    assert seen == [(2, 6), (4, 6), (6, 6)]
+    canyon.trace(links([-20, 2, 15], receivers), lambda *step: seen.append(step))
+    assert seen == [("tracing", done, 6) for done in (2, 4, 6)]
 
 
 def test_stored_paths_hold_on_to_nothing_else(canyon: Tracer, receivers: np.ndarray) -> None:

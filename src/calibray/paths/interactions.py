@@ -70,4 +70,5 @@ class Diffraction:
     @classmethod
     def empty(cls) -> Diffraction:
         """No diffraction."""
-        return cls(*(np.zeros(0) for _ in range(6)), np.zeros((0, 4, 2)))
+        none = np.zeros(0)
+        return cls(none, none, none, none, none, none, np.zeros((0, 4, 2)))

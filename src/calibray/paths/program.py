@@ -147,7 +147,8 @@ class Paths:
                 f"{target}: cannot be written ({error}); name a file in a writable folder"
             ) from None
         finally:
-            with suppress(OSError):  # nothing half-written stays behind
+            # Nothing half-written stays behind.
+            with suppress(OSError):
                 partial.unlink(missing_ok=True)
 
     @classmethod
@@ -290,7 +291,8 @@ def _write(paths: Paths, file: h5py.File) -> None:
     for group, names in _LAYOUT.items():
         for name in names:
             value = getattr(paths, name)
-            if np.iscomplexobj(value):  # MATLAB's h5read knows no complex type: real and imaginary part apart
+            # MATLAB's h5read knows no complex type: real and imaginary part apart.
+            if np.iscomplexobj(value):
                 file[f"{group}/{name}_real"], file[f"{group}/{name}_imag"] = value.real, value.imag
             else:
                 file[f"{group}/{name}"] = value

@@ -81,6 +81,10 @@ def trace(
             raise InputError(
                 f"trace: {given[0]} is given, and said by the study {scene.path} as well; change the study"
             )
+        if not isinstance(measurements, Measurements | None):
+            raise InputError(
+                "trace: measurements of a study must be Measurements; read them, or make them of a table"
+            )
         return Setup.open(scene, links=measurements).trace(materials, progress)
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"

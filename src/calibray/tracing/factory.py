@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final, final
+from typing import Any, Final, final
 
 from calibray.errors import InputError
 from calibray.materials import Material
@@ -98,7 +98,7 @@ def trace(
     return tracer.trace(links, progress)
 
 
-def _settings(settings: Mapping[str, int | bool]) -> TraceSettings:
+def _settings(settings: Mapping[str, Any]) -> TraceSettings:
     unknown = set(settings) - set(TraceSettings().record())
     if unknown:
         raise InputError(

@@ -25,7 +25,8 @@ LARGEST_EFFICIENCY: Final = 1.5
 """Radiated over accepted power beyond which the gains are taken for another quantity."""
 SEAM_TOLERANCE_DB: Final = 0.1
 """How far the gains at the first azimuth and a full turn later may lie apart."""
-_UNEVEN: Final = 0.01  # how far a step may differ from the others, as a share of it
+_UNEVEN: Final = 0.01
+"""How far a step may differ from the others, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)

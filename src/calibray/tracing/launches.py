@@ -16,11 +16,14 @@ import numpy as np
 
 from calibray.tracing.settings import TraceSettings
 
-LANE_BYTES: Final = 40  # peak while tracing, measured by benchmarks/memory.py --lanes
-# Bytes of a path, and of each of its interactions, until it is compiled; measured by benchmarks/memory.py --paths
+LANE_BYTES: Final = 40
+"""Bytes of a lane at the peak of tracing, measured by benchmarks/memory.py --lanes."""
 PATH_BYTES: Final = (650, 260)
-BUFFER_BYTES: Final = (50, 30)  # the same in the tracer's buffer
-GRID: Final = 0.01  # [m]; interaction points of one path found twice agree better, those of two seldom do
+"""Bytes of a path, and of each of its interactions, until it is compiled; measured by benchmarks/memory.py --paths."""
+BUFFER_BYTES: Final = (50, 30)
+"""The same in the tracer's buffer."""
+GRID: Final = 0.01
+"""Interaction points of one path found twice agree better, those of two seldom do [m]."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,8 @@ def repeated(
     present = kind[rows] != 0
     where = np.where(present[..., None], vertex[rows], 0) / GRID
     head = np.hstack([link[rows, None], kind[rows], np.where(present, shape[rows], 0)])
-    for offset in (0.0, 0.5):  # two grids: points that a line of one parts lie together in the other
+    # Two grids: points that a line of one parts lie together in the other.
+    for offset in (0.0, 0.5):
         grid = np.floor(where + offset).astype(np.int64).reshape(len(rows), -1)
         _, first, group = np.unique(np.hstack([head, grid]), axis=0, return_index=True, return_inverse=True)
         found[rows] |= piece[rows[first[group.reshape(-1)]]] < piece[rows]

@@ -104,7 +104,7 @@ class Llvm:
 
 
 def version_in_name(path: str) -> tuple[int, ...]:
-    """Reads the major version from a file name.
+    """Read the major version from a file name.
 
     Args:
         path: Path or name of a library.
@@ -126,7 +126,7 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decides whether a library that opens is one that Dr.Jit can use.
+    """Decide whether a library that opens is one that Dr.Jit can use.
 
     Args:
         path: Path or name of the library.
@@ -144,7 +144,7 @@ def judge(path: str, reported: tuple[int, ...]) -> Llvm:
 
 
 def inspect(path: str) -> Llvm:
-    """Opens a library in a process of its own, which a broken one may kill, and asks for its version.
+    """Open a library in a process of its own, which a broken one may kill, and asks for its version.
 
     Args:
         path: Path of the library, or a bare name for the dynamic loader.
@@ -159,7 +159,7 @@ def inspect(path: str) -> Llvm:
 
 
 def library_paths() -> tuple[str, ...]:
-    """Finds the libLLVM files of this machine, each once.
+    """Find the libLLVM files of this machine, each once.
 
     Returns:
         Paths from the dynamic loader's cache, the usual folders of Linux and Homebrew, and conda's.
@@ -184,7 +184,7 @@ def candidates() -> tuple[Llvm, ...]:
 
 
 def select() -> Llvm:
-    """Points Dr.Jit to the libLLVM that it shall use; to be called before Dr.Jit is imported.
+    """Point Dr.Jit to the libLLVM that it shall use; to be called before Dr.Jit is imported.
 
     A library named by `DRJIT_LIBLLVM_PATH` is used or refused, never passed over. Without one, the best
     candidate is taken and `DRJIT_LIBLLVM_PATH` is set to it, for this process and those that it starts.
@@ -238,7 +238,7 @@ def mitsuba_variant() -> str:
 
 
 def prepare() -> str:
-    """Makes Dr.Jit safe to import: picks the variant and, if that compiles with LLVM, the library.
+    """Make Dr.Jit safe to import: picks the variant and, if that compiles with LLVM, the library.
 
     Returns:
         The Mitsuba variant to set before `sionna.rt` is imported.
@@ -254,7 +254,7 @@ def prepare() -> str:
 
 
 def require_libatomic() -> None:
-    """Refuses a Linux without libatomic, which Dr.Jit links to and a bare Debian does not bring.
+    """Refuse a Linux without libatomic, which Dr.Jit links to and a bare Debian does not bring.
 
     Raises:
         InputError: If the library cannot be opened.
@@ -283,7 +283,7 @@ def remedy() -> str:
 
 
 def _refuse_loaded() -> None:
-    """Refuses a Dr.Jit that was imported already with an unusable library, which cannot be exchanged."""
+    """Refuse a Dr.Jit that was imported already with an unusable library, which cannot be exchanged."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
         return
@@ -308,7 +308,7 @@ def _loader_cache() -> list[Path]:
 
 
 def _probe(code: str, *arguments: str) -> tuple[str, str | None]:
-    """Runs Python code in a bare interpreter; returns its output and what went wrong, None if nothing did."""
+    """Run Python code in a bare interpreter; return its output and what went wrong, None if nothing did."""
     command = [sys.executable, "-I", "-S", "-c", code, *arguments]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False)

@@ -6,9 +6,12 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-GROUP = Path("/sys/fs/cgroup")  # where a container's limit is
+GROUP = Path("/sys/fs/cgroup")
+"""Where a container's limit is."""
 SYSTEM = Path("/proc/meminfo")
-UNKNOWN = 2**34  # [bytes] what is taken to be built in where nothing tells
+"""Where Linux tells what is left."""
+UNKNOWN = 2**34
+"""What is taken to be built in where nothing tells [bytes]."""
 
 
 def available() -> int:
@@ -21,7 +24,8 @@ def available() -> int:
     left = [_physical() // 2]
     with suppress(OSError, ValueError, KeyError):
         left = [_entries(SYSTEM)["MemAvailable:"] * 1024]
-    with suppress(OSError, ValueError, KeyError):  # no number where there is no limit; caches give way
+    # There is no number where there is no limit; caches give way.
+    with suppress(OSError, ValueError, KeyError):
         left.append(int((GROUP / "memory.max").read_text()) - _entries(GROUP / "memory.stat")["anon"])
     return max(min(left), 0)
 
@@ -34,5 +38,6 @@ def _entries(file: Path) -> dict[str, int]:
 def _physical() -> int:
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # not every system tells
+    # Not every system tells.
+    except (AttributeError, ValueError, OSError):
         return UNKNOWN

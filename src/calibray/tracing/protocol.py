@@ -68,11 +68,6 @@ class Tracer(Protocol):
         """The switches."""
         ...
 
-    @property
-    def versions(self) -> Mapping[str, str]:
-        """What the paths found depend on beside the arguments: the tracer's programs and their versions."""
-        ...
-
     def with_settings(self, settings: TraceSettings) -> Tracer:
         """The tracer with other switches; the scene stays as it is loaded.
 
@@ -153,7 +148,7 @@ class TracerFactory(Protocol):
 
     @property
     def versions(self) -> Mapping[str, str]:
-        """As the `versions` of the tracers that it opens, known before one is."""
+        """What the paths found depend on beside the arguments: the tracer's programs and their versions."""
         ...
 
     def __call__(

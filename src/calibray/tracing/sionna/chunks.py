@@ -29,7 +29,7 @@ class Chunk:
 
 @contextmanager
 def share_of_rays(launch: Launch, samples: int) -> Iterator[None]:
-    """Lets Sionna take a launch's share of the lattice of all rays in place of a lattice of its own.
+    """Let Sionna take a launch's share of the lattice of all rays in place of a lattice of its own.
 
     Args:
         launch: The launch.

@@ -33,7 +33,6 @@ from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
-from calibray.tracing.factory import SIONNA
 from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan
 from calibray.tracing.memory import available
 from calibray.tracing.protocol import Links, Solution, positions
@@ -94,11 +93,6 @@ class Tracer:
         self._shape_material = shape_materials(self._scene)
         self._candidates, self._images = SBDeterministicCandidateGenerator(), ImageMethod()
         self._fields = FieldCalculator()
-
-    @property
-    def versions(self) -> dict[str, str]:
-        """Installed versions by package."""
-        return SIONNA.versions
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
         """The tracer with other switches, on the same scene in Sionna's memory.
