@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import StudyFile, log
-from calibray.cli.progress import progress_bars
 from calibray.errors import InputError
 
 
@@ -25,6 +24,7 @@ def trace(
     ] = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
+    from calibray.cli.progress import progress_bars
     from calibray.engines import make_tracer
     from calibray.files import check_file
     from calibray.report import trace as report
