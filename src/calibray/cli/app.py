@@ -7,7 +7,7 @@ running, 2 for bad input. Commands import what they need when they run, so that 
 from __future__ import annotations
 
 from importlib import metadata
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -25,7 +25,7 @@ from calibray.errors import EngineError, InputError
 class Commands(TyperGroup):
     """A group of commands whose expected failures are one message and an exit status, not a traceback."""
 
-    def invoke(self, ctx: typer.Context) -> object:
+    def invoke(self, ctx: Any) -> Any:
         """Run the command.
 
         Args:

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import StudyFile, log
-from calibray.cli.progress import progress_bars
 
 
 def compare(
@@ -38,6 +37,7 @@ def compare(
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+    from calibray.cli.progress import progress_bars
     from calibray.comparison.arena import study_arena
     from calibray.comparison.comparison import compare as run_all
     from calibray.comparison.tables import optimum, table

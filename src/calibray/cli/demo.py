@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import log
-from calibray.cli.progress import progress_bars
 
 
 def demo(
@@ -25,6 +24,7 @@ def demo(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
 ) -> None:
     """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
+    from calibray.cli.progress import progress_bars
     from calibray.comparison.experiment import run_demo
     from calibray.comparison.paper import tables
     from calibray.files import check_folder

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from calibray.cli.console import log
-from calibray.cli.progress import progress_bars
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,6 +40,7 @@ def predict(
     """Predict path loss at links that were never measured, with the calibrated scene."""
     import numpy as np
 
+    from calibray.cli.progress import progress_bars
     from calibray.files import check_table, write_table
     from calibray.measurements import read_links
     from calibray.result import Result

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import StudyFile, log
-from calibray.cli.progress import progress_bars
 
 
 def run(
@@ -37,6 +36,7 @@ def run(
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
     from calibray.calibration import calibrate
+    from calibray.cli.progress import progress_bars
     from calibray.engines import open_executor
     from calibray.result import FILES, tables
     from calibray.study import Study

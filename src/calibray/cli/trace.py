@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from calibray.cli.console import StudyFile, log
-from calibray.cli.progress import progress_bars
 from calibray.errors import InputError
 
 
@@ -27,6 +26,7 @@ def trace(
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
     from functools import partial
 
+    from calibray.cli.progress import progress_bars
     from calibray.fields import path_loss
     from calibray.files import check_file
     from calibray.progress import staged

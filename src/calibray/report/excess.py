@@ -57,7 +57,7 @@ def figure(comparison: Comparison) -> Figure:
     calls = np.arange(1, last + 1)
     for entry in comparison.entries:
         shown = calls if entry.reference else calls[: entry.budget]
-        quartiles = [comparison.quartiles(entry.name, call) for call in shown]
+        quartiles = [comparison.quartiles(entry.name, int(call)) for call in shown]
         low, middle, high = np.maximum(quartiles, FLOOR_DB).T
         color = COLORS.get(entry.method) or next(colors)
         dashed = "--" if entry.reference or entry.name != entry.method else "-"
