@@ -7,13 +7,13 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
-from calibray import engines
+from calibray import engines, optimizers
 from calibray.engines import Differentiable, Engine, Recorded
 from calibray.errors import InputError
 from calibray.files import check_folder
@@ -211,7 +211,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         InputError: No candidate could be evaluated.
     """
     engine, objective, parameters, run = problem.engine, problem.objective, problem.engine.parameters, Run()
-    derivatives = "jacobian" in optimizer.uses and isinstance(engine, Differentiable)
+    derivatives = optimizer.needs_derivatives() and isinstance(engine, Differentiable)
     started, iteration, calls, hits = time.perf_counter(), 0, engine.calls, _hits(engine)
     # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
     with threadpool_limits(1, user_api="blas"):
@@ -315,44 +315,16 @@ def search_slope(parameters: Parameters, candidates: np.ndarray) -> np.ndarray:
     return np.where(parameters.logarithmic, candidates, 1.0)
 
 
-def make_optimizer(name: str, parameters: Parameters, seed: int, **options: object) -> Optimizer:
-    """An optimizer over the search space of some parameters.
+def local_searches(interactions: int) -> int:
+    """Starting points of a method that takes them, on paths where they cost what they may.
 
     Args:
-        name: A method of `METHODS`.
-        parameters: The parameters.
-        seed: Seed.
-        **options: Settings of the method.
+        interactions: Interactions that a candidate is evaluated at.
 
     Returns:
-        The optimizer.
-
-    Raises:
-        InputError: The method has no such setting, or refuses a value.
+        Their number.
     """
-    kind = METHODS[name]
-    lower, upper = to_search(parameters, parameters.lower), to_search(parameters, parameters.upper)
-    try:
-        return kind(lower, upper, seed=seed, **options)
-    except TypeError as error:
-        raise InputError(f"method.options of {name!r}: {error}") from None
-
-
-def usual_options(name: str, parameters: Parameters, interactions: int) -> dict[str, Any]:
-    """Settings of a method that follow from what is calibrated; a study's own replace them.
-
-    Args:
-        name: A method of `METHODS`.
-        parameters: The parameters.
-        interactions: Interactions that a candidate is evaluated at, 0 where that is no matter.
-
-    Returns:
-        The settings; none for most methods.
-    """
-    if name == "least-squares":
-        starts = int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))
-        return {"x0": to_search(parameters, parameters.start), "starts": starts}
-    return {}
+    return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))
 
 
 def _optimizer(problem: Problem) -> Optimizer:
@@ -360,10 +332,15 @@ def _optimizer(problem: Problem) -> Optimizer:
     replay, name = isinstance(problem.engine, Differentiable), section.name
     if name == AUTO:
         name = "least-squares" if replay else "vector-surrogate"
-    if name == "least-squares" and not replay:
-        raise InputError("method 'least-squares' needs derivatives, which only the replay engine gives")
-    usual = usual_options(name, parameters, problem.engine.interactions if replay else 0)
-    return make_optimizer(name, parameters, section.seed, **{**usual, **section.options})
+    if METHODS[name].needs_derivatives() and not replay:
+        raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
+    start, lower, upper = (
+        to_search(parameters, values) for values in (parameters.start, parameters.lower, parameters.upper)
+    )
+    starts = local_searches(problem.engine.interactions) if replay else None
+    return optimizers.make(
+        name, lower, upper, section.seed, start=start, starts=starts, options=section.options
+    )
 
 
 def _result(

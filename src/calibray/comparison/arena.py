@@ -6,15 +6,14 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calibray import engines
-from calibray.calibration.calibration import Problem, from_search, search_slope, to_search, usual_options
+from calibray.calibration.calibration import Problem, from_search, local_searches, search_slope, to_search
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
-from calibray.optimizers import METHODS, landscapes
+from calibray.optimizers import landscapes
 from calibray.study import Study
 
 Told = tuple[np.ndarray, np.ndarray, np.ndarray | None]
@@ -30,8 +29,8 @@ class Arena:
         fingerprint: All that an answer depends on.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Where a user would start [d].
-        options: Settings of methods that the problem suggests, by method.
+        start: Where a user would start [d]; None if that is nowhere in particular.
+        starts: Further starting points for the methods that take them; their own number if None.
         large: Whether an evaluation is so dear that searches from few starts have to do.
         minimum: Lowest objective known beforehand; +inf if none is.
         evaluate: Points [n, d], and whether derivatives are wanted, to what an optimizer is told.
@@ -41,8 +40,8 @@ class Arena:
     fingerprint: str
     lower: np.ndarray
     upper: np.ndarray
-    start: np.ndarray
-    options: dict[str, dict[str, Any]]
+    start: np.ndarray | None
+    starts: int | None
     large: bool
     minimum: float
     evaluate: Callable[[np.ndarray, bool], Told]
@@ -87,9 +86,9 @@ def study_arena(path: str | Path) -> Arena:
     digest.update(repr((objective.num_groups, objective.ceiling_db)).encode())
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = to_search(parameters, parameters.start)
-    options = {name: usual_options(name, parameters, engine.interactions) for name in METHODS}
+    starts = local_searches(engine.interactions)
     return Arena(
-        Path(path).stem, digest.hexdigest(), lower, upper, start, options, engine.large, np.inf, evaluate
+        Path(path).stem, digest.hexdigest(), lower, upper, start, starts, engine.large, np.inf, evaluate
     )
 
 
@@ -100,7 +99,7 @@ def landscape_arena(name: str) -> Arena:
         name: The function that makes it.
 
     Returns:
-        The arena; it starts in the middle of the box.
+        The arena.
     """
     land: landscapes.Landscape = getattr(landscapes, name)()
 
@@ -113,4 +112,4 @@ def landscape_arena(name: str) -> Arena:
     digest = hashlib.sha256(name.encode())
     for part in (land.lower, land.upper, *evaluate(middle[None], True)):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
-    return Arena(name, digest.hexdigest(), land.lower, land.upper, middle, {}, False, known, evaluate)
+    return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from calibray.comparison.comparison import REFERENCE, Comparison, quantile
+from calibray.comparison.comparison import Comparison, quantile
 from calibray.files import write_table
+from calibray.optimizers import METHODS
 from calibray.report.figures import COLORS, label, plain_figure
 from calibray.report.figures import write as write_figure
 
@@ -83,18 +84,19 @@ def figure(comparison: Comparison) -> Figure:
         The figure.
     """
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
-    last = max(entry.budget for entry in comparison.entries)
-    colors = iter(PALETTE * (1 + len(comparison.entries) // len(PALETTE)))
+    last = max(contender.budget for contender in comparison.contenders)
+    colors = iter(PALETTE * (1 + len(comparison.contenders) // len(PALETTE)))
     calls = np.arange(1, last + 1)
-    for entry in comparison.entries:
-        shown = calls if entry.method == REFERENCE else calls[: entry.budget]
-        excess = np.array([comparison.excess(entry.name, call) for call in shown])
+    for contender in comparison.contenders:
+        endless = METHODS[contender.method].schedule is None
+        shown = calls if endless else calls[: contender.budget]
+        excess = np.array([comparison.excess(contender.name, call) for call in shown])
         low, middle, high = (
             np.maximum([quantile(each, share) for each in excess], FLOOR_DB) for share in (0.25, 0.5, 0.75)
         )
-        color = COLORS.get(entry.method) or next(colors)
-        dashed = "--" if entry.method == REFERENCE or entry.name != entry.method else "-"
-        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(entry.name))
+        color = COLORS.get(contender.method) or next(colors)
+        dashed = "--" if endless or contender.name != contender.method else "-"
+        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(contender.name))
         axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
     axes.set(yscale="log", xlim=(0, last))
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
