@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 
 import synthetic
-from calibray.comparison.comparison import Comparison, Entry
+from calibray.comparison.comparison import Comparison, Contender
 from calibray.comparison.experiment import Demo
-from calibray.comparison.runs import Run
+from calibray.comparison.runs import MethodRun
 from calibray.diagnosis import Check, Diagnosis
 from calibray.paths import Kind, Paths
 from calibray.result import Result
@@ -70,22 +70,22 @@ def convergence() -> Convergence:
 
 def comparison() -> Comparison:
     """Four methods from three seeds, one of which failed and one never came near."""
-    entries = tuple(
-        Entry.parse(name, 225) for name in ("sgwo-im", "gwo@600", "gaussian-process", "least-squares")
+    contenders = tuple(
+        Contender.parse(name, 225) for name in ("sgwo-im", "gwo@600", "gaussian-process", "least-squares")
     )
     random = np.random.default_rng(4)
 
-    def run(entry: Entry, seed: int) -> Run:
-        calls = tuple(sorted(random.choice(np.arange(1, entry.budget + 1), 9, replace=False).tolist()))
+    def run(contender: Contender, seed: int) -> MethodRun:
+        calls = tuple(sorted(random.choice(np.arange(1, contender.budget + 1), 9, replace=False).tolist()))
         best = tuple((2.0 + np.sort(10.0 ** random.uniform(-4, 1, 9))[::-1]).tolist())
-        return Run(entry.method, entry.budget, seed, entry.budget, calls, best, 0.5 + seed)
+        return MethodRun(contender.method, contender.budget, seed, contender.budget, calls, best, 0.5 + seed)
 
-    runs = {entry.name: tuple(run(entry, seed) for seed in range(3)) for entry in entries}
+    runs = {contender.name: tuple(run(contender, seed) for seed in range(3)) for contender in contenders}
     runs["gaussian-process"] = (
         *runs["gaussian-process"][:2],
-        Run("gaussian-process", 225, 2, 0, (), (), 0.1, "LinAlgError: not positive definite"),
+        MethodRun("gaussian-process", 225, 2, 0, (), (), 0.1, "LinAlgError: not positive definite"),
     )
-    return Comparison("street", entries, runs, 2.0, "least-squares from 2048 starts")
+    return Comparison("street", contenders, runs, 2.0, "least-squares from 2048 starts")
 
 
 def demo() -> Demo:

@@ -14,11 +14,11 @@ from calibray.calibration import calibrate
 from calibray.cli.app import app
 from calibray.comparison import comparison as module
 from calibray.comparison.arena import landscape_arena, study_arena
-from calibray.comparison.comparison import Entry, compare, settings
-from calibray.comparison.runs import Run, Runs
+from calibray.comparison.comparison import Contender, compare
+from calibray.comparison.runs import MethodRun, Runs
 from calibray.comparison.tables import table as shown
 from calibray.errors import InputError
-from calibray.optimizers import METHODS, SGWOIM, RandomSearch
+from calibray.optimizers import GWO, METHODS, SGWOIM, RandomSearch
 from calibray.report.excess import FILES, FLOOR_DB, figure
 from calibray.study import Study
 from calibray.tables import markdown
@@ -53,16 +53,18 @@ def test_the_papers_methods_keep_to_any_budget():
     arena = STREET()
     for budget in range(24, 700):
         for name, full in (("gwo", 30), ("sgwo-im", 5)):
-            used = Entry.parse(name, budget).optimizer(arena, 0).budget
+            used = Contender.parse(name, budget).optimizer(arena, 0).budget
             assert budget - full < used <= budget
-    assert settings("sgwo-im", 225) == {"population": 30, "elites": 5, "iterations": 20}
-    assert Entry.parse("sgwo-im", 225).optimizer(arena, 0).budget == SGWOIM(arena.lower, arena.upper).budget
-    assert settings("gwo", 600) == {"population": 30, "iterations": 20}
+    assert SGWOIM.within(225) == {"population": 30, "elites": 5, "iterations": 20}
+    assert (
+        Contender.parse("sgwo-im", 225).optimizer(arena, 0).budget == SGWOIM(arena.lower, arena.upper).budget
+    )
+    assert GWO.within(600) == {"population": 30, "iterations": 20}
 
 
 @pytest.mark.parametrize("name", sorted(set(METHODS) - {"least-squares"}))
 def test_every_method_takes_a_budget(name):
-    optimizer = Entry.parse(name, 50).optimizer(STREET(), 0)
+    optimizer = Contender.parse(name, 50).optimizer(STREET(), 0)
     assert 45 <= optimizer.budget <= 50
 
 
@@ -72,8 +74,8 @@ def test_a_run_is_what_the_optimizer_does_when_driven_by_hand(small):
     while not optimizer.done:
         x = optimizer.ask()
         told = land.evaluate(x, False)
-        optimizer.tell(x, *told)
-        y += told[0].tolist()
+        optimizer.tell(x, told.value, told.residuals)
+        y += told.value.tolist()
     best = np.minimum.accumulate(y)
     run = small[0].runs["random"][2]
     assert [run.at(call) for call in range(1, 46)] == best.tolist()
@@ -113,9 +115,12 @@ def test_the_table_says_what_the_runs_did(small):
 
 def test_what_half_of_the_runs_never_reached_has_no_median():
     runs = tuple(
-        Run("random", 30, seed, 30, (1,), (value,), 0.1) for seed, value in enumerate([1.0, 1.0, 3.0, 3.0])
+        MethodRun("random", 30, seed, 30, (1,), (value,), 0.1)
+        for seed, value in enumerate([1.0, 1.0, 3.0, 3.0])
     )
-    finished = module.Comparison("x", (Entry.parse("random", 30),), {"random": runs}, 1.0, "random, seed 0")
+    finished = module.Comparison(
+        "x", (Contender.parse("random", 30),), {"random": runs}, 1.0, "random, seed 0"
+    )
     row = finished.table().iloc[0]
     assert row["reached_0.05_db"] == 2
     assert np.isnan(row["calls_to_0.05_db"])
@@ -130,7 +135,7 @@ def test_finished_runs_are_not_run_again(small, monkeypatch):
     def refuse(*_):
         raise AssertionError("ran again")
 
-    monkeypatch.setattr(module, "run_entry", refuse)
+    monkeypatch.setattr(module, "run_contender", refuse)
     monkeypatch.setattr(module, "_optimum", refuse)
     again = compare(STREET, ["random", "sgwo-im"], seeds=2, budget=45, out=out)
     assert again.runs == {name: finished.runs[name][:2] for name in ("random", "sgwo-im")}
@@ -169,7 +174,8 @@ def test_several_workers_find_the_same(small, tmp_path):
 
 def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
     class Broken:
-        uses = RandomSearch.uses
+        uses, schedule, takes_starts = RandomSearch.uses, RandomSearch.schedule, False
+        within, needs_derivatives = RandomSearch.within, RandomSearch.needs_derivatives
 
         def __init__(self, lower, upper, *, seed, budget):
             if seed == 1:
@@ -182,11 +188,11 @@ def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
         def ask(self):
             return self._inner.ask()[:10]
 
-        def tell(self, *told):
+        def tell(self, *told, **more):
             if not self._left:
                 raise RuntimeError("singular")
             self._left -= 1
-            self._inner.tell(*told)
+            self._inner.tell(*told, **more)
 
     monkeypatch.setitem(METHODS, "broken", Broken)
     finished = compare(STREET, ["broken", "random"], seeds=2, budget=30, out=tmp_path)
@@ -205,13 +211,13 @@ def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
 
 
 def test_a_lower_minimum_known_beforehand_is_the_optimum(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_optimum", lambda arena: Run("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
+    monkeypatch.setattr(module, "_optimum", lambda arena: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
     finished = compare(STREET, ["random"], seeds=1, budget=30, out=tmp_path)
     assert (finished.optimum, finished.found_by) == (2.97426794, "earlier searches")
 
 
 def test_a_run_below_the_optimum_becomes_the_optimum(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_optimum", lambda arena: Run("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
+    monkeypatch.setattr(module, "_optimum", lambda arena: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
     finished = compare(
         lambda: replace(STREET(), minimum=np.inf), ["random"], seeds=2, budget=30, out=tmp_path
     )
@@ -262,7 +268,7 @@ def test_a_study_is_searched_as_calibrate_searches_it(method, calls, study):
     options = f"{{ budget = {calls} }}" if method == "vector-surrogate" else "{}"
     study.write_text(f'{study.read_text()}[method]\nname = "{method}"\nseed = 1\noptions = {options}\n')
     result = calibrate(Study.load(study))
-    run = module.run_entry(study_arena(study), Entry.parse(method, calls), 1)
+    run = module.run_contender(study_arena(study), Contender.parse(method, calls), 1)
     assert run.failure == ""
     assert run.at(calls) == result.rmse_db
     assert [run.at(call) for call in range(1, calls + 1)] == result.history["best_db"].tolist()
@@ -271,7 +277,7 @@ def test_a_study_is_searched_as_calibrate_searches_it(method, calls, study):
 def test_the_derivatives_of_a_study_are_those_of_its_search_space(study):
     arena = study_arena(study)
     x = 0.4 * arena.lower + 0.6 * arena.upper
-    _, _, jacobian = arena.evaluate(x[None], True)
+    jacobian = arena.evaluate(x[None], True).jacobian
     for k in range(len(x)):
         step = 1e-5 * np.eye(len(x))[k]
         (up, down) = arena.evaluate(np.array([x + step, x - step]), False)[1]

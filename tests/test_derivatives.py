@@ -13,7 +13,7 @@ import pytest
 
 import synthetic
 from calibray.engines import Replay
-from calibray.fields import Program, constants, layout, program_path_loss
+from calibray.fields import GroupedProgram, constants, layout, program_path_loss
 from calibray.materials import BOUNDS, FIELDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths
@@ -54,14 +54,14 @@ def interval(field: str, value: float) -> tuple[float, float]:
     return max(bound.lower, 0.5 * value), min(bound.upper, 1.5 * value)
 
 
-def _value_and_jacobian(program: Program, table: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+def _value_and_jacobian(program: GroupedProgram, table: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Path loss [L] and its derivatives by all constants of all materials [L, M, 8], by forward mode."""
     jacobian, value = _forward(program, table)
     return np.asarray(value), np.asarray(jacobian)
 
 
 @jax.jit
-def _forward(program: Program, table: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _forward(program: GroupedProgram, table: jax.Array) -> tuple[jax.Array, jax.Array]:
     def twice(table: jax.Array) -> tuple[jax.Array, jax.Array]:
         value = program_path_loss(program, table)
         return value, value

@@ -18,7 +18,7 @@ from calibray.materials import Material
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import (
     Chains,
-    Program,
+    Geometry,
     compile_chains,
     rotate,
     spherical_basis,
@@ -122,8 +122,8 @@ def carried_in_space(chains: Chains, path: int) -> np.ndarray:
     return gains
 
 
-def as_paths(program: Program, count: int) -> Paths:
-    """The program between antennas with fields theta and phi at both ends."""
+def as_paths(geometry: Geometry, count: int) -> Paths:
+    """The geometry between antennas with fields theta and phi at both ends."""
 
     def turned(rotation: np.ndarray) -> np.ndarray:
         cos, sin = rotation.T
@@ -131,18 +131,18 @@ def as_paths(program: Program, count: int) -> Paths:
             complex
         )
 
-    shared = {entry.name for entry in fields(Program)} & {entry.name for entry in fields(Paths)}
+    shared = {entry.name for entry in fields(Geometry)} & {entry.name for entry in fields(Paths)}
     return Paths(
         frequency=FREQUENCY,
         materials={"wall": WALL},
         tx_position=np.zeros((count, 3)),
         rx_position=np.ones((count, 3)),
         link=np.arange(count, dtype=np.int32),
-        departure=zenith_azimuth(program.departure_direction),
-        arrival=zenith_azimuth(-program.arrival_direction),
-        tx_field=turned(program.departure_rotation),
-        rx_field=turned(program.arrival_rotation * [1, -1]),
-        **{name: getattr(program, name) for name in shared},
+        departure=zenith_azimuth(geometry.departure_direction),
+        arrival=zenith_azimuth(-geometry.arrival_direction),
+        tx_field=turned(geometry.departure_rotation),
+        rx_field=turned(geometry.arrival_rotation * [1, -1]),
+        **{name: getattr(geometry, name) for name in shared},
     )
 
 
@@ -155,8 +155,8 @@ def test_chain_of_frames_equals_the_field_carried_in_space(seed: int) -> None:
         np.testing.assert_allclose(found[path], expected, rtol=1e-9, atol=1e-12, err_msg=str(sequence))
 
 
-def assert_same(one: Program, other: Program) -> None:
-    for entry in fields(Program):
+def assert_same(one: Geometry, other: Geometry) -> None:
+    for entry in fields(Geometry):
         a, b = getattr(one, entry.name), getattr(other, entry.name)
         if isinstance(a, np.ndarray):
             np.testing.assert_allclose(a, b, atol=1e-9, err_msg=entry.name)
@@ -188,20 +188,20 @@ def test_scene_may_be_moved_and_turned_about_the_vertical() -> None:
 
 def test_lengths_delays_and_solid_angles() -> None:
     chains = random_chains(3)
-    program = compile_chains(chains)
+    geometry = compile_chains(chains)
     for path, sequence in enumerate(SEQUENCES):
         stops = np.array([chains.source[path], *chains.vertex[path][: len(sequence)], chains.target[path]])
         lengths = np.linalg.norm(np.diff(stops, axis=0), axis=1)
-        assert program.delay[path] * speed_of_light == pytest.approx(lengths.sum())
+        assert geometry.delay[path] * speed_of_light == pytest.approx(lengths.sum())
         after = sequence[::-1].index(D) + 1 if D in sequence else len(lengths)  # the last ray tube's segments
-        assert program.spreading[path] == pytest.approx(1 / lengths[-after:].sum())
+        assert geometry.spreading[path] == pytest.approx(1 / lengths[-after:].sum())
     first = [sequence.index(D) for sequence in SEQUENCES if D in sequence]
     rows = [path for path, sequence in enumerate(SEQUENCES) if D in sequence]
     chosen = [np.prod(chains.probability[path, : step + 1]) for path, step in zip(rows, first, strict=True)]
-    angles = program.diffuse.solid_angle[np.cumsum([0, *(SEQUENCES[path].count(D) for path in rows)])[:-1]]
+    angles = geometry.diffuse.solid_angle[np.cumsum([0, *(SEQUENCES[path].count(D) for path in rows)])[:-1]]
     np.testing.assert_allclose(angles, 4 * np.pi / SAMPLES / np.array(chosen))
     twice = SEQUENCES.index((T, D, D))
-    assert program.diffuse.solid_angle[-1] == pytest.approx(2 * np.pi / chains.probability[twice, 2])
+    assert geometry.diffuse.solid_angle[-1] == pytest.approx(2 * np.pi / chains.probability[twice, 2])
 
 
 # Wedges
@@ -241,13 +241,13 @@ def test_angles_of_a_wedge_are_those_it_was_built_with(
         normal_n=place[3],
         edge_lengths=np.array([[before, after]]) / sine,
     )
-    program = compile_chains(chains)
-    wedge = program.diffraction
+    geometry = compile_chains(chains)
+    wedge = geometry.diffraction
     lit = np.sin(azimuth[0]) > 0  # the incident ray comes from the side that the 0-face's normal points to
     assert wedge.sin_edge[0] == pytest.approx(sine, abs=1e-9)
     assert wedge.distance[0] == pytest.approx(before * after / (before + after) * sine)
-    assert program.spreading[0] == pytest.approx((before * after * (before + after) / sine**3) ** -0.5)
-    assert program.cos_incidence[0] == pytest.approx(abs(np.sin(azimuth[0])) * sine, abs=1e-9)
+    assert geometry.spreading[0] == pytest.approx((before * after * (before + after) / sine**3) ** -0.5)
+    assert geometry.cos_incidence[0] == pytest.approx(abs(np.sin(azimuth[0])) * sine, abs=1e-9)
     assert wedge.cos_incidence_n[0] == pytest.approx(abs(np.sin(exterior - azimuth[0])) * sine, abs=1e-9)
     if lit:
         assert wedge.exterior_angle[0] == pytest.approx(exterior, abs=1e-6)
@@ -307,6 +307,6 @@ def test_no_paths_compile_to_an_empty_program() -> None:
         for entry in fields(Chains)
         if isinstance(getattr(chains, entry.name), np.ndarray)
     }
-    program = compile_chains(replace(chains, **arrays))
-    assert program.first.tolist() == [0]
-    assert len(program.delay) == len(program.kind) == len(program.diffuse.solid_angle) == 0
+    geometry = compile_chains(replace(chains, **arrays))
+    assert geometry.first.tolist() == [0]
+    assert len(geometry.delay) == len(geometry.kind) == len(geometry.diffuse.solid_angle) == 0

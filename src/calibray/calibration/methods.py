@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from calibray import optimizers
 from calibray.calibration.problem import Problem
 from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, Optimizer
-from calibray.parameters import Parameters
 from calibray.spelling import did_you_mean
 
 AUTO: Final = "auto"
@@ -51,46 +51,26 @@ def choose(problem: Problem) -> Optimizer:
     section, name = problem.setup.study.method, problem.setup.study.method.name
     if name == AUTO:
         name = "least-squares" if problem.differentiable else "vector-surrogate"
-    if "jacobian" in METHODS[name].uses and not problem.differentiable:
+    if METHODS[name].needs_derivatives() and not problem.differentiable:
         raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
-    interactions = problem.engine.interactions if isinstance(problem.engine, Differentiable) else 0
-    usual = usual_options(name, problem.parameters, interactions)
-    return make_optimizer(name, problem.parameters, section.seed, **{**usual, **section.options})
+    engine, parameters = problem.engine, problem.parameters
+    return optimizers.make(
+        name,
+        *parameters.search_bounds,
+        section.seed,
+        start=parameters.to_search(parameters.start),
+        starts=local_searches(engine.interactions) if isinstance(engine, Differentiable) else None,
+        options=section.options,
+    )
 
 
-def make_optimizer(name: str, parameters: Parameters, seed: int, **options: object) -> Optimizer:
-    """An optimizer over the search space of some parameters.
-
-    Args:
-        name: A method of `METHODS`.
-        parameters: The parameters.
-        seed: Seed.
-        **options: Settings of the method.
-
-    Returns:
-        The optimizer.
-
-    Raises:
-        InputError: The method has no such setting, or refuses a value.
-    """
-    try:
-        return METHODS[name](*parameters.search_bounds, seed=seed, **options)
-    except TypeError as error:
-        raise InputError(f"method.options of {name!r}: {error}") from None
-
-
-def usual_options(name: str, parameters: Parameters, interactions: int) -> dict[str, Any]:
-    """Settings of a method that follow from what is calibrated; a study's own replace them.
+def local_searches(interactions: int) -> int:
+    """Starting points of a method that takes them, on paths where they cost what they may.
 
     Args:
-        name: A method of `METHODS`.
-        parameters: The parameters.
-        interactions: Interactions that a candidate is evaluated at, 0 where that is no matter.
+        interactions: Interactions that a candidate is evaluated at.
 
     Returns:
-        The settings; none for most methods.
+        Their number.
     """
-    if name == "least-squares":
-        starts = int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))
-        return {"x0": parameters.to_search(parameters.start), "starts": starts}
-    return {}
+    return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))

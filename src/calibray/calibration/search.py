@@ -32,7 +32,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
     Yields:
         The candidates of every round [n, d], as points of the search space, and what was told of them.
     """
-    derivatives = "jacobian" in optimizer.uses
+    derivatives = optimizer.needs_derivatives()
     # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
     with threadpool_limits(1, user_api="blas"):
         while not optimizer.done:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calibray import engines
-from calibray.calibration.methods import usual_options
+from calibray.calibration.methods import local_searches
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Evaluate
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
-from calibray.optimizers import METHODS, landscapes
+from calibray.optimizers import landscapes
 from calibray.study import Setup, Study
 
 
@@ -28,8 +27,8 @@ class Arena:
         fingerprint: All that an answer depends on.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Where a user would start [d].
-        options: Settings of methods that the problem suggests, by method.
+        start: Where a user would start [d]; None if that is nowhere in particular.
+        starts: Further starting points for the methods that take them; their own number if None.
         large: Whether an evaluation is so dear that searches from few starts have to do.
         minimum: Lowest objective known beforehand; +inf if none is.
         evaluate: What is searched.
@@ -39,8 +38,8 @@ class Arena:
     fingerprint: str
     lower: np.ndarray
     upper: np.ndarray
-    start: np.ndarray
-    options: dict[str, dict[str, Any]]
+    start: np.ndarray | None
+    starts: int | None
     large: bool
     minimum: float
     evaluate: Evaluate
@@ -75,14 +74,13 @@ def study_arena(path: str | Path) -> Arena:
     digest.update(repr((objective.num_groups, objective.ceiling_db)).encode())
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = parameters.to_search(parameters.start)
-    options = {name: usual_options(name, parameters, engine.interactions) for name in METHODS}
     return Arena(
         Path(path).stem,
         digest.hexdigest(),
         lower,
         upper,
         start,
-        options,
+        local_searches(engine.interactions),
         engine.large,
         np.inf,
         problem.evaluate,
@@ -96,7 +94,7 @@ def landscape_arena(name: str) -> Arena:
         name: The function that makes it.
 
     Returns:
-        The arena; it starts in the middle of the box.
+        The arena.
     """
     land: landscapes.Landscape = getattr(landscapes, name)()
 
@@ -109,4 +107,4 @@ def landscape_arena(name: str) -> Arena:
     digest = hashlib.sha256(name.encode())
     for part in (land.lower, land.upper, *evaluate(middle[None], True)[:3]):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
-    return Arena(name, digest.hexdigest(), land.lower, land.upper, middle, {}, False, known, evaluate)
+    return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)

@@ -20,8 +20,10 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from calibray import optimizers
+from calibray.calibration.search import rounds
 from calibray.comparison.arena import Arena
-from calibray.comparison.runs import Run, Runs
+from calibray.comparison.runs import MethodRun, Runs
 from calibray.comparison.tables import summary
 from calibray.errors import InputError
 from calibray.files import check_folder
@@ -30,20 +32,18 @@ from calibray.progress import Progress
 from calibray.spelling import did_you_mean
 from calibray.tables import glance
 
-LEAST_BUDGET: Final = 24  # below, the pack of SGWO-IM would have no three leaders
-WOLVES: Final = 30  # the paper's population
 CALLS: Final = (30, 60, 225)  # where the excess is tabulated, beside the end
 EXCESSES_DB: Final = (0.05, 0.02, 0.01)  # whose first RT call is tabulated
 ROUNDING_DB: Final = 1e-7  # below which objectives are taken for equal
 OPTIMUM: Final = "optimum"  # the run that finds it, among the runs kept
-REFERENCE: Final = "least-squares"  # the one method that uses derivatives and stops by itself
+REFERENCE: Final = "least-squares"  # which finds it
 OPTIMUM_STARTS: Final = {False: 2048, True: 64}  # its local searches on small and on large path programs
 
 Open = Callable[[], Arena]
 
 
 @dataclass(frozen=True)
-class Entry:
+class Contender:
     """A method in a comparison.
 
     Attributes:
@@ -57,12 +57,12 @@ class Entry:
     budget: int
 
     @property
-    def reference(self) -> bool:
-        """Whether it is least squares, which uses derivatives and stops by itself."""
-        return self.method == REFERENCE
+    def endless(self) -> bool:
+        """Whether the method has no budget to keep to, but stops by itself."""
+        return METHODS[self.method].schedule is None
 
     @staticmethod
-    def parse(name: str, budget: int) -> Entry:
+    def parse(name: str, budget: int) -> Contender:
         """Read a method as it is asked for.
 
         Args:
@@ -70,26 +70,26 @@ class Entry:
             budget: RT calls of those without one.
 
         Returns:
-            The entry.
+            The contender.
 
         Raises:
             InputError: There is no such method, or the budget is no whole number, or too small.
 
         Example:
-            >>> Entry.parse("gwo@600", 225)
-            Entry(name='gwo@600', method='gwo', budget=600)
+            >>> Contender.parse("gwo@600", 225)
+            Contender(name='gwo@600', method='gwo', budget=600)
         """
         method, _, own = name.partition("@")
-        if method not in METHODS:
-            raise InputError(f"method {method!r}: there is no such method; {did_you_mean(method, METHODS)}")
+        schedule = optimizers.method(method).schedule
         if own:
             with suppress(ValueError):
                 budget = int(own)
-        if (own and own != str(budget)) or budget < LEAST_BUDGET:
+        least = 1 if schedule is None else schedule.least
+        if (own and own != str(budget)) or budget < least:
             raise InputError(
-                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number >= {LEAST_BUDGET}"
+                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number >= {least}"
             )
-        return Entry(name, method, budget)
+        return Contender(name, method, budget)
 
     def optimizer(self, arena: Arena, seed: int) -> Optimizer:
         """The optimizer of a run.
@@ -104,32 +104,15 @@ class Entry:
         Raises:
             InputError: The method does not fit the problem, or its library is not installed.
         """
-        options = {**arena.options.get(self.method, {}), **settings(self.method, self.budget)}
-        return METHODS[self.method](arena.lower, arena.upper, seed=seed, **options)
-
-
-def settings(method: str, budget: int) -> dict[str, int]:
-    """Settings with which a method keeps to a budget.
-
-    GWO has the paper's 30 wolves and as many whole iterations as the budget holds. SGWO-IM spends two thirds of it in
-    its 5 full iterations, on 30 wolves at most, and the rest on 5 elites an iteration: at 225 that is the paper's
-    schedule. All others take the budget itself.
-
-    Args:
-        method: A method of `METHODS`.
-        budget: RT calls.
-
-    Returns:
-        Arguments of its class.
-    """
-    if method == "gwo":
-        wolves = min(WOLVES, budget // 2)
-        return {"population": wolves, "iterations": budget // wolves}
-    if method == "sgwo-im":
-        wolves = min(WOLVES, 2 * budget // 15)
-        elites = min(5, wolves)
-        return {"population": wolves, "elites": elites, "iterations": 5 + (budget - 5 * wolves) // elites}
-    return {} if method == REFERENCE else {"budget": budget}
+        return optimizers.make(
+            self.method,
+            arena.lower,
+            arena.upper,
+            seed,
+            budget=self.budget,
+            start=arena.start,
+            starts=arena.starts,
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -138,25 +121,25 @@ class Comparison:
 
     Attributes:
         name: The problem.
-        entries: The methods, in the order asked for.
-        runs: Their runs by entry name, one for each seed.
+        contenders: The methods, in the order asked for.
+        runs: Their runs by contender name, one for each seed.
         optimum: Lowest objective known, [dB].
         found_by: What found it.
     """
 
     name: str
-    entries: tuple[Entry, ...]
-    runs: dict[str, tuple[Run, ...]]
+    contenders: tuple[Contender, ...]
+    runs: dict[str, tuple[MethodRun, ...]]
     optimum: float
     found_by: str
 
     def excess(self, name: str, calls: int) -> np.ndarray:
-        """Excess of an entry's runs after some RT calls.
+        """Excess of an contender's runs after some RT calls.
 
         A run that ended or failed before stays where it was.
 
         Args:
-            name: The entry.
+            name: The contender.
             calls: Number of RT calls.
 
         Returns:
@@ -168,7 +151,7 @@ class Comparison:
         """Quartiles of `excess`.
 
         Args:
-            name: The entry.
+            name: The contender.
             calls: Number of RT calls.
 
         Returns:
@@ -178,10 +161,10 @@ class Comparison:
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> np.ndarray:
-        """RT calls after which an entry's runs were within some excess.
+        """RT calls after which an contender's runs were within some excess.
 
         Args:
-            name: The entry.
+            name: The contender.
             excess_db: The excess [dB].
 
         Returns:
@@ -197,7 +180,7 @@ class Comparison:
             an excess over all runs, empty where half of them or more never had it, and how many had; failed runs;
             median seconds a run.
         """
-        return pd.DataFrame([self._row(entry) for entry in self.entries])
+        return pd.DataFrame([self._row(contender) for contender in self.contenders])
 
     def __repr__(self) -> str:
         return glance.text(*summary(self))
@@ -205,12 +188,12 @@ class Comparison:
     def _repr_html_(self) -> str:
         return glance.html(*summary(self))
 
-    def _row(self, entry: Entry) -> dict[str, Any]:
-        runs = self.runs[entry.name]
+    def _row(self, contender: Contender) -> dict[str, Any]:
+        runs = self.runs[contender.name]
         row: dict[str, Any] = {
-            "method": entry.name,
+            "method": contender.name,
             "uses": "+".join(
-                name for name in ("value", "residuals", "jacobian") if name in METHODS[entry.method].uses
+                name for name in ("value", "residuals", "jacobian") if name in METHODS[contender.method].uses
             ),
             "runs": len(runs),
             "failed": sum(bool(run.failure) for run in runs),
@@ -218,12 +201,12 @@ class Comparison:
         }
         for calls in (*CALLS, None):
             place = "end" if calls is None else str(calls)
-            known = calls is None or entry.reference or calls <= entry.budget
-            excess = self.excess(entry.name, 2**62 if calls is None else calls)
+            known = calls is None or contender.endless or calls <= contender.budget
+            excess = self.excess(contender.name, 2**62 if calls is None else calls)
             for label, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
                 row[f"{label}_excess_db_{place}"] = quantile(excess, share) if known else np.nan
         for level in EXCESSES_DB:
-            calls_to = self.calls_to(entry.name, level)
+            calls_to = self.calls_to(contender.name, level)
             middle = quantile(calls_to, 0.5)
             row[f"calls_to_{level:g}_db"] = middle if np.isfinite(middle) else np.nan
             row[f"reached_{level:g}_db"] = int(np.isfinite(calls_to).sum())
@@ -235,7 +218,7 @@ class Comparison:
         """Runs that ended in an error.
 
         Returns:
-            Entry, seed and message of each.
+            Contender, seed and message of each.
         """
         return [
             (name, run.seed, run.failure) for name, runs in self.runs.items() for run in runs if run.failure
@@ -294,7 +277,7 @@ def compare(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
+    """MethodRun methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
     Every finished run is appended to `runs.jsonl` in `out` at once; what is found there of the same problem, code of
     the optimizers, method, budget and seed is not run again.
@@ -317,15 +300,15 @@ def compare(
     for name, value in (("seeds", seeds), ("workers", workers)):
         if value < 1:
             raise InputError(f"{name} = {value}; it must be at least 1")
-    entries = tuple(Entry.parse(name, budget) for name in dict.fromkeys(methods))
-    if not entries:
+    contenders = tuple(Contender.parse(name, budget) for name in dict.fromkeys(methods))
+    if not contenders:
         raise InputError(f"methods: none is named; {did_you_mean('', METHODS)}")
     check_folder(out)
     arena = open_arena()
-    for entry in entries:
-        entry.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
+    for contender in contenders:
+        contender.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
     store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{_code()}")
-    tasks = [(entry, seed) for seed in range(seeds) for entry in entries]
+    tasks = [(contender, seed) for seed in range(seeds) for contender in contenders]
     missing = [task for task in tasks if store.find(*_key(*task)) is None]
     done = len(tasks) - len(missing)
     for run in _finished(open_arena, arena, missing, workers):
@@ -336,35 +319,35 @@ def compare(
     best = store.find(OPTIMUM, 0, 0)
     if best is None:
         best = store.add(_optimum(arena))
-    runs = {entry.name: tuple(store.find(*_key(entry, seed)) for seed in range(seeds)) for entry in entries}
-    return Comparison(arena.name, entries, runs, *_lowest(arena.minimum, best, runs))
+    runs = {
+        contender.name: tuple(store.find(*_key(contender, seed)) for seed in range(seeds))
+        for contender in contenders
+    }
+    return Comparison(arena.name, contenders, runs, *_lowest(arena.minimum, best, runs))
 
 
-def run_entry(arena: Arena, entry: Entry, seed: int) -> Run:
+def run_contender(arena: Arena, contender: Contender, seed: int) -> MethodRun:
     """One run of a method.
 
     Args:
         arena: The problem.
-        entry: The method.
+        contender: The method.
         seed: Its seed.
 
     Returns:
         The run; a method or an engine that raised ends it there, with the message kept.
     """
-    return _recorded(arena, _key(entry, seed), lambda: entry.optimizer(arena, seed))
+    return _recorded(arena, _key(contender, seed), lambda: contender.optimizer(arena, seed))
 
 
-def _recorded(arena: Arena, key: tuple[str, int, int], make: Callable[[], Optimizer]) -> Run:
+def _recorded(arena: Arena, key: tuple[str, int, int], make: Callable[[], Optimizer]) -> MethodRun:
     calls: list[int] = []
     best: list[float] = []
     evaluations, failure, started = 0, "", time.perf_counter()
     try:
         optimizer = make()
-        while not optimizer.done:
-            points = optimizer.ask()
-            told = arena.evaluate(points, "jacobian" in optimizer.uses)
-            optimizer.tell(points, *told)
-            for value in told[0].tolist():
+        for _, told in rounds(optimizer, arena.evaluate):
+            for value in told.value.tolist():
                 evaluations += 1
                 if value < (best[-1] if best else np.inf):
                     calls.append(evaluations)
@@ -372,24 +355,24 @@ def _recorded(arena: Arena, key: tuple[str, int, int], make: Callable[[], Optimi
     except Exception as error:  # a run that fails is a finding about its method
         failure = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - started
-    return Run(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
+    return MethodRun(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
 
 
-def _key(entry: Entry, seed: int) -> tuple[str, int, int]:
-    return entry.method, entry.budget, seed
+def _key(contender: Contender, seed: int) -> tuple[str, int, int]:
+    return contender.method, contender.budget, seed
 
 
-def _optimum(arena: Arena) -> Run:
+def _optimum(arena: Arena) -> MethodRun:
     """Least squares from so many starts that its answer passes for the global optimum."""
     starts = OPTIMUM_STARTS[arena.large]
 
     def make() -> Optimizer:
-        return METHODS[REFERENCE](arena.lower, arena.upper, seed=2**31, starts=starts, x0=arena.start)
+        return optimizers.make(REFERENCE, arena.lower, arena.upper, 2**31, start=arena.start, starts=starts)
 
     return _recorded(arena, (OPTIMUM, 0, 0), make)
 
 
-def _lowest(known: float, best: Run, runs: dict[str, tuple[Run, ...]]) -> tuple[float, str]:
+def _lowest(known: float, best: MethodRun, runs: dict[str, tuple[MethodRun, ...]]) -> tuple[float, str]:
     """The lowest objective of all searches, and the first of them that came there within rounding."""
     found = [(best.at(best.evaluations), "many-start least squares"), (known, "earlier searches")]
     found += [
@@ -399,15 +382,17 @@ def _lowest(known: float, best: Run, runs: dict[str, tuple[Run, ...]]) -> tuple[
     return optimum, next(by for objective, by in found if objective <= optimum + ROUNDING_DB)
 
 
-def _finished(open_arena: Open, arena: Arena, tasks: list[tuple[Entry, int]], workers: int) -> Iterator[Run]:
+def _finished(
+    open_arena: Open, arena: Arena, tasks: list[tuple[Contender, int]], workers: int
+) -> Iterator[MethodRun]:
     """The runs, as they finish."""
     if workers == 1 or len(tasks) < 2:
-        yield from (run_entry(arena, entry, seed) for entry, seed in tasks)
+        yield from (run_contender(arena, contender, seed) for contender, seed in tasks)
         return
     with ProcessPoolExecutor(
         min(workers, len(tasks)), mp_context=get_context("spawn"), initializer=_start, initargs=(open_arena,)
     ) as pool:
-        futures = [pool.submit(_work, entry, seed) for entry, seed in tasks]
+        futures = [pool.submit(_work, contender, seed) for contender, seed in tasks]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -420,14 +405,14 @@ def _start(open_arena: Open) -> None:
     _opened = open_arena()
 
 
-def _work(entry: Entry, seed: int) -> Run:
-    return run_entry(_opened, entry, seed)
+def _work(contender: Contender, seed: int) -> MethodRun:
+    return run_contender(_opened, contender, seed)
 
 
 @cache
 def _code() -> str:
     """Fingerprint of the optimizers' code: a run of other code says nothing about this one."""
     digest = hashlib.sha256()
-    for path in sorted((Path(__file__).parent / "optimizers").glob("*.py")):
+    for path in sorted(Path(optimizers.__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -11,7 +11,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Run:
+class MethodRun:
     """One run of a method.
 
     Attributes:
@@ -71,7 +71,7 @@ class Runs:
 
     def __init__(self, path: Path, problem: str) -> None:
         self._path, self._problem = path, problem
-        self._runs: dict[tuple[str, int, int], Run] = {}
+        self._runs: dict[tuple[str, int, int], MethodRun] = {}
         text = path.read_text(encoding="utf-8") if path.exists() else ""
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
@@ -80,10 +80,10 @@ class Runs:
             except ValueError:  # the line that a killed process was writing
                 continue
             if record.pop("problem") == problem:
-                run = Run(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
+                run = MethodRun(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
                 self._runs[run.method, run.budget, run.seed] = run
 
-    def find(self, method: str, budget: int, seed: int) -> Run | None:
+    def find(self, method: str, budget: int, seed: int) -> MethodRun | None:
         """A run that was finished before.
 
         Args:
@@ -96,7 +96,7 @@ class Runs:
         """
         return self._runs.get((method, budget, seed))
 
-    def add(self, run: Run) -> Run:
+    def add(self, run: MethodRun) -> MethodRun:
         """Keep a run.
 
         Args:

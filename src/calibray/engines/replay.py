@@ -136,7 +136,7 @@ class Replay:
         self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
         self._program = self._laid_out()
 
-    def _laid_out(self) -> fields.Program:
+    def _laid_out(self) -> fields.GroupedProgram:
         phases = self._combining != "power"
         program = fields.layout(self.paths, self._dtype, self._intervals, phases).program
         if self._intervals is None or self._forced:

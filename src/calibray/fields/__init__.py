@@ -23,12 +23,12 @@ from calibray.fields.evaluation import (  # noqa: E402
     path_powers,
     program_path_loss,
 )
-from calibray.fields.program import Layout, Program, constants, layout  # noqa: E402
+from calibray.fields.program import GroupedProgram, Layout, constants, layout  # noqa: E402
 
 __all__ = [
     "COMBINING",
+    "GroupedProgram",
     "Layout",
-    "Program",
     "band_quadrature",
     "check_combining",
     "constants",

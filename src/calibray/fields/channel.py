@@ -16,7 +16,7 @@ import numpy as np
 
 from calibray import fields
 from calibray.errors import InputError
-from calibray.fields import Program, path_powers
+from calibray.fields import GroupedProgram, path_powers
 from calibray.materials import Material
 from calibray.paths import Paths
 
@@ -66,13 +66,13 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
 
 @jax.jit
 def _statistics(
-    program: Program, table: jax.Array, departure: jax.Array, arrival: jax.Array
+    program: GroupedProgram, table: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
     return statistics(program, path_powers(program, table), departure, arrival)
 
 
 def statistics(
-    program: Program, power: jax.Array, departure: jax.Array, arrival: jax.Array
+    program: GroupedProgram, power: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
     """Statistics of every link from its paths' powers.
 
@@ -136,7 +136,7 @@ def power_delay_profile(
     return np.asarray(delay_profile(program, power, jnp.asarray(edges)))
 
 
-def delay_profile(program: Program, power: jax.Array, edges: jax.Array) -> jax.Array:
+def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -> jax.Array:
     """Power of every link by delay, from its paths' powers.
 
     Args:

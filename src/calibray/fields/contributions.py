@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from calibray.fields import slab, tabulation
-from calibray.fields.program import Formula, Program
+from calibray.fields.program import Formula, GroupedProgram
 from calibray.fields.scattering import pattern_value
 from calibray.materials import FIELDS
 
@@ -43,7 +43,7 @@ class Contributions:
     crossed: jax.Array
 
 
-def contributions(program: Program, table: jax.Array) -> Contributions:
+def contributions(program: GroupedProgram, table: jax.Array) -> Contributions:
     """What the materials contribute.
 
     Args:
@@ -77,7 +77,7 @@ def contributions(program: Program, table: jax.Array) -> Contributions:
 
 
 def tangents(
-    program: Program, table: jax.Array, columns: tuple[int, ...]
+    program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
 ) -> tuple[Contributions, tuple[Contributions, ...]]:
     """What the materials contribute, and its derivatives by each interaction's own material.
 
@@ -93,7 +93,7 @@ def tangents(
     return found, tuple(push(jnp.zeros_like(table).at[:, column].set(1.0)) for column in columns)
 
 
-def pieces(program: Program, found: Contributions) -> tuple[Pieces, ...]:
+def pieces(program: GroupedProgram, found: Contributions) -> tuple[Pieces, ...]:
     """The contributions cut into what each position of each group takes, in the order of the program.
 
     Derivatives are taken by these pieces: by the flat arrays, every piece would cost a pass over all of them.
@@ -119,7 +119,7 @@ def pieces(program: Program, found: Contributions) -> tuple[Pieces, ...]:
     return tuple(cut)
 
 
-def _coefficients(program: Program, found: Contributions) -> Iterator[tuple[slab.Pair, slab.Pair]]:
+def _coefficients(program: GroupedProgram, found: Contributions) -> Iterator[tuple[slab.Pair, slab.Pair]]:
     """The coefficients of one position after the other."""
     if isinstance(found.coefficients, tabulation.Nodes):
         lookup = program.coefficients

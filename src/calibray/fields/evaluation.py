@@ -18,7 +18,7 @@ from scipy.constants import speed_of_light
 from calibray.fields import slab, tabulation
 from calibray.fields.combining import check_combining, decibel, link_power, path_power
 from calibray.fields.contributions import Contributions, Pieces, contributions, pieces, tangents
-from calibray.fields.program import Formula, Program, constants, layout
+from calibray.fields.program import Formula, GroupedProgram, constants, layout
 from calibray.fields.propagation import path_fields
 from calibray.fields.segments import total
 from calibray.materials import Material
@@ -73,7 +73,7 @@ def path_loss(
 
 
 def program_path_loss(
-    program: Program, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+    program: GroupedProgram, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
 ) -> jax.Array:
     """Path loss of every link of a program, as one pure function.
 
@@ -90,7 +90,7 @@ def program_path_loss(
     return decibel(_power(program, pieces(program, found), combining, offsets))
 
 
-def path_powers(program: Program, table: jax.Array) -> jax.Array:
+def path_powers(program: GroupedProgram, table: jax.Array) -> jax.Array:
     """Power gain of every path, summed over receive ports and averaged over transmit ports.
 
     Args:
@@ -104,7 +104,7 @@ def path_powers(program: Program, table: jax.Array) -> jax.Array:
 
 
 def path_losses(
-    program: Program, tables: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+    program: GroupedProgram, tables: jax.Array, combining: str = "power", offsets: jax.Array | None = None
 ) -> tuple[jax.Array, float]:
     """Path loss of every link for a batch of candidates.
 
@@ -132,7 +132,7 @@ def path_losses(
 
 
 def path_losses_and_slopes(
-    program: Program,
+    program: GroupedProgram,
     tables: jax.Array,
     columns: tuple[int, ...],
     combining: str = "power",
@@ -166,7 +166,11 @@ def path_losses_and_slopes(
 
 
 def _power(
-    program: Program, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None, keep: bool = False
+    program: GroupedProgram,
+    found: tuple[Pieces, ...],
+    combining: str,
+    offsets: jax.Array | None,
+    keep: bool = False,
 ) -> jax.Array:
     """Power gain of every link [L]; `keep` holds the field after every interaction, for a reverse pass."""
     held = partial(slab.keep, positive=program.wavelength)
@@ -178,7 +182,7 @@ def _power(
 
 
 def _slope(
-    program: Program, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None
 ) -> tuple[jax.Array, tuple[Pieces, ...]]:
     """Power gain of every link, and its derivative by every piece.
 
@@ -190,7 +194,7 @@ def _slope(
 
 
 def _contract(
-    program: Program,
+    program: GroupedProgram,
     power: jax.Array,
     slope: tuple[Pieces, ...],
     rates: tuple[Contributions, ...],
@@ -239,33 +243,33 @@ _decibel_slope = jax.jit(_contract, static_argnums=4)
 
 
 @jax.jit
-def _table_error(program: Program, found: Contributions) -> jax.Array:
+def _table_error(program: GroupedProgram, found: Contributions) -> jax.Array:
     return tabulation.table_error(found.coefficients, program.coefficients)
 
 
 @partial(jax.jit, static_argnums=2)
 def _link_power(
-    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
 ) -> jax.Array:
     return _power(program, pieces(program, found), combining, offsets)
 
 
 @partial(jax.jit, static_argnums=2)
 def _link_powers(
-    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
 ) -> jax.Array:
     return jax.vmap(lambda one: _power(program, pieces(program, one), combining, offsets))(found)
 
 
 @partial(jax.jit, static_argnums=2)
 def _powers_and_slopes(
-    program: Program, found: Contributions, combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
 ) -> tuple[jax.Array, tuple[Pieces, ...]]:
     return jax.vmap(lambda one: _slope(program, pieces(program, one), combining, offsets))(found)
 
 
 @partial(jax.jit, static_argnums=4)
 def _decibel_slopes(
-    program: Program, power: jax.Array, slope: tuple[Pieces, ...], rates: tuple, num_materials: int
+    program: GroupedProgram, power: jax.Array, slope: tuple[Pieces, ...], rates: tuple, num_materials: int
 ) -> jax.Array:
     return jax.vmap(lambda *one: _contract(program, *one, num_materials))(power, slope, rates)

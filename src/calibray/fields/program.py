@@ -95,7 +95,7 @@ class Formula:
     meta_fields=["patterns"],
 )
 @dataclass(frozen=True)
-class Program:
+class GroupedProgram:
     """A path program laid out for evaluation: P paths, J coefficients, D diffuse interactions, M materials.
 
     Attributes:
@@ -148,7 +148,7 @@ class Layout:
         order: Path of the path program at each place [P].
     """
 
-    program: Program
+    program: GroupedProgram
     order: np.ndarray
 
 
@@ -182,7 +182,7 @@ def layout(
     rows, (interaction, cosine) = flat.scattered(), flat.coefficients()
     segment = np.repeat(paths.link, depth).astype(np.int64) * len(paths.materials) + paths.material
     count = paths.num_links * len(paths.materials)
-    program = Program(
+    program = GroupedProgram(
         groups=groups,
         by_link=make_segments(paths.link[order], paths.num_links),
         link=jnp.asarray(paths.link[order]) if phases else None,

@@ -14,13 +14,15 @@ import jax.numpy as jnp
 
 from calibray.fields import slab
 from calibray.fields.contributions import Pieces
-from calibray.fields.program import Group, Program
+from calibray.fields.program import Group, GroupedProgram
 
 Fields = tuple[slab.Pair, slab.Pair]
 
 
 def path_fields(
-    program: Program, pieces: tuple[Pieces, ...], keep: Callable[[Fields], Fields] = lambda field: field
+    program: GroupedProgram,
+    pieces: tuple[Pieces, ...],
+    keep: Callable[[Fields], Fields] = lambda field: field,
 ) -> slab.Pair:
     """Gains of all paths.
 

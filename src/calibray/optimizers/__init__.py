@@ -1,7 +1,8 @@
 """Ask/tell optimizers over a box: NumPy arrays in and out, seeded, and ignorant of radio.
 
-Every class is an `Optimizer`; `METHODS` lists them by the names that a study file uses. A library that is not
-installed is only missed when its class is constructed.
+Every class is an `Optimizer`, and declares what it uses, how it keeps to a budget and whether it takes starting points;
+`METHODS` lists them by the names that a study file uses, and `make` makes one. A library that is not installed is only
+missed when its class is constructed.
 """
 
 from calibray.optimizers.archive import Best
@@ -11,24 +12,11 @@ from calibray.optimizers.differential_evolution import DifferentialEvolution
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
+from calibray.optimizers.methods import METHODS, make, method
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.sgwoim import SGWOIM
 from calibray.optimizers.vector_surrogate import VectorSurrogate
-
-METHODS: dict[str, type[Optimizer]] = {
-    "gwo": GWO,
-    "sgwo-im": SGWOIM,
-    "vector-surrogate": VectorSurrogate,
-    "least-squares": LeastSquares,
-    "cma-es": CMAES,
-    "differential-evolution": DifferentialEvolution,
-    "dfo-ls": DFOLS,
-    "gaussian-process": GaussianProcess,
-    "random": RandomSearch,
-    "latin-hypercube": LatinHypercube,
-    "sobol": Sobol,
-}
 
 __all__ = [
     "CMAES",
@@ -45,4 +33,6 @@ __all__ = [
     "RandomSearch",
     "Sobol",
     "VectorSurrogate",
+    "make",
+    "method",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.optimizers.box import Box
 
+Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""The value [n] that belongs to residuals [n, m]; it rises with their mean square."""
+
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest relative difference of an objective from the root mean square of its residuals (float32
-engines)."""
+"""Largest relative difference of a value from the one that belongs to its residuals (float32 engines)."""
 
 DECIMALS = 9
 """Decimals of unit coordinates that agree in points taken for one."""
@@ -24,7 +27,7 @@ class Best:
 
     Attributes:
         x: The point [d].
-        y: Its objective; +inf when every evaluation failed.
+        y: Its value; +inf when every evaluation failed.
     """
 
     x: NDArray[np.float64]
@@ -37,8 +40,8 @@ class Evaluations:
 
     Attributes:
         x: Points [n, d].
-        y: Objective [n], +inf where an evaluation failed.
-        residuals: Weighted residuals [n, m], so that y = sqrt(mean(residuals**2)), or None.
+        y: Value [n], +inf where an evaluation failed.
+        residuals: Residuals [n, m], whose mean square rises and falls with y, or None.
         jacobian: Derivatives of the residuals by the parameters [n, m, d], or None.
     """
 
@@ -86,7 +89,7 @@ class Archive:
     def __init__(self, box: Box) -> None:
         self.box = box
         self._parts: list[Evaluations] = []
-        self._best: Best | None = None
+        self._leading: Evaluations | None = None
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
@@ -98,20 +101,29 @@ class Archive:
             told: Checked evaluations. Their Jacobians are not kept.
         """
         self._parts.append(Evaluations(told.x, told.y, told.residuals))
-        first = int(np.argmin(told.y))
-        if self._best is None or told.y[first] < self._best.y:
-            self._best = Best(read_only(told.x[first].copy()), float(told.y[first]))
+        lowest = self._parts[-1].rows(np.argmin(told.y, keepdims=True))
+        if self._leading is None or lowest.y[0] < self._leading.y[0]:
+            self._leading = lowest
 
     @property
     def best(self) -> Best:
-        """The first evaluation with the lowest objective.
+        """The point and value of `leading`.
 
         Raises:
             InputError: Nothing has been told yet.
         """
-        if self._best is None:
+        return Best(read_only(self.leading.x[0]), float(self.leading.y[0]))
+
+    @property
+    def leading(self) -> Evaluations:
+        """The first evaluation with the lowest value, alone.
+
+        Raises:
+            InputError: Nothing has been told yet.
+        """
+        if self._leading is None:
             raise InputError("no best point: 0 evaluations told, at least 1 is needed; call tell() first")
-        return self._best
+        return self._leading
 
     def all(self) -> Evaluations:
         """Every evaluation so far, without Jacobians.
@@ -173,28 +185,30 @@ def checked_evaluations(
     residuals: ArrayLike | None,
     jacobian: ArrayLike | None,
     uses: frozenset[str],
+    objective: Objective | None = None,
 ) -> Evaluations:
     """Validate and copy what was told.
 
     Args:
         box: The box searched.
         x: Points [n, d].
-        y: Objective [n]; +inf is a failed evaluation, whose residuals and derivatives may be anything.
-        residuals: Weighted residuals [n, m], or None.
+        y: Value [n]; +inf is a failed evaluation, whose residuals and derivatives may be anything.
+        residuals: Residuals [n, m], or None.
         jacobian: Derivatives of the residuals [n, m, d], or None.
         uses: What the optimizer uses; the rest is checked and left out.
+        objective: The value that belongs to residuals; not checked if None.
 
     Returns:
         The evaluations with exactly the information used.
 
     Raises:
         InputError: A shape is wrong, a number is not finite, a point lies outside the box, something that the
-            optimizer uses is missing, or an objective is not the root mean square of its residuals.
+            optimizer uses is missing, or a value does not belong to its residuals.
     """
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
     if len(points) != len(values) or len(values) == 0:
         raise InputError(
-            f"x has {len(points)} rows, y {len(values)}; tell one objective for each of n >= 1 points"
+            f"x has {len(points)} rows, y {len(values)}; tell one value for each of n >= 1 points"
         )
     _finite("x", points)
     for row, column in np.argwhere((points < box.lower) | (points > box.upper)):
@@ -213,7 +227,10 @@ def checked_evaluations(
     slopes = None
     if errors is not None:
         _finite("residuals", errors, good)
-        _check_objective(values, errors, good)
+        if errors.shape[1] == 0:
+            raise InputError("residuals has 0 columns; at least 1 link is needed")
+        if objective is not None:
+            _check_value(values, errors, good, objective)
     if jacobian is not None:
         links = None if errors is None else errors.shape[1]
         slopes = _array("jacobian", jacobian, (len(values), links, box.dimension))
@@ -221,6 +238,45 @@ def checked_evaluations(
     return Evaluations(
         points, values, errors if "residuals" in uses else None, slopes if "jacobian" in uses else None
     )
+
+
+def check_order(told: Evaluations, archive: Archive) -> None:
+    """Check that a lower value comes with a lower mean square, within what is told and against the best before.
+
+    Args:
+        told: Checked evaluations with residuals.
+        archive: Those before.
+
+    Raises:
+        InputError: An evaluation has a lower value than another and yet a higher mean square.
+    """
+    if len(archive):
+        told = Evaluations.joined([archive.leading, Evaluations(told.x, told.y, told.residuals)])
+    told = told.rows(np.flatnonzero(np.isfinite(told.y)))
+    size = root_mean_square(told.residuals)
+    order = np.argsort(size, kind="stable")
+    value, size = told.y[order], size[order]
+    highest = np.maximum.accumulate(value)
+    slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
+    for row in np.flatnonzero(highest > value + slack):
+        before = int(np.argmax(value[:row]))
+        if size[row] > (1.0 + OBJECTIVE_TOLERANCE) * size[before] + 1e-9:
+            raise InputError(
+                f"y = {value[row]:g} where sqrt(mean(residuals**2)) = {size[row]:g}, but y = {value[before]:g} "
+                f"where it is {size[before]:g}; the mean square must rise with the value: tell deviance residuals"
+            )
+
+
+def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The value that belongs to residuals unless an optimizer is told otherwise.
+
+    Args:
+        residuals: Residuals [n, m].
+
+    Returns:
+        Their root mean square [n].
+    """
+    return np.sqrt(np.mean(residuals**2, axis=1))
 
 
 def merged(
@@ -276,14 +332,22 @@ def _finite(name: str, array: NDArray[np.float64], rows: NDArray[np.bool_] | Non
         )
 
 
-def _check_objective(
-    values: NDArray[np.float64], residuals: NDArray[np.float64], good: NDArray[np.bool_]
+def _check_value(
+    values: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    good: NDArray[np.bool_],
+    objective: Objective,
 ) -> None:
-    if residuals.shape[1] == 0:
-        raise InputError("residuals has 0 columns; at least 1 link is needed")
-    formed = np.sqrt(np.mean(np.where(good[:, None], residuals, 0.0) ** 2, axis=1))
-    for row in np.flatnonzero(good & (np.abs(values - formed) > OBJECTIVE_TOLERANCE * formed + 1e-9)):
+    formed = np.where(good, objective(np.where(good[:, None], residuals, 0.0)), 0.0)
+    usual = objective is root_mean_square
+    name, remedy = (
+        ("sqrt(mean(residuals[{}]**2))", "put the weights into the residuals")
+        if usual
+        else ("objective(residuals[{}])", "tell the value that belongs to the residuals")
+    )
+    slack = OBJECTIVE_TOLERANCE * np.abs(formed) + 1e-9
+    for row in np.flatnonzero(good & ~(np.abs(np.where(good, values, 0.0) - formed) <= slack)):
         raise InputError(
-            f"y[{row}] = {values[row]:g}, but sqrt(mean(residuals[{row}]**2)) = {formed[row]:g}; they must "
-            f"agree within {OBJECTIVE_TOLERANCE:g}: put the weights into the residuals"
+            f"y[{row}] = {values[row]:g}, but {name.format(row)} = {formed[row]:g}; they must agree within "
+            f"{OBJECTIVE_TOLERANCE:g}: {remedy}"
         )

@@ -17,6 +17,7 @@ from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.inversion import library, limited
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 STEP = 0.3  # of the unit cube, initial standard deviation
@@ -38,6 +39,8 @@ class CMAES(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -16,11 +16,12 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.archive import Archive
+from calibray.optimizers.archive import Archive, Objective, root_mean_square
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.inversion import Evaluate, inverted, library, limited
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 
@@ -35,12 +36,16 @@ class DFOLS(Optimizer):
         budget: Number of evaluations.
         radius: First trust region, as a share of the box.
         tolerance: Trust region at which a start has converged, as a share of the box.
+        objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
+            must rise with their mean square, which is what is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -51,6 +56,7 @@ class DFOLS(Optimizer):
         budget: int = 225,
         radius: float = 0.2,
         tolerance: float = 1e-4,
+        objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
         self._budget = whole("budget", budget, at_least=1)
@@ -58,7 +64,7 @@ class DFOLS(Optimizer):
         self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._dfols = library("dfols", "DFO-LS")
-        self._session = Session(self.box, self.uses, self._search)
+        self._session = Session(self.box, self.uses, self._search, objective)
 
     @property
     def budget(self) -> int:

@@ -18,6 +18,7 @@ from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.inversion import Evaluate, inverted, limited
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 
@@ -46,6 +47,8 @@ class DifferentialEvolution(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225, population: int = 5

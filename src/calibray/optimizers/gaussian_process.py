@@ -23,6 +23,7 @@ from calibray.optimizers.box import Box
 from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 300  # drawn over the box, and as many around the best points
@@ -60,6 +61,8 @@ class GaussianProcess(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,

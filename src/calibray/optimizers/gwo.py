@@ -28,9 +28,17 @@ from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
-LEADERS = 3  # alpha, beta, delta
+# Alpha, beta, delta.
+LEADERS = 3
+
+# The paper's population (table II).
+WOLVES = 30
+
+# Below, a pack would have no three leaders.
+LEAST_BUDGET = 24
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
@@ -74,6 +82,23 @@ def encircle(
     return (guide - a_coefficient * distance).mean(axis=1) + origin  # eqs. 3.6, 3.7
 
 
+def whole_iterations(budget: int) -> dict[str, int]:
+    """The settings of GWO that keep to a budget: 30 wolves, and as many whole iterations as it holds.
+
+    Args:
+        budget: Number of evaluations.
+
+    Returns:
+        Population and iterations; fewer wolves where the budget holds no two iterations of all.
+
+    Example:
+        >>> whole_iterations(600), whole_iterations(45)
+        ({'population': 30, 'iterations': 20}, {'population': 22, 'iterations': 2})
+    """
+    wolves = min(WOLVES, budget // 2)
+    return {"population": wolves, "iterations": budget // wolves}
+
+
 @final
 class GWO(Optimizer):
     """Grey Wolf Optimizer. Uses the value alone; 600 evaluations at the paper's settings.
@@ -100,6 +125,8 @@ class GWO(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = Schedule(whole_iterations, LEAST_BUDGET)
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -107,7 +134,7 @@ class GWO(Optimizer):
         upper: ArrayLike,
         *,
         seed: int = 0,
-        population: int = 30,
+        population: int = WOLVES,
         iterations: int = 20,
         centred: bool = False,
     ) -> None:

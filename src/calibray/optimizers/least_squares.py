@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive
+from calibray.optimizers.archive import Archive, Objective, root_mean_square
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import descend
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import design
+from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0  # predicted decreases that a search may lie behind the best one before it is given up
@@ -41,6 +42,8 @@ class LeastSquares(Optimizer):
         iterations: Largest number of steps of each search.
         tolerance: A search has converged when its model predicts less than this relative decrease of the mean
             square, or a step shorter than this in the unit cube.
+        objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
+            must rise with their mean square, which is what is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.
@@ -57,6 +60,8 @@ class LeastSquares(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals", "jacobian"})
+    schedule: ClassVar[Schedule | None] = None
+    takes_starts: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -68,6 +73,7 @@ class LeastSquares(Optimizer):
         x0: ArrayLike | None = None,
         iterations: int = 100,
         tolerance: float = 1e-10,
+        objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
         self.starts = whole("starts", starts, at_least=1)
@@ -75,7 +81,7 @@ class LeastSquares(Optimizer):
         self.tolerance = real("tolerance", tolerance, at_least=0.0, at_most=1.0)
         self.x0 = _user_starts(x0, self.box)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
-        self._session = Session(self.box, self.uses, self._search)
+        self._session = Session(self.box, self.uses, self._search, objective)
 
     @property
     def budget(self) -> None:

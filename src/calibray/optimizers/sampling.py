@@ -15,6 +15,7 @@ from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 
@@ -80,6 +81,8 @@ class Sampling(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
     kind: ClassVar[str]
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike, *, seed: int = 0, budget: int = 225) -> None:

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive, Best, Evaluations, checked_evaluations
+from calibray.optimizers.archive import (
+    Archive,
+    Best,
+    Evaluations,
+    Objective,
+    check_order,
+    checked_evaluations,
+    root_mean_square,
+)
 from calibray.optimizers.box import Box
 
 Search = Generator[NDArray[np.float64], Evaluations, None]
@@ -27,11 +35,18 @@ class Session:
         box: The box searched.
         uses: What the algorithm uses of an evaluation: "value", "residuals", "jacobian".
         search: Starts the algorithm on the archive; nothing of it runs before the first `ask`.
+        objective: The value that belongs to residuals, where they are used.
     """
 
-    def __init__(self, box: Box, uses: frozenset[str], search: Callable[[Archive], Search]) -> None:
+    def __init__(
+        self,
+        box: Box,
+        uses: frozenset[str],
+        search: Callable[[Archive], Search],
+        objective: Objective | None = None,
+    ) -> None:
         self.archive = Archive(box)
-        self._uses = uses
+        self._uses, self._objective = uses, objective
         self._search = search(self.archive)
         self._asked: NDArray[np.float64] | None = None
         self._answers: list[Evaluations | None] = []
@@ -76,20 +91,22 @@ class Session:
 
         Args:
             x: Points [n, d].
-            y: Objective [n], +inf for a failed evaluation.
-            residuals: Weighted residuals [n, m].
+            y: Value [n], +inf for a failed evaluation.
+            residuals: Residuals [n, m].
             jacobian: Derivatives of the residuals [n, m, d].
 
         Raises:
             InputError: What is told is malformed; nothing of it is kept.
         """
-        told = checked_evaluations(self.archive.box, x, y, residuals, jacobian, self._uses)
+        told = checked_evaluations(self.archive.box, x, y, residuals, jacobian, self._uses, self._objective)
         if told.residuals is not None:
             links = told.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
                     f"residuals have {links} columns, earlier ones {self._links}; tell the same links"
                 )
+            if self._objective is not root_mean_square:
+                check_order(told, self.archive)
             self._links = links
         self.archive.add(told)
         if self._asked is None:

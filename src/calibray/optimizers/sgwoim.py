@@ -31,8 +31,9 @@ from calibray.errors import InputError
 from calibray.optimizers.archive import Archive, Evaluations, read_only
 from calibray.optimizers.arguments import choice, real, whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.gwo import LEADERS, encircle, linear_decay
+from calibray.optimizers.gwo import LEADERS, LEAST_BUDGET, WOLVES, encircle, linear_decay
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.screening import KERNELS, predict
 from calibray.optimizers.session import Search, Session
 
@@ -66,6 +67,30 @@ def memory_weight(iteration: int, iterations: int, w_min: float, w_max: float) -
 
 
 CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
+
+# Table II: iterations that evaluate all wolves, and wolves evaluated in each one after.
+FULL_ITERATIONS, ELITES = 5, 5
+
+
+def screened_iterations(budget: int) -> dict[str, int]:
+    """The settings of SGWO-IM that keep to a budget: the paper's schedule at 225, and alike at any other.
+
+    Two thirds are spent in 5 full iterations, on 30 wolves at most, and the rest on 5 elites an iteration.
+
+    Args:
+        budget: Number of evaluations.
+
+    Returns:
+        Population, elites and iterations.
+
+    Example:
+        >>> screened_iterations(225)
+        {'population': 30, 'elites': 5, 'iterations': 20}
+    """
+    wolves = min(WOLVES, 2 * budget // (3 * FULL_ITERATIONS))
+    elites = min(ELITES, wolves)
+    rest = budget - FULL_ITERATIONS * wolves
+    return {"population": wolves, "elites": elites, "iterations": FULL_ITERATIONS + rest // elites}
 
 
 @final
@@ -101,6 +126,8 @@ class SGWOIM(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})
+    schedule: ClassVar[Schedule | None] = Schedule(screened_iterations, LEAST_BUDGET)
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -108,10 +135,10 @@ class SGWOIM(Optimizer):
         upper: ArrayLike,
         *,
         seed: int = 0,
-        population: int = 30,
+        population: int = WOLVES,
         iterations: int = 20,
-        full_iterations: int = 5,
-        elites: int = 5,
+        full_iterations: int = FULL_ITERATIONS,
+        elites: int = ELITES,
         w_min: float = 0.1,
         w_max: float = 0.3,
         convergence: str = "cosine",

@@ -36,13 +36,14 @@ from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive, merged
+from calibray.optimizers.archive import Archive, Objective, merged, root_mean_square
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import descend
 from calibray.optimizers.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
+from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 600  # drawn over the box, and as many around the best points
@@ -68,8 +69,10 @@ class VectorSurrogate(Optimizer):
         batch: Candidates asked for at once after the initial design, for engines that run in parallel.
         logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
-        tolerance: Stop before the budget is used when the predicted gain stays below this, in the objective's
-            unit; never if None.
+        tolerance: Stop before the budget is used when the predicted gain stays below this, in the unit of the
+            residuals' root mean square; never if None.
+        objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
+            must rise with their mean square, which is what is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.
@@ -86,6 +89,8 @@ class VectorSurrogate(Optimizer):
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -99,6 +104,7 @@ class VectorSurrogate(Optimizer):
         logarithmic: ArrayLike = False,
         noisy: bool = False,
         tolerance: float | None = None,
+        objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
         d = self.box.dimension
@@ -111,7 +117,7 @@ class VectorSurrogate(Optimizer):
         self._seen = Box.between(*(self._seen_by_model(x) for x in (self.box.lower, self.box.upper)))
         self._model: Kriging | None = None
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
-        self._session = Session(self.box, self.uses, self._search)
+        self._session = Session(self.box, self.uses, self._search, objective)
 
     @property
     def budget(self) -> int:
@@ -126,8 +132,7 @@ class VectorSurrogate(Optimizer):
         """
         if self._model is None:
             return None
-        y = np.sqrt(np.mean(self._model.residuals**2, axis=1))
-        predicted = np.sqrt(np.mean(self._model.left_out() ** 2, axis=1))
+        y, predicted = (root_mean_square(r) for r in (self._model.residuals, self._model.left_out()))
         return float(spearmanr(y, predicted).statistic)
 
     def _search(self, archive: Archive) -> Search:
@@ -147,7 +152,8 @@ class VectorSurrogate(Optimizer):
             else:
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(told.y, kind="stable")]
-                chosen, gain = self._choose(self._model, best_first, archive.best.y, turn, count)
+                best = float(root_mean_square(archive.leading.residuals)[0])
+                chosen, gain = self._choose(self._model, best_first, best, turn, count)
                 quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
             yield self._from_unit(chosen)
             left, turn = left - count, turn + count
@@ -245,7 +251,7 @@ def expected_improvement(
     Args:
         model: The model of the residuals.
         x: Points of the unit cube [k, d].
-        best: The best objective so far, the root of its mean square.
+        best: The root mean square of the best residuals so far.
         normal: Standard normal draws [draws, n - 1 - d], one column a row of the model's `root`.
 
     Returns:

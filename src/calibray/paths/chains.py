@@ -49,7 +49,7 @@ class Chains:
 
 
 @dataclass(frozen=True)
-class Program:
+class Geometry:
     """The geometric part of a path program; names and shapes as in `calibray.paths.Paths`.
 
     Attributes:
@@ -83,7 +83,7 @@ class Program:
     diffraction: Diffraction
 
 
-def compile_chains(chains: Chains) -> Program:
+def compile_chains(chains: Chains) -> Geometry:
     """Compute what the fields of traced paths depend on, apart from the materials.
 
     Args:
@@ -164,7 +164,7 @@ def compile_chains(chains: Chains) -> Program:
     last = direction[np.arange(count), length]
     spread = np.where(spread > 0, spread, 1 / (total - tube_start))
     flat = present.reshape(-1)
-    return Program(
+    return Geometry(
         delay=total / speed_of_light,
         spreading=spread,
         departure_direction=direction[:, 0],

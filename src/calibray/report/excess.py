@@ -52,16 +52,16 @@ def figure(comparison: Comparison) -> Figure:
         The figure.
     """
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
-    last = max(entry.budget for entry in comparison.entries)
-    colors = iter(PALETTE * (1 + len(comparison.entries) // len(PALETTE)))
+    last = max(contender.budget for contender in comparison.contenders)
+    colors = iter(PALETTE * (1 + len(comparison.contenders) // len(PALETTE)))
     calls = np.arange(1, last + 1)
-    for entry in comparison.entries:
-        shown = calls if entry.reference else calls[: entry.budget]
-        quartiles = [comparison.quartiles(entry.name, int(call)) for call in shown]
+    for contender in comparison.contenders:
+        shown = calls if contender.endless else calls[: contender.budget]
+        quartiles = [comparison.quartiles(contender.name, int(call)) for call in shown]
         low, middle, high = np.maximum(quartiles, FLOOR_DB).T
-        color = COLORS.get(entry.method) or next(colors)
-        dashed = "--" if entry.reference or entry.name != entry.method else "-"
-        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(entry.name))
+        color = COLORS.get(contender.method) or next(colors)
+        dashed = "--" if contender.endless or contender.name != contender.method else "-"
+        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(contender.name))
         axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
     axes.set(yscale="log", xlim=(0, last))
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))

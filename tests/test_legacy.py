@@ -1,0 +1,129 @@
+"""Files of the version before the rooms still load, and mean the same; `legacy/README.md` tells how they were made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calibray as cb
+from calibray import engines
+from calibray.comparison import comparison
+from calibray.comparison.arena import study_arena
+from calibray.comparison.runs import Runs
+from calibray.paths import Kind
+
+LEGACY = Path(__file__).parent / "legacy"
+EXPECTED = json.loads((LEGACY / "expected.json").read_text())
+MADE_IN = "/srv/calibray-legacy"
+
+# Losses on paths that are traced anew: the tracer computes in single precision.
+TRACED_DB = 1e-3
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A copy of the files, which believes to have been made where it lies."""
+    copy = tmp_path / "legacy"
+    shutil.copytree(LEGACY, copy)
+    for result in copy.glob("*/result.json"):
+        result.write_text(result.read_text().replace(MADE_IN, str(copy)))
+    return copy
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED["studies"]))
+def test_a_study_file_means_the_same(name):
+    study = cb.Study.load(LEGACY / f"{name}.toml")
+    expected = dict(EXPECTED["studies"][name]["content"])
+    # Each engine has keys of its own now; those of others were written with their defaults.
+    engine = expected.pop("engine")
+    assert {key: value for key, value in study.content().items() if key != "engine"} == expected
+    assert study.engine == cb.Study.from_content({**expected, "engine": engine}, study.path).engine
+    assert study.content()["engine"].items() <= engine.items()
+    study.measurements()
+
+
+def test_a_path_file_gives_the_same_path_loss():
+    paths, expected = cb.Paths.load(LEGACY / "paths.h5"), EXPECTED["paths"]
+    assert set(paths.kind) == set(Kind)
+    assert len(paths.link) == expected["num_paths"]
+    other = paths.materials | {"stone": cb.Material(6.5, 0.1, 0.2, 0.3, 0.1)}
+    for loss, name in (
+        (cb.path_loss(paths), "path_loss_db"),
+        (cb.path_loss(paths, other), "other_path_loss_db"),
+        (cb.path_loss(paths, combining="coherent"), "coherent_path_loss_db"),
+    ):
+        assert loss == pytest.approx(np.array(expected[name]), rel=1e-12)
+    assert cb.path_loss(paths) != pytest.approx(cb.path_loss(paths, other), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["replay", "program"])
+def test_a_result_holds_what_was_written(name, folder):
+    written = json.loads((LEGACY / name / "result.json").read_text())
+    result = cb.Result.load(folder / name)
+    content = result.content()
+    # What later versions add is theirs; what was there must be there, the study with its own new defaults.
+    assert {key: content[key] for key in written if key not in ("study", "study_file")} == {
+        key: value for key, value in written.items() if key not in ("study", "study_file")
+    }
+    assert result.study.digest() == EXPECTED["studies"][name]["digest"]
+    assert len(result.history) == result.rt_calls
+    assert result.links.held_out.sum() > 0
+    assert result.links.retrace_gap_db.isna().all()
+
+
+def test_a_result_predicts_the_same(folder):
+    result = cb.Result.load(folder / "replay")
+    predicted = result.predict(pd.read_csv(folder / "new-links.csv"))
+    assert predicted == pytest.approx(EXPECTED["predicted_db"], abs=TRACED_DB)
+    assert np.isfinite(predicted).all()
+
+
+def test_a_ledger_answers_every_call(folder):
+    written = cb.Result.load(folder / "program")
+    with closing(engines.open_ledger(folder / "program")) as ledger:
+        calls = len(ledger.table())
+    (folder / "model.py").unlink()  # a call would fail
+    again = cb.calibrate(cb.Study.load(folder / "program.toml"), out=folder / "program")
+    assert (again.rt_calls, again.ledger_hits) == (written.rt_calls, written.rt_calls)
+    assert again.parameters == written.parameters
+    assert again.offsets_db == pytest.approx(written.offsets_db, rel=1e-12)
+    assert again.holdout_rmse_db == pytest.approx(written.holdout_rmse_db, rel=1e-12)
+    with closing(engines.open_ledger(folder / "program")) as ledger:
+        assert len(ledger.table()) == calls
+
+
+def test_a_comparison_finds_its_runs(folder, monkeypatch):
+    path = folder / "compare" / "runs.jsonl"
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    problem, code = records[0]["problem"].split("-")
+    assert study_arena(folder / "replay.toml").fingerprint == problem
+    found = Runs(path, f"{problem}-{code}")
+    for record in records:
+        run = found.find(record["method"], record["budget"], record["seed"])
+        assert (run.evaluations, list(run.best)) == (record["evaluations"], record["best"])
+    # The optimizers' code is part of what a run depends on; as that of then, nothing is run again.
+    monkeypatch.setattr(comparison, "_code", lambda: code)
+    monkeypatch.setattr(comparison, "run_contender", None)
+    monkeypatch.setattr(comparison, "_optimum", None)
+    finished = comparison.compare(
+        lambda: study_arena(folder / "replay.toml"),
+        ["random", "sgwo-im"],
+        seeds=2,
+        budget=24,
+        out=folder / "compare",
+    )
+    table = finished.table()
+    written = pd.read_csv(folder / "compare" / "compare.csv")
+    shared = ["method", "rt_calls", "median_excess_db_end", "optimum_db"]
+    pd.testing.assert_frame_equal(table[shared], written[shared], rtol=1e-4)
+
+
+def test_the_optimizers_code_has_a_fingerprint():
+    assert comparison._code() != hashlib.sha256().hexdigest()[:16]
