@@ -19,18 +19,23 @@ from calibray.measurements import Measurements
 from timing import seconds
 
 
-def former_jacobian(objective: Objective, group: np.ndarray, groups: int, slope: np.ndarray) -> np.ndarray:
-    """Derivatives less their weighted means over groups, a mask for each; offsets unbounded, all links counted."""
-    weight = objective.weight
-    masks = [group == k for k in range(groups)]
+def former_jacobian(
+    objective: Objective, group: np.ndarray, groups: int, loss: np.ndarray, slope: np.ndarray
+) -> np.ndarray:
+    """Derivatives less their weighted means over groups, a mask for each; all links counted."""
+    gap = objective.measured - loss
+    weight = np.where(np.isfinite(gap), objective.weight, 0.0)
 
     def per_group(value: np.ndarray) -> np.ndarray:
-        return np.stack([value[:, mask].sum(axis=1) for mask in masks], axis=1)
+        return np.stack([value[:, group == k].sum(axis=1) for k in range(groups)], axis=1)
 
-    total = per_group(weight[None])
-    mean = np.stack([per_group(weight * slope[..., k]) for k in range(slope.shape[2])], axis=-1)
-    left = slope - (mean / total[..., None])[:, group]
-    return left * np.sqrt(weight / weight.mean())[:, None]
+    offset = per_group(weight * gap) / per_group(weight)
+    free = np.isfinite(offset)
+    total = per_group(objective.weight[None])
+    mean = np.stack([per_group(objective.weight * slope[..., k]) for k in range(slope.shape[2])], axis=-1)
+    mean = mean / total[..., None] * free[..., None]
+    left = slope - mean[:, group]
+    return left * np.sqrt(objective.weight / objective.weight.mean())[:, None]
 
 
 def campaign(count: int, groups: int) -> Measurements:
@@ -83,8 +88,8 @@ def main() -> None:
         for name, terms in designs(links).items()
     }
     plain, group = targets["offset per group"], links.group_index
-    rival = seconds(lambda: former_jacobian(plain, group, groups, slope), 1)
-    gap = abs(former_jacobian(plain, group, groups, slope) - plain.jacobian(loss, slope)).max()
+    rival = seconds(lambda: former_jacobian(plain, group, groups, loss, slope), 1)
+    gap = abs(former_jacobian(plain, group, groups, loss, slope) - plain.jacobian(loss, slope)).max()
     for name, target in targets.items():
         time = seconds(lambda target=target: target.jacobian(loss, slope), 5)
         value = seconds(lambda target=target: target.value(loss), 5)
