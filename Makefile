@@ -23,6 +23,7 @@ lint: $(VENV)/.lint
 bench: setup
 	$(BIN)/python benchmarks/replay.py
 	$(BIN)/python benchmarks/interactions.py
+	$(BIN)/python benchmarks/nuisance.py
 	$(BIN)/python benchmarks/diffuse.py
 
 docs: setup

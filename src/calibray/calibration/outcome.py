@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
-from calibray.inference.likelihood import Interval, LogDistance, Objective, intervals
-from calibray.measurements import Measurements
+from calibray.inference.intervals import Interval, intervals
+from calibray.inference.rivals import log_distance
 from calibray.result import Result
 from calibray.tracing.enclosed import Enclosed
 
@@ -41,9 +41,9 @@ def outcome(
     before, best, counted = problem.before, trail.best_modelled, objective.weight > 0
     reached = np.isfinite(before) & np.isfinite(best)
     judged = held_out & (reached | (objective.ceiling_db is not None))
-    offsets = objective.offsets(best[None])[0] if objective.num_groups else np.zeros(0)
+    offsets, fitted = objective.coefficients(best[None]), bool(objective.nuisance.terms)
     offset_only, after = objective.model(np.stack([before, best]))
-    rival = _log_distance(links, objective, study.scene.frequency)
+    rival = log_distance(links, objective.measured, objective.weight, study.scene.frequency)
 
     def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
         if not mask.any():
@@ -55,29 +55,27 @@ def outcome(
             "row": links.row,
             "measured_db": objective.measured,
             "before_db": before,
-            "after_db": best + (offsets[objective.group] if objective.num_groups else 0.0),
+            "after_db": best + objective.nuisance.contribution(offsets)[0],
             "log_distance_db": rival,
             "has_path": reached,
             "held_out": held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
         }
     )
-    determined = np.unique(objective.group[counted]) if objective.num_groups else np.zeros(0, dtype=int)
-    lost = np.setdiff1d(np.arange(objective.num_groups), determined)
     return Result(
         study=study,
         parameters=parameters.named(trail.best),
         initial_parameters=parameters.named(parameters.start),
         intervals=_intervals(problem, trail.best),
         materials=parameters.materials(trail.best, problem.engine.materials),
-        offsets_db={links.group_names[k]: float(offsets[k]) for k in determined},
-        groups_without_path=tuple(links.group_names[k] for k in lost),
+        offsets_db={links.group_names[k]: float(offsets[0, k]) for k in np.flatnonzero(objective.determined)},
+        groups_without_path=tuple(links.group_names[k] for k in np.flatnonzero(~objective.determined)),
         rmse_db=trail.best_rmse_db,
         initial_rmse_db=rmse(objective.capped(before), counted),
-        offset_only_rmse_db=rmse(offset_only, counted) if objective.num_groups else None,
+        offset_only_rmse_db=rmse(offset_only, counted) if fitted else None,
         holdout_rmse_db=rmse(after, judged),
         initial_holdout_rmse_db=rmse(objective.capped(before), judged),
-        offset_only_holdout_rmse_db=rmse(offset_only, judged) if objective.num_groups else None,
+        offset_only_holdout_rmse_db=rmse(offset_only, judged) if fitted else None,
         log_distance_rmse_db=rmse(rival, counted),
         log_distance_holdout_rmse_db=rmse(rival, judged),
         retrace_gap_db=largest(gap, counted),
@@ -93,13 +91,6 @@ def outcome(
     )
 
 
-def _log_distance(links: Measurements, objective: Objective, frequency: float) -> NDArray[np.float64]:
-    """Path loss [L], [dB] of the log-distance model fitted to links; over carriers it rises as in free space."""
-    rise = 0.0 if links.frequency is None else 20 * np.log10(links.frequency / frequency)
-    model = LogDistance.fit(links.distance, objective.measured - rise, objective.weight)
-    return model.path_loss(links.distance) + rise
-
-
 def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interval]:
     """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
     if not problem.differentiable:
@@ -107,9 +98,8 @@ def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interva
     parameters, objective = problem.parameters, problem.objective
     point = parameters.to_search(best)
     told = problem.evaluate(point[None], derivatives=True)
-    found = intervals(
-        point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, objective.num_groups
-    )
+    nuisances = int(objective.determined.sum())
+    found = intervals(point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, nuisances)
     lower, upper = (
         parameters.from_search(np.array(ends))
         for ends in zip(*((each.lower, each.upper) for each in found), strict=True)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from calibray.engines.observable import PATH_LOSS, Observable
 from calibray.engines.protocol import Differentiable, Engine
 from calibray.errors import InputError
-from calibray.inference.likelihood import Objective, make_objective
+from calibray.inference.nuisance import Nuisance, make_term
+from calibray.inference.objective import Objective, make_objective
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
-from calibray.study import Setup
+from calibray.study import Setup, Study
 
 
 class Evaluation(NamedTuple):
@@ -72,8 +73,7 @@ class Problem:
             links,
             np.isfinite(before),
             ~held_out,
-            offset=study.offset is not None,
-            bounds=study.offset.bounds if study.offset else None,
+            nuisance=_nuisance(study, links),
             ceiling_db=study.objective.ceiling_db,
         )
         objective = replace(objective, measured=observable.measured(links))
@@ -108,15 +108,21 @@ class Problem:
             jacobian = objective.jacobian(modelled, slope * parameters.search_slope(candidates)[:, None, :])
         else:
             modelled = self.observable.modelled(self.engine, candidates)
-        return Evaluation(objective.rmse(modelled), objective.residuals(modelled), jacobian, modelled)
+        return Evaluation(objective.value(modelled), objective.residuals(modelled), jacobian, modelled)
+
+
+def _nuisance(study: Study, links: Measurements) -> Nuisance:
+    """The study's offset, for all links or for each group, if it has one."""
+    if study.offset is None:
+        return Nuisance(len(links))
+    return Nuisance(len(links), (make_term(links, "offset", labels=links.group, bounds=study.offset.bounds),))
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
     """Refuse links held out whose offset no link to calibrate on could tell."""
-    if objective.num_groups:
-        unknown = np.setdiff1d(objective.group[judged], objective.group[objective.weight > 0])
-        if len(unknown):
-            raise InputError(
-                f"{links.source}: group {links.group_names[unknown[0]]!r} is held out but has no link to "
-                "calibrate its offset on; change [holdout] or [offset]"
-            )
+    unknown = links.group_index[judged & ~objective.supported]
+    if len(unknown):
+        raise InputError(
+            f"{links.source}: group {links.group_names[unknown.min()]!r} is held out but has no link to "
+            "calibrate its offset on; change [holdout] or [offset]"
+        )

@@ -69,9 +69,11 @@ def study_arena(path: str | Path) -> Arena:
     objective, parameters, links = problem.objective, problem.parameters, setup.links
     lower, upper = parameters.search_bounds
     digest = hashlib.sha256(fingerprint(setup).encode())
-    for part in (lower, upper, objective.measured, objective.weight, objective.group, objective.bounds):
+    nuisance, design = objective.nuisance, objective.nuisance.design
+    parts = (design.data, design.indices, design.indptr, nuisance.lower, nuisance.upper, nuisance.prior)
+    for part in (lower, upper, objective.measured, objective.weight, *parts):
         digest.update(np.asarray(part, dtype="<f8").tobytes())
-    digest.update(repr((objective.num_groups, objective.ceiling_db)).encode())
+    digest.update(repr((nuisance.columns, objective.ceiling_db, objective.noise_db)).encode())
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = parameters.to_search(parameters.start)
     return Arena(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.files import check_folder, write_text
-from calibray.inference.likelihood import Interval
+from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.progress import Progress

@@ -1,0 +1,72 @@
+"""How far a calibration's answer can be trusted: intervals from the curvature of the sum of squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+CONFIDENCE: Final = 0.95
+
+
+@dataclass(frozen=True)
+class Interval:
+    """How well the links determine one parameter.
+
+    Attributes:
+        standard_error: From the residuals' scatter and the derivatives at the optimum, in the parameter's unit.
+        lower: Lower end of the 95 % interval, within the bounds.
+        upper: Upper end.
+        verdict: "identified", "at bound" or "not identifiable".
+    """
+
+    standard_error: float
+    lower: float
+    upper: float
+    verdict: str
+
+
+def intervals(
+    best: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    nuisances: int,
+) -> list[Interval]:
+    """Confidence intervals of the parameters from the curvature of the sum of squares at the optimum.
+
+    A parameter is called not identifiable when its 95 % interval is wider than half of its bounds. Linear theory:
+    other minima, and errors that neighbouring links share, can make the truth wider.
+
+    Args:
+        best: The optimum [d].
+        residuals: Residuals there, offsets eliminated [m], [dB].
+        jacobian: Their derivatives [m, d].
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        nuisances: Number of offsets fitted beside the parameters.
+
+    Returns:
+        One interval per parameter.
+    """
+    freedom = max(len(residuals) - len(best) - nuisances, 1)
+    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # Student's t: standard errors either side
+    variance = float(residuals @ residuals) / freedom
+    values, vectors = np.linalg.eigh((scaled := jacobian * (upper - lower)).T @ scaled)
+    values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
+    errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
+    found = []
+    for value, error, low, high in zip(best, errors, lower, upper, strict=True):
+        ends = max(value - reach * error, low), min(value + reach * error, high)
+        span = high - low
+        verdict = "identified"
+        if 2 * reach * error > span / 2:
+            verdict = "not identifiable"
+        elif min(value - low, high - value) < 1e-6 * span:
+            verdict = "at bound"
+        found.append(Interval(float(error), float(ends[0]), float(ends[1]), verdict))
+    return found
