@@ -134,7 +134,7 @@ class Comparison:
     found_by: str
 
     def excess(self, name: str, calls: int) -> np.ndarray:
-        """Excess of an contender's runs after some RT calls.
+        """Excess of a contender's runs after some RT calls.
 
         A run that ended or failed before stays where it was.
 
@@ -161,7 +161,7 @@ class Comparison:
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> np.ndarray:
-        """RT calls after which an contender's runs were within some excess.
+        """RT calls after which a contender's runs were within some excess.
 
         Args:
             name: The contender.
