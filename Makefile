@@ -19,6 +19,8 @@ test: setup
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
 
 bench: setup
 	$(BIN)/python benchmarks/replay.py

@@ -168,7 +168,8 @@ class Study(Section):
             # By way of JSON, where lists pass for tuples and yet nothing is converted: "4" is no number.
             study = cls.model_validate_json(json.dumps(content, default=str))
         except ValidationError as error:
-            raise explain(error, cls, content, str(path), tagged=("engine",)) from None
+            refusal = explain(error, cls, content, str(path), tagged=("engine",))
+            raise refusal from None
         study._path, study._other_engines = Path(path), others
         return study
 
