@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.measurements.filters import evaluate
 from calibray.spelling import did_you_mean, shortened
 
@@ -135,8 +136,8 @@ def read_table(path: str | Path) -> Table:
             and pyarrow is not installed.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    if not exists(path):
+        raise InputError(f"{shortened(str(path), 300)}: no such file")
     match path.suffix.lower():
         case ".csv":
             table = _read_csv(path)

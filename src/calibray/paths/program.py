@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.materials import FIELDS, Material
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, Content, read
@@ -166,7 +167,7 @@ class Paths:
                 checksum (see `seal`).
         """
         source = Path(path)
-        if not source.is_file():
+        if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:
             verify(source)

@@ -18,10 +18,12 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator, model
 from calibray.closed import Section, Text
 from calibray.engines.kinds import DEFAULT, KINDS, AnyEngine
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
+from calibray.spelling import shortened
 from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
@@ -350,8 +352,11 @@ class Study(Section):
                 written = getattr(self.antennas, end).pattern
                 files.append((f"antennas.{end}.pattern", written, antenna.gain_file))
         for key, written, file in files:
-            if not str(file).startswith(BUNDLED) and not Path(file).is_file():
-                raise InputError(f"{self._path}: {key} = {written!r}: no such file, {Path(file).resolve()}")
+            if not str(file).startswith(BUNDLED) and not exists(file):
+                raise InputError(
+                    f"{self._path}: {key} = {shortened(written)!r}: no such file, "
+                    f"{shortened(str(Path(file).absolute()), 300)}"
+                )
 
 
 def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
