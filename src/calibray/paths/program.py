@@ -25,7 +25,6 @@ from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, Con
 from calibray.paths.sealing import BLOCK, stamp, verify
 from calibray.paths.summary import as_html, as_text
 
-
 Table = TypeVar("Table", Diffuse, Diffraction)
 
 

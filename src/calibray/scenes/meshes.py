@@ -60,6 +60,8 @@ def check_ply(path: Path) -> None:
         raise _malformed(path, "has no vertices or no faces")
     if missing := [axis for axis in "xyz" if axis not in vertices.dtype.names]:
         raise _malformed(path, f"its vertices have no {missing[0]}")
+    if "corners" not in faces.dtype.names:
+        raise _malformed(path, "its faces name no corners")
     for axis in "xyz":
         if (wrong := ~np.isfinite(vertices[axis].astype(np.float64))).any():
             row = int(np.flatnonzero(wrong)[0])
@@ -154,8 +156,10 @@ def _text_tables(path: Path, elements: list[_Element], body: bytes) -> dict[str,
             values = np.array(words[place : place + numbers], dtype=np.bytes_).astype(np.float64)
         except ValueError:
             raise _malformed(path, f"its {shortened(element.name)} holds what is no number") from None
-        columns = values.reshape(element.count, -1).T
-        tables[element.name] = np.rec.fromarrays(list(columns), names=list(row.names))
+        table = np.empty(element.count, dtype=[(name, np.float64) for name in row.names])
+        for column, name in enumerate(row.names):
+            table[name] = values[column :: len(row.names)]
+        tables[element.name] = table
         place += numbers
         _check_triangles(path, tables[element.name])
     return tables
