@@ -481,5 +481,5 @@ def test_scenes_that_cannot_be_taken(tmp_path: Path, old: str, new: str, message
 
 @pytest.mark.parametrize("name", ["s" * 5000 + ".xml", "a\0b.xml", "sionna:" + "x" * 5000, "sionna:a\0b"])
 def test_names_that_no_file_can_have(name: str) -> None:
-    with pytest.raises(InputError, match="does not exist|bundles no such scene"):
+    with pytest.raises(InputError, match=r"does not exist|bundles no such scene"):
         read_scene(name, 2e9)

@@ -103,6 +103,7 @@ def read_scene(
     materials: dict[str, Material] = {}
     laws: dict[str, ItuLaw] = {}
     origin: dict[str, str] = {}
+    order: dict[str, int] = {}
     for shape in root.findall("shape"):
         check_shape(shape, path)
         original, name = _materials_of(shape, definitions, split, path)
@@ -116,7 +117,7 @@ def read_scene(
             bsdf = definitions.get(original)
             materials[name] = _material(name, original, bsdf, constants, frequency, path)
             laws[name] = _law(materials[name], original, bsdf, constants, frequency)
-        _refer(shape, f"{TRACED}{list(materials).index(name)}")
+        _refer(shape, f"{TRACED}{order.setdefault(name, len(order))}")
         objects.append(SceneObject(_object_name(shape), name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")

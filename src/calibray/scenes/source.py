@@ -9,7 +9,7 @@ from typing import Final
 
 from calibray.errors import InputError
 from calibray.files import exists
-from calibray.scenes.meshes import check_ply
+from calibray.scenes.ply import check_ply
 from calibray.spelling import shortened
 
 BUNDLED_PREFIX: Final = "sionna:"

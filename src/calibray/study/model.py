@@ -135,16 +135,17 @@ class Study(Section):
                 names a scene or links that do not exist; one line for each fault.
         """
         path = Path(path)
+        if not exists(path):
+            raise InputError(f"{shortened(str(path), 300)}: no such study file")
         try:
             content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such study file") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
         except UnicodeDecodeError:
             raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{path}: not valid TOML: {error}") from None
+        except (ValueError, RecursionError) as error:
+            # A number of thousands of digits, or lists thousands deep, beside what TOML itself refuses.
+            raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
         study = cls.from_content(content, path)
         study._check_files()
         return study
@@ -168,7 +169,11 @@ class Study(Section):
         content = {**content, "engine": own}
         try:
             # By way of JSON, where lists pass for tuples and yet nothing is converted: "4" is no number.
-            study = cls.model_validate_json(json.dumps(content, default=str))
+            text = json.dumps(content, default=str)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
+        try:
+            study = cls.model_validate_json(text)
         except ValidationError as error:
             raise explain(error, cls, content, str(path), tagged=("engine",)) from None
         study._path, study._other_engines = Path(path), others
