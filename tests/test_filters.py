@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.measurements.filters import FUNCTIONS, METHODS, TEXT_METHODS, evaluate
+from calibray.measurements.filters import evaluate
+from calibray.measurements.grammar import FUNCTIONS, METHODS, TEXT_METHODS
 from calibray.measurements.tables import Table
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "study-file.md"

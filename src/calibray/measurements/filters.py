@@ -1,6 +1,6 @@
 """Row filters: a small closed language over the columns of a table.
 
-A filter is parsed by Python's own parser and interpreted here over whole columns. What the tables below do not name
+A filter is parsed by Python's own parser and interpreted here over whole columns. What `grammar` does not name
 does not exist: no attribute, no call, no subscript, nothing of the program. Precedence is that of pandas' queries,
 where ``&`` and ``|`` mean ``and`` and ``or`` and bind as loosely. `docs/study-file.md` lists all that is allowed.
 """
@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import ast
 import operator
-import re
 import warnings
 from collections.abc import Callable, Mapping
 from math import inf, isfinite
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -21,80 +19,25 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.grammar import (
+    ARITHMETIC,
+    COMPARISONS,
+    FUNCTIONS,
+    MAX_LENGTH,
+    METHODS,
+    TEXT_METHODS,
+    as_python,
+    parse,
+)
 from calibray.measurements.patterns import check_pattern
 from calibray.spelling import did_you_mean, shortened
-
-MAX_LENGTH: Final = 10_000
-"""The number of characters beyond which a filter is refused."""
-
-MAX_PARTS: Final = 2_000
-"""The number of names, values and operators beyond which a filter is refused."""
-
-MAX_DEPTH: Final = 50
-"""How deep the parts of a filter may lie in each other."""
 
 _LARGEST: Final = 2**63 - 1
 _Value = pd.Series | bool | int | float | str | None
 
-_COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = MappingProxyType(
-    {
-        ast.Eq: operator.eq,
-        ast.NotEq: operator.ne,
-        ast.Lt: operator.lt,
-        ast.LtE: operator.le,
-        ast.Gt: operator.gt,
-        ast.GtE: operator.ge,
-    }
-)
-
-_ARITHMETIC: Final[Mapping[type[ast.operator], Callable[[Any, Any], Any]]] = MappingProxyType(
-    {
-        ast.Add: operator.add,
-        ast.Sub: operator.sub,
-        ast.Mult: operator.mul,
-        ast.Div: operator.truediv,
-        ast.FloorDiv: operator.floordiv,
-        ast.Mod: operator.mod,
-        ast.Pow: operator.pow,
-    }
-)
-
-FUNCTIONS: Final[Mapping[str, np.ufunc]] = MappingProxyType(
-    {
-        name: getattr(np, name)
-        for name in (
-            *("abs", "arctan2", "ceil", "cos", "exp", "floor"),
-            *("log", "log10", "sin", "sqrt", "tan"),
-        )
-    }
-)
-"""The functions that a filter may call, over numbers."""
-
-METHODS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"abs": (), "between": ("left", "right", "inclusive"), "isin": ("values",), "isna": (), "notna": ()}
-)
-"""The methods of a column, each with its arguments in order."""
-
-TEXT_METHODS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "contains": ("pat", "case", "regex", "na"),
-        "endswith": ("pat", "na"),
-        "lower": (),
-        "startswith": ("pat", "na"),
-        "strip": ("to_strip",),
-        "upper": (),
-    }
-)
-"""The methods after ``.str``, likewise."""
-
 _REQUIRED: Final = ("left", "right", "values", "pat")
 _SWITCHES: Final = ("case", "regex", "na")
 _INCLUSIVE: Final = ("both", "left", "right", "neither")
-
-# Texts and backticked names are told from the rest, in which alone `&` and `|` are operators.
-_TOKENS: Final = re.compile(
-    r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|`(?P<column>[^`\n]+)`|(?P<sign>[&|])"""
-)
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
@@ -118,55 +61,15 @@ def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
     """
     if len(expression) > MAX_LENGTH:
         raise InputError(f"{len(expression)} characters, must be at most {MAX_LENGTH}; shorten it")
-    code, quoted = _python(expression.strip())
+    code, quoted = as_python(expression.strip())
     # Python warns of escapes in texts and pandas of patterns; neither is of use to who wrote the filter.
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        tree = _parse(code, frame)
+        tree = parse(code, frame)
         result = _Interpreter(frame, code, quoted).value(tree)
     if not isinstance(result, pd.Series) or not pd.api.types.is_bool_dtype(result.dtype):
         raise InputError("must be true or false for each row, for instance \"set == 'LOS'\"")
     return result.to_numpy(dtype=bool, na_value=False)
-
-
-def _python(expression: str) -> tuple[str, dict[str, str]]:
-    """The filter as a Python expression, and the columns that its stand-ins for backticked names mean."""
-    stem = "quoted"
-    while stem in expression:
-        stem += "_"
-    quoted: dict[str, str] = {}
-
-    def plain(match: re.Match[str]) -> str:
-        if match["column"] is not None:
-            quoted[f"{stem}{len(quoted)}"] = match["column"]
-            return f" {next(reversed(quoted))} "
-        return match[0] if match["text"] is not None else {"&": " and ", "|": " or "}[match["sign"]]
-
-    return _TOKENS.sub(plain, expression).strip(), quoted
-
-
-def _parse(code: str, frame: pd.DataFrame) -> ast.expr:
-    """The expression's tree, refused where it is too large to be walked."""
-    try:
-        tree = ast.parse(code, mode="eval").body
-    except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-        fault = getattr(error, "msg", None) or str(error) or "too deep"
-        columns = shortened(", ".join(map(str, frame)), 200)
-        raise InputError(
-            f"not a valid filter ({fault}); compare as in \"x < 5 and set == 'LOS'\"; the columns are {columns}"
-        ) from None
-    parts, level = 0, [tree]
-    for _ in range(MAX_DEPTH):
-        parts += len(level)
-        # An operator is a node without fields; its own level would halve the depth.
-        level = [
-            child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.AST)
-        ]
-        if parts > MAX_PARTS:
-            raise InputError(f"more than {MAX_PARTS} parts; shorten it, or add a column to filter by")
-        if not level:
-            return tree
-    raise InputError(f"parts lie more than {MAX_DEPTH} deep in each other; shorten it")
 
 
 class _Interpreter:
@@ -280,9 +183,9 @@ class _Interpreter:
                 raise InputError(f"{self._piece(right)}: must be a list of values, as in ['A', 'B']")
             found = column.isin(values)
             return found if kind in (ast.In, ast.Eq) else ~found
-        if kind not in _COMPARISONS:
+        if kind not in COMPARISONS:
             raise InputError(f"{self._piece(node)}: is and is not are not allowed; use ==, != or isna()")
-        return _COMPARISONS[kind](self.value(left), self.value(right))
+        return COMPARISONS[kind](self.value(left), self.value(right))
 
     def _column(self, node: ast.expr) -> pd.Series:
         value = self.value(node)
@@ -306,7 +209,7 @@ class _Interpreter:
         return self._number(node) * 1 if negative else self._constant(constant)
 
     def _arithmetic(self, node: ast.BinOp) -> _Value:
-        if (operation := _ARITHMETIC.get(type(node.op))) is None:
+        if (operation := ARITHMETIC.get(type(node.op))) is None:
             raise InputError(f"{self._piece(node)}: only + - * / // % ** are allowed between numbers")
         left, right = self._number(node.left), self._number(node.right)
         if isinstance(node.op, ast.Pow):

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import inf, isfinite, pi
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -138,7 +138,7 @@ def _damaged(fault: str) -> InputError:
     return InputError(f"is damaged ({fault}); trace again")
 
 
-def _attribute(file: h5py.File, name: str) -> object:
+def _attribute(file: h5py.File, name: str) -> Any:
     value = file.attrs[name]
     if isinstance(value, str | np.bool_) or (
         isinstance(value, np.number) and value.dtype.kind in "iuf" and isfinite(value)
