@@ -254,12 +254,12 @@ class _Interpreter:
             raise InputError(f"{self._piece(node)}: takes {function.nin} number(s), nothing else")
         return function(*(_floats(self._number(argument)) for argument in node.args))
 
-    def _method(self, node: ast.Call, owner: ast.expr, name: str) -> pd.Series:
+    def _method(self, node: ast.Call, owner: ast.expr, name: str) -> _Value:
         given = self._arguments(node, name, METHODS)
-        column = self._column(owner) if name != "abs" else self._number(owner)
+        if name == "abs":
+            return abs(self._number(owner))
+        column = self._column(owner)
         match name:
-            case "abs":
-                return abs(column)
             case "between":
                 inclusive = self._choice(given.get("inclusive"))
                 return column.between(self.value(given["left"]), self.value(given["right"]), inclusive)
@@ -271,8 +271,9 @@ class _Interpreter:
                 return column.notna()
 
     def _choice(self, node: ast.expr | None) -> Any:
-        choice = "both" if node is None else self._literal(node)
-        if choice not in _INCLUSIVE:
+        if node is None:
+            return "both"
+        if (choice := self._literal(node)) not in _INCLUSIVE:
             raise InputError(f"{self._piece(node)}: inclusive must be one of {', '.join(_INCLUSIVE)}")
         return choice
 

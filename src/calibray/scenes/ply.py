@@ -58,9 +58,9 @@ def check_ply(path: Path) -> None:
     vertices, faces = tables.get("vertex"), tables.get("face")
     if vertices is None or faces is None or not len(vertices) or not len(faces):
         raise _malformed(path, "has no vertices or no faces")
-    if missing := [axis for axis in "xyz" if axis not in vertices.dtype.names]:
+    if missing := [axis for axis in "xyz" if axis not in _names(vertices.dtype)]:
         raise _malformed(path, f"its vertices have no {missing[0]}")
-    if "corners" not in faces.dtype.names:
+    if "corners" not in _names(faces.dtype):
         raise _malformed(path, "its faces name no corners")
     for axis in "xyz":
         if (wrong := ~np.isfinite(vertices[axis].astype(np.float64))).any():
@@ -123,6 +123,10 @@ def _row_type(path: Path, element: _Element, order: str) -> np.dtype:
     return np.dtype([(name, f"{order}{kind}") for name, kind in element.columns])
 
 
+def _names(row: np.dtype) -> tuple[str, ...]:
+    return row.names or ()
+
+
 def _needed(elements: list[_Element]) -> list[_Element]:
     """The elements up to the last that matters."""
     last = max((k for k, element in enumerate(elements) if element.name in ("vertex", "face")), default=-1)
@@ -147,7 +151,7 @@ def _text_tables(path: Path, elements: list[_Element], body: bytes) -> dict[str,
     words, tables, place = body.split(), {}, 0
     for element in _needed(elements):
         row = _row_type(path, element, "")
-        numbers = element.count * len(row.names)
+        numbers = element.count * len(_names(row))
         if len(words) - place < numbers:
             raise _malformed(
                 path, f"is cut short, or has a face of other than three corners in {element.name}"
@@ -156,9 +160,9 @@ def _text_tables(path: Path, elements: list[_Element], body: bytes) -> dict[str,
             values = np.array(words[place : place + numbers], dtype=np.bytes_).astype(np.float64)
         except ValueError:
             raise _malformed(path, f"its {shortened(element.name)} holds what is no number") from None
-        table = np.empty(element.count, dtype=[(name, np.float64) for name in row.names])
-        for column, name in enumerate(row.names):
-            table[name] = values[column :: len(row.names)]
+        table = np.empty(element.count, dtype=[(name, np.float64) for name in _names(row)])
+        for column, name in enumerate(_names(row)):
+            table[name] = values[column :: len(_names(row))]
         tables[element.name] = table
         place += numbers
         _check_triangles(path, tables[element.name])
@@ -166,6 +170,6 @@ def _text_tables(path: Path, elements: list[_Element], body: bytes) -> dict[str,
 
 
 def _check_triangles(path: Path, table: NDArray) -> None:
-    if "corners" in (table.dtype.names or ()) and (wrong := table["corners"] != 3).any():
+    if "corners" in _names(table.dtype) and (wrong := table["corners"] != 3).any():
         row = int(np.flatnonzero(wrong)[0])
         raise _malformed(path, f"face {row} has {table['corners'][row]:g} corners, must have 3")
