@@ -280,5 +280,5 @@ def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, m
 
 
 def test_an_option_that_a_method_lacks_is_refused(tmp_path, exact):
-    with pytest.raises(InputError, match=r"method.options of 'gwo'.*wolfes"):
+    with pytest.raises(InputError, match=r"method\.options\.wolfes: the method 'gwo' has no such setting"):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})

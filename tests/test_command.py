@@ -284,9 +284,24 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
 
 @pytest.mark.parametrize(
     ("workers", "scheduler", "message"),
-    [(0, None, "must be at least 1"), (2, "tcp://here:1", "give one of them")],
+    [
+        (0, None, "must be at least 1"),
+        (2, "tcp://here:1", "give one of them"),
+        *(
+            (None, address, "--scheduler .*: is no address; give host and port, as tcp://")
+            for address in (
+                *("", "x", "127.0.0.1", "tcp://", "tcp://127.0.0.1:0", "tcp://127.0.0.1:99999", "tcp://[::1"),
+                *("tcp://127.0.0.1:abc", "http://127.0.0.1:80", "inproc://1", "ucx://a:1", "a:b:c:d"),
+                *("a" * 9999, "a b:1"),
+            )
+        ),
+        (None, "tls://127.0.0.1:9", "no Dask scheduler answers there"),
+        (None, "tcp://nowhere.invalid:8786", "no Dask scheduler answers there"),
+    ],
 )
-def test_executors_that_are_refused(workers, scheduler, message):
+def test_executors_that_are_refused(workers, scheduler, message, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("calibray.engines.pool.PATIENCE", 0.1)
     with pytest.raises(InputError, match=message), engines.open_executor(workers, scheduler):
         pass
 

@@ -34,6 +34,24 @@ def test_every_ray_goes_to_every_receiver_once(samples, depth, lanes):
     assert found.memory >= found.lanes * LANE_BYTES
 
 
+def test_more_launches_than_could_be_kept_are_counted_and_made_one_by_one():
+    """10^12 rays to 10,000 receivers: 1.5 thousand million launches."""
+    tx = np.tile([[0.0, 0, 10]], (10_000, 1))
+    found = plan(tx, TraceSettings(samples=10**12, max_depth=3), 20_000_000, 1_000_000)
+    assert len(found.launches) == 10_000 * 150_000
+    assert found.lanes <= 20_000_001
+    assert found.memory < 2**31
+    for piece in (0, 1, 77_777, 149_999):
+        launch = found.launches[piece]
+        assert (launch.links.tolist(), launch.last) == ([0], piece == 149_999)
+        assert launch.first == 10**12 * piece // 150_000
+        assert launch.first + launch.rays == 10**12 * (piece + 1) // 150_000
+    assert found.launches[-1].links.tolist() == [9999]
+    assert [launch.first for launch in found.launches[150_000:150_002]] == [0, 6_666_666]
+    with pytest.raises(IndexError):
+        found.launches[len(found.launches)]
+
+
 def test_rays_are_shared_out_only_where_one_receiver_is_too_much():
     settings = TraceSettings(samples=16_000_000, max_depth=3)
     assert [launch.rays for launch in plan(MASTS[:1], settings, 20_000_000, 1).launches] == [

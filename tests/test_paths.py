@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -15,9 +17,12 @@ from hypothesis import strategies as st
 import synthetic
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
-from calibray.paths import SCHEMA_VERSION, Diffraction, Diffuse, Kind, Paths, concatenate, take
+from calibray.paths import SCHEMA_VERSION, Diffraction, Diffuse, Kind, Paths, concatenate, seal, take
+from calibray.paths.schema import DATASETS
+from calibray.paths.sealing import BLOCK
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "path-file.md"
+FLOATS = [name for name, entry in DATASETS.items() if entry.kind == "f"]
 SEQUENCES = st.lists(st.lists(st.sampled_from(Kind), max_size=4), max_size=8)
 
 
@@ -144,8 +149,12 @@ def test_missing_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"paths", b"\x89HDF\r\n\x1a\n" + bytes(100)])
 def test_file_that_is_no_hdf5(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "paths.h5").write_bytes(content)
-    with pytest.raises(InputError, match=r"paths\.h5: .*damaged"):
+    with pytest.raises(InputError, match=r"paths\.h5: .*(damaged|checksum)"):
         Paths.load(tmp_path / "paths.h5")
+    if content.startswith(b"\x89"):
+        seal(tmp_path / "paths.h5")
+        with pytest.raises(InputError, match=r"paths\.h5: .*damaged"):
+            Paths.load(tmp_path / "paths.h5")
 
 
 def test_truncated_file(paths: Paths, tmp_path: Path) -> None:
@@ -156,8 +165,16 @@ def test_truncated_file(paths: Paths, tmp_path: Path) -> None:
         Paths.load(file)
 
 
+@contextmanager
+def changed(file: Path) -> Iterator[h5py.File]:
+    """A path file to be changed on purpose: its checksum agrees again at the end."""
+    with h5py.File(file, "a") as content:
+        yield content
+    seal(file)
+
+
 def test_hdf5_file_of_another_kind(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "other.h5", "w") as file:
+    with changed(tmp_path / "other.h5") as file:
         file["x"] = [1.0]
     with pytest.raises(InputError, match=r"other\.h5: is no Calibray path file"):
         Paths.load(tmp_path / "other.h5")
@@ -165,7 +182,7 @@ def test_hdf5_file_of_another_kind(tmp_path: Path) -> None:
 
 def test_other_schema_version(paths: Paths, tmp_path: Path) -> None:
     paths.save(tmp_path / "paths.h5")
-    with h5py.File(tmp_path / "paths.h5", "a") as file:
+    with changed(tmp_path / "paths.h5") as file:
         file.attrs["version"] = SCHEMA_VERSION + 1
     with pytest.raises(
         InputError, match=rf"version {SCHEMA_VERSION + 1}, need {SCHEMA_VERSION}; trace again"
@@ -173,21 +190,126 @@ def test_other_schema_version(paths: Paths, tmp_path: Path) -> None:
         Paths.load(tmp_path / "paths.h5")
 
 
-@pytest.mark.parametrize(
-    "name", ["paths/delay", "materials/name", "diffuse/solid_angle", "paths/tx_field_imag"]
-)
-def test_missing_dataset(paths: Paths, tmp_path: Path, name: str) -> None:
+def test_changed_file_is_refused_until_it_is_sealed(paths: Paths, tmp_path: Path) -> None:
+    file = tmp_path / "paths.h5"
+    paths.save(file)
+    with h5py.File(file, "a") as content:
+        content["paths/delay"][0] *= 2
+    with pytest.raises(
+        InputError, match=r"paths\.h5: is damaged \(its checksum does not agree\); trace again"
+    ):
+        Paths.load(file)
+    seal(file)
+    assert Paths.load(file).delay[0] == 2 * paths.delay[0]
+
+
+def test_file_from_before_there_were_seals_loads_once_it_is_sealed(paths: Paths, tmp_path: Path) -> None:
+    """Without a checksum no byte reaches HDF5, which flipped bits can hang and crash."""
+    file = tmp_path / "paths.h5"
+    paths.save(file)
+    file.write_bytes(file.read_bytes()[BLOCK:])
+    with pytest.raises(InputError, match=r"paths\.h5: has no checksum.*p\.seal\('.*paths\.h5'\)"):
+        Paths.load(file)
+    seal(file)
+    assert_equal(Paths.load(file), paths)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["paths.h5"]
+
+
+def test_only_hdf5_files_are_sealed(tmp_path: Path) -> None:
+    (tmp_path / "links.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(InputError, match=r"links\.csv: is no HDF5 file"):
+        seal(tmp_path / "links.csv")
+    with pytest.raises(InputError, match=r"absent\.h5: cannot be sealed"):
+        seal(tmp_path / "absent.h5")
+    assert (tmp_path / "links.csv").read_text() == "x,y\n1,2\n"
+
+
+def test_every_flipped_bit_and_every_cut_is_noticed(paths: Paths, tmp_path: Path) -> None:
+    file = tmp_path / "paths.h5"
+    paths.save(file)
+    whole, random = file.read_bytes(), np.random.default_rng(7)
+    damaged = [whole[:cut] for cut in random.integers(len(whole), size=60)] + [whole + b"\0", whole + whole]
+    for place in [*range(0, BLOCK, 3), *random.integers(len(whole), size=300).tolist()]:
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(random.integers(8))
+        damaged.append(bytes(flipped))
+    for content in damaged:
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=r"paths\.h5: (is damaged|has no checksum)"):
+            Paths.load(file)
+
+
+@pytest.mark.parametrize("name", list(DATASETS))
+def test_missing_misshapen_or_mistyped_dataset(paths: Paths, tmp_path: Path, name: str) -> None:
+    file = tmp_path / "paths.h5"
+    for fault in ("missing", "shorter", "deeper", "typed"):
+        paths.save(file)
+        with changed(file) as content:
+            values = content[name][()]
+            del content[name]
+            if fault == "shorter":
+                content[name] = values[:-1]
+            elif fault == "deeper":
+                content[name] = values[None]
+            elif fault == "typed":
+                content[name] = (
+                    values.astype(float) if values.dtype.kind in "iu" else np.zeros(values.shape, int)
+                )
+        with pytest.raises(InputError, match=r"paths\.h5: .*trace again"):
+            Paths.load(file)
+
+
+@pytest.mark.parametrize(("name", "index", "value"), [
+    *((name, 0, value) for name in FLOATS for value in (np.nan, np.inf, -np.inf)),
+    ("paths/link", -1, 2), ("paths/link", 0, -1), ("paths/link", 0, 1), ("paths/first", 0, 1),
+    ("paths/first", -1, 10**12), ("paths/first", 1, 5), ("paths/first", 3, -1), ("interactions/kind", 0, 3),
+    ("interactions/kind", 0, 0), ("interactions/kind", 0, Kind.DIFFUSE), ("interactions/material", 0, 3),
+    ("interactions/material", 0, -1), ("interactions/cos_incidence", 0, 1.1),
+    ("interactions/rotation", 0, 0.5), ("paths/delay", 0, -1e-9), ("paths/spreading", 0, -1.0),
+    ("diffuse/solid_angle", 0, -1.0), ("diffraction/sin_edge", 0, 1.5), ("paths/departure", 0, 7.0),
+    ("materials/relative_permittivity", 0, 0.5), ("materials/name", 0, "glass"), ("materials/name", 0, ""),
+    ("materials/scattering_pattern", 0, "shiny"),
+])  # fmt: skip
+def test_value_that_no_trace_gives(
+    paths: Paths, tmp_path: Path, name: str, index: int, value: float | str
+) -> None:
+    """Refused although the checksum agrees: who changed the file was wrong."""
     paths.save(tmp_path / "paths.h5")
-    with h5py.File(tmp_path / "paths.h5", "a") as file:
-        del file[name]
-    with pytest.raises(InputError, match=r"paths\.h5: .*trace again"):
+    with changed(tmp_path / "paths.h5") as file:
+        file[name][index] = value
+    with pytest.raises(InputError, match=r"paths\.h5: "):
+        Paths.load(tmp_path / "paths.h5")
+
+
+@pytest.mark.parametrize("frequency", [0.0, -1e9, 3.5, 1e15, np.nan, np.inf, "1e9", True, [1e9]])
+def test_impossible_carrier(paths: Paths, tmp_path: Path, frequency: object) -> None:
+    paths.save(tmp_path / "paths.h5")
+    with changed(tmp_path / "paths.h5") as file:
+        file.attrs["frequency_hz"] = frequency
+    with pytest.raises(InputError, match=r"paths\.h5: .*frequency_hz"):
+        Paths.load(tmp_path / "paths.h5")
+
+
+def test_dataset_from_elsewhere_is_not_read(paths: Paths, tmp_path: Path) -> None:
+    """A link into another file, and sizes that were never written."""
+    for name in ("other.h5", "paths.h5"):
+        paths.save(tmp_path / name)
+    with changed(tmp_path / "paths.h5") as file:
+        del file["paths/delay"]
+        file["paths/delay"] = h5py.ExternalLink("other.h5", "/paths/delay")
+    with pytest.raises(InputError, match="no dataset paths/delay"):
+        Paths.load(tmp_path / "paths.h5")
+    with changed(tmp_path / "paths.h5") as file:
+        del file["paths/delay"]
+        file.create_dataset("paths/delay", shape=(10**14,), dtype=float, chunks=(10**3,))
+    with pytest.raises(InputError, match="not stored in one piece"):
         Paths.load(tmp_path / "paths.h5")
 
 
 @pytest.mark.parametrize("name", ["version", "frequency_hz"])
 def test_missing_attribute(paths: Paths, tmp_path: Path, name: str) -> None:
     paths.save(tmp_path / "paths.h5")
-    with h5py.File(tmp_path / "paths.h5", "a") as file:
+    with changed(tmp_path / "paths.h5") as file:
         del file.attrs[name]
     with pytest.raises(InputError, match=r"paths\.h5: .*trace again"):
         Paths.load(tmp_path / "paths.h5")

@@ -145,7 +145,8 @@ def test_missing_mesh(tmp_path: Path) -> None:
 
 def test_damaged_mesh_is_told_by_the_tracer(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
-    (tmp_path / "meshes" / "floor.ply").write_text("ply\nformat ascii 1.0\nnonsense\n")
+    (tmp_path / "meshes" / "floor.ply").rename(tmp_path / "meshes" / "floor.obj")
+    file.write_text(file.read_text().replace("floor.ply", "floor.obj").replace('"ply"', '"obj"'))
     links = SimpleNamespace(tx=np.zeros((1, 3)), rx=np.ones((1, 3)))
     with pytest.raises(InputError, match=r"scene\.xml: Sionna RT cannot load the scene"):
         cb.trace(file, links, frequency=2e9, max_depth=0, samples=1)
@@ -291,3 +292,194 @@ def test_export_needs_every_material(tmp_path: Path) -> None:
             tmp_path / "scene.xml",
         )
     assert not list(tmp_path.iterdir())
+
+
+# Meshes and shapes that would end the process, or lose reflections in silence
+
+HEADER = """ply
+format {} 1.0
+element vertex {}
+property float x
+property float y
+property float z
+element face {}
+property list uchar int vertex_indices
+end_header
+"""
+CORNERS = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
+FACES = [[0, 1, 2], [0, 2, 3]]
+KINDS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def mesh(
+    kind: str = "ascii", corners: np.ndarray = CORNERS, faces: list[list[int]] = FACES, header: str = HEADER
+) -> bytes:
+    """A PLY file, its faces of any number of corners."""
+    head = header.format(kind, len(corners), len(faces)).encode()
+    if kind == "ascii":
+        rows = [*corners.tolist(), *([len(face), *face] for face in faces)]
+        return head + "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
+    order = KINDS[kind]
+    packed = [bytes([len(face)]) + np.array(face, dtype=f"{order}i4").tobytes() for face in faces]
+    return head + corners.astype(f"{order}f4").tobytes() + b"".join(packed)
+
+
+def scene_of(folder: Path, content: bytes) -> Path:
+    """A scene of one PLY mesh."""
+    file = write_scene(folder, FLOOR)
+    (folder / "meshes" / "floor.ply").write_bytes(content)
+    return file
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sound_meshes_pass_and_reflect(tmp_path: Path, kind: str) -> None:
+    links = SimpleNamespace(tx=np.array([[0.0, 0, 3]]), rx=np.array([[4.0, 0, 2]]))
+    file = scene_of(tmp_path, mesh(kind))
+    assert [entry.name for entry in read_scene(file, 2e9).objects] == ["floor"]
+    if kind != "binary_big_endian":
+        assert cb.trace(file, links, frequency=2e9, max_depth=1, samples=1000).num_paths == 2
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        HEADER.replace("\n", "\r\n"),
+        HEADER.replace("float", "double"),
+        HEADER.replace("vertex_indices", "vertex_index").replace("int", "uint"),
+        HEADER.replace("element vertex", "comment made by hand\nobj_info none\nelement vertex"),
+        HEADER.replace("end_header", "element edge 0\nproperty int a\nend_header"),
+    ],
+)
+def test_meshes_written_in_other_ways_pass(tmp_path: Path, header: str) -> None:
+    read_scene(scene_of(tmp_path, mesh(header=header)), 2e9)
+
+
+def test_meshes_with_more_columns_pass(tmp_path: Path) -> None:
+    header = HEADER.replace("property float z\n", "property float z\nproperty float red\n")
+    coloured = np.hstack([CORNERS, np.ones((4, 1))])
+    for kind in KINDS:
+        read_scene(scene_of(tmp_path, mesh(kind, coloured, header=header)), 2e9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("corners", "faces", "message"),
+    [
+        (CORNERS, [[0, 1, 2], [0, 2, 4]], r"face 1 names vertex 4, must be 0 to 3"),
+        (CORNERS, [[0, 1, 99_999_999], [0, 2, 3]], r"face 0 names vertex 1e\+08, must be 0 to 3"),
+        (CORNERS, [[0, 1, 2], [0, -1, 3]], r"face 1 names vertex -1, must be 0 to 3"),
+        (
+            CORNERS,
+            [[0, 1, 2, 3]],
+            "cut short|face 0 has 4 corners, must have 3|face of more than three corners",
+        ),
+        (np.where(CORNERS == 9, np.nan, CORNERS), FACES, r"x of vertex 1 is nan, must be finite"),
+        (np.where(CORNERS == 9, np.inf, CORNERS), FACES, r"x of vertex 1 is inf, must be finite"),
+        (CORNERS, [], "has no vertices or no faces"),
+        (CORNERS[:0], [], "has no vertices or no faces"),
+    ],
+)
+def test_malformed_meshes(
+    tmp_path: Path, kind: str, corners: np.ndarray, faces: list[list[int]], message: str
+) -> None:
+    """Sionna RT ends the process at the first, and loses the reflection of the second."""
+    with pytest.raises(InputError, match=rf"mesh .*floor\.ply: .*({message}).*; export it again") as caught:
+        read_scene(scene_of(tmp_path, mesh(kind, corners, faces)), 2e9)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_meshes_cut_or_flipped_anywhere_are_refused_or_as_sound_as_any(tmp_path: Path, kind: str) -> None:
+    whole, random = mesh(kind), np.random.default_rng(3)
+    file = scene_of(tmp_path, whole)
+    body = whole.index(b"end_header") + 11
+    for cut in random.integers(len(whole) - 4, size=40):
+        (tmp_path / "meshes" / "floor.ply").write_bytes(whole[:cut])
+        with pytest.raises(InputError, match=r"floor\.ply"):
+            read_scene(file, 2e9)
+    for place in random.integers(body if kind == "ascii" else len(whole), size=150):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(random.integers(8))
+        (tmp_path / "meshes" / "floor.ply").write_bytes(flipped)
+        try:
+            read_scene(file, 2e9)
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"ply", b"plx", "is no PLY file"),
+        (b"end_header", b"end_of_it", "its header has no end"),
+        (b"format ascii 1.0\n", b"", "its header names no format"),
+        (b"ascii", b"morse", "cannot read its header's line 'format morse 1.0'"),
+        (b"vertex 4", b"vertex 9999999999999999", "is cut short"),
+        (b"vertex 4", b"vertex -4", "cannot read its header's line"),
+        (b"vertex 4", b"vertex " + b"9" * 5000, "cannot read its header's line"),
+        (b"float x", b"float w", "its vertices have no x"),
+        (b"float x", b"float y", "cannot be read"),
+        (b"list uchar int vertex_indices", b"list uchar int holes", "cannot be read"),
+        (b"list uchar int vertex_indices", b"int a", "no corners|cut short|face"),
+        (b"9.0", b"nine", "is cut short|holds what is no number"),
+        (b"9.0", b"\xff\xfe", "holds what is no number"),
+    ],
+)
+def test_malformed_headers(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    with pytest.raises(InputError, match=rf"floor\.ply: .*({message})"):
+        read_scene(scene_of(tmp_path, mesh().replace(old, new, 1)), 2e9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"ply"', '"sphere"', "shape 'mesh-floor' is a 'sphere', must be one of cube, obj, ply"),
+        ('"ply"', '"shapegroup"', "is a 'shapegroup', must be one of"),
+        ('type="ply"', "", "is a '', must be one of"),
+        ('<string name="filename" value="meshes/floor.ply"/>', "", "shape 'mesh-floor' names no file"),
+        ("floor.ply", "f" * 5000 + ".ply", r"mesh 'meshes/ff.*\.\.\..*' of shape 'mesh-floor' does not exist"),
+        ("floor.ply", "", "mesh 'meshes/' of shape 'mesh-floor' does not exist"),
+        ("floor.ply", "&#0;", "is not well-formed XML"),
+        ("<shape", '<include filename="more.xml"/><shape', "<include> is not supported"),
+        (
+            "<shape",
+            '<texture type="bitmap"><string name="filename" value="wood.png"/></texture><shape',
+            "file 'wood.png' of a texture does not exist; .*remove the texture",
+        ),
+        (
+            "<shape",
+            '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter><shape',
+            "file 'sky.exr' of a emitter does not exist",
+        ),
+        ("<shape", "<a>" * 100 + "</a>" * 100 + "<shape", "more than 64 deep in each other"),
+        ("<shape", "<a>" * 300_000, "more than 64 deep in each other"),
+        ("<scene", '<?xml version="1.0" encoding="banana"?><scene', "is not well-formed XML .*unknown encoding"),
+        ("<scene", '<?xml version="1.0" encoding="utf-32"?><scene', "is not well-formed XML .*as UTF-8"),
+        (
+            "<scene",
+            '<!DOCTYPE s [<!ENTITY x SYSTEM "file:///dev/zero">]><scene a="&x;"',
+            "is not well-formed XML .*external entity",
+        ),
+        (
+            "<scene",
+            '<!DOCTYPE s [<!ENTITY a0 "aaaaaaaaaa">'
+            + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
+            + ']><scene a="&a9;"',
+            "is not well-formed XML",
+        ),
+    ],
+    ids=lambda value: value[:20],
+)  # fmt: skip
+def test_scenes_that_cannot_be_taken(tmp_path: Path, old: str, new: str, message: str) -> None:
+    file = write_scene(tmp_path, FLOOR)
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as caught:
+        read_scene(file, 2e9)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("name", ["s" * 5000 + ".xml", "a\0b.xml", "sionna:" + "x" * 5000, "sionna:a\0b"])
+def test_names_that_no_file_can_have(name: str) -> None:
+    with pytest.raises(InputError, match=r"does not exist|bundles no such scene"):
+        read_scene(name, 2e9)

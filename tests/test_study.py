@@ -286,7 +286,7 @@ def test_all_faults_are_told_at_once_a_line_each(folder):
 def test_files_that_are_no_study(folder):
     with pytest.raises(InputError, match=r"none\.toml: no such study file"):
         Study.load(folder / "none.toml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="no such study file"):
         Study.load(folder)
     assert "study.toml: not valid TOML:" in (message := refusal(folder, "version = 1\n[scene\n"))
     assert "line 2" in message
@@ -368,3 +368,147 @@ def test_reading_a_study_imports_neither_tracer_nor_jax():
     script = "import calibray.study, sys; print(*{'jax', 'sionna', 'mitsuba', 'drjit'} & set(sys.modules))"
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == ""
+
+
+# Settings of methods
+
+
+def options_of(folder, method, options):
+    text = FULL.replace('name = "gwo"', f'name = "{method}"').replace("{ population = 10 }", options)
+    return load(folder, text).method.options
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("gwo", "{ population = 12, centred = true }"),
+        ("sgwo-im", "{ w_min = 0.2, w_max = 1, kernel = 'linear', surrogate = false }"),
+        ("vector-surrogate", "{ budget = 50, tolerance = 1e-3, noisy = true }"),
+        ("least-squares", "{ starts = 4, x0 = [[1.0, 2], [3, 4.5]] }"),
+        ("auto", "{ anything = 3 }"),
+    ],
+)
+def test_settings_of_methods_are_read(folder, method, options):
+    assert options_of(folder, method, options) == tomllib.loads(f"options = {options}")["options"]
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("gwo", "{ wolves = 3 }", "wolves: the method 'gwo' has no such setting; there are: "),
+        ("gwo", "{ populatoin = 3 }", "the method 'gwo' has no such setting; did you mean 'population'?"),
+        ("gwo", "{ seed = 3 }", "seed: the method 'gwo' has no such setting"),
+        ("gwo", "{ lower = [3] }", "lower: the method 'gwo' has no such setting"),
+        ("gwo", "{ centred = 'x' }", "centred = 'x': must be true or false"),
+        ("gwo", "{ centred = 1 }", "centred = 1: must be true or false"),
+        ("gwo", "{ population = '9' }", "population = '9': must be a whole number"),
+        ("gwo", "{ population = true }", "population = True: must be a whole number"),
+        ("gwo", "{ population = 9.5 }", "population = 9.5: must be a whole number"),
+        ("gwo", "{ population = nan }", "population = nan: must be a finite number"),
+        ("gwo", "{ population = 10000000 }", "population = 10000000: must be at most 1,000,000"),
+        ("gwo", "{ population = -9999999999999999 }", "must be at most 1,000,000"),
+        ("gwo", "{ population = { a = 1 } }", "must be a number, a text, true, false, or a list of them"),
+        ("gwo", "{ population = 2024-01-01 }", "must be a whole number"),
+        ("sgwo-im", "{ w_min = nan }", "w_min = nan: must be a finite number"),
+        ("sgwo-im", "{ w_max = -inf }", "w_max = -inf: must be a finite number"),
+        ("sgwo-im", "{ w_max = true }", "w_max = True: must be a number"),
+        ("sgwo-im", "{ kernel = 3 }", "kernel = 3: must be text in quotes"),
+        ("least-squares", "{ x0 = [1.0, nan] }", "must be a finite number"),
+        ("least-squares", "{ x0 = [[[[1.0]]]] }", "must be a list of at most"),
+        ("auto", "{ anything = inf }", "anything = inf: must be a finite number"),
+        ("auto", "{ anything = '" + "a" * 20_000 + "' }", "...aaaaaaa"),
+    ],
+)
+def test_settings_that_no_method_takes(folder, method, options, message):
+    with pytest.raises(InputError) as caught:
+        options_of(folder, method, options)
+    text = str(caught.value)
+    assert "study.toml: method.options." in text
+    assert message in text
+    assert "\n" not in text
+    assert len(text) < 600
+
+
+# Sizes
+
+
+def many(count, content):
+    """A study of many materials with some parameters each."""
+    return {
+        "version": 1,
+        "scene": {"file": "s.xml", "frequency": 3.5e9},
+        "links": {"file": "l.csv", "tx": [0, 0, 1], "rx": ["x", "y", 1], "value": "v"},
+        "parameters": {f"wall-{k}.{field}": entry for k in range(count) for field, entry in content.items()},
+    }
+
+
+def test_ten_thousand_parameters_and_no_more():
+    """Quadratic loops took minutes."""
+    constant = {"relative_permittivity": {"bounds": [1.5, 12.0]}}
+    laws = {"itu_a": {"bounds": [2.0, 6.0], "start": 3.0}, "itu_b": {"bounds": [-0.1, 0.1], "start": 0.0}}
+    base = {f"wall-{k}": Material(5.0, 0.1, 0.3) for k in range(10_000)}
+    for count, content in ((10_000, constant), (5_000, laws)):
+        parameters = Study.from_content(many(count, content)).parameter_set(base)
+        assert len(parameters) == 10_000
+        changed = parameters.materials(parameters.lower, base)
+        assert changed["wall-4999"].relative_permittivity < 5.0
+    with pytest.raises(InputError, match="parameters: 10001, must be at most 10000"):
+        Study.from_content(many(10_001, constant))
+
+
+def test_many_and_long_faults_make_a_short_message():
+    content = many(500, {"relative_permittivity": {"bounds": "b" * 5000}})
+    with pytest.raises(InputError) as caught:
+        Study.from_content(content)
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 21
+    assert lines[-1] == "study.toml: and 480 more like these; correct them first"
+    assert max(map(len, lines)) < 250
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "version = " + "9" * 5000,
+        "version = 0x" + "f" * 5000,
+        "version = " + "[" * 5000 + "]" * 5000,
+        "version = [" * 3000,
+        "a." * 3000 + "b = 1",
+        "version = 1e999",
+        "version = nan",
+        "version = 1\n\0 = 2",
+        "version = '\ud800'",
+        'engine = { name = ["replay"] }',
+        "engine = 3",
+        "[engine]\nname = {}",
+        "[method]\nname = 3\noptions = 4",
+        "[links]\nfile = '" + "f" * 5000 + "'",
+        '[links]\nfile = "a\\u0000b"',
+        "[parameters]\n'" + "p" * 100_000 + "' = 3",
+        "parameters = 3",
+        "trace = { samples = 99999999999999999999 }",
+        "trace = { max_depth = 1000 }",
+        "trace = { seed = 99999999999999999999 }",
+        "fidelity = { rounds = 1000000 }",
+    ],
+    ids=lambda text: ascii(text[:30]),
+)
+def test_bombs_and_oddities_in_a_study_file(tmp_path, text):
+    path = tmp_path / "study.toml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(InputError) as caught:
+        Study.load(path)
+    assert str(path) in str(caught.value)
+    assert max(map(len, str(caught.value).splitlines())) < 1000
+
+
+@pytest.mark.parametrize("file", ["f" * 5000, "a\\u0000b", "/dev/zero"])
+def test_files_that_cannot_be_are_named(folder, file):
+    with pytest.raises(InputError, match=r"study\.toml: links\.file = .*: no such file"):
+        load(folder, MINIMAL.replace("links.csv", file))
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "s" * 5000, "a\0b"])
+def test_a_study_that_is_no_file(name):
+    with pytest.raises(InputError, match="no such study file"):
+        Study.load(name)

@@ -16,6 +16,21 @@ TABLES: Final = (".csv", ".parquet")
 PARTIAL: Final = ".part"  # what the name of an unfinished file ends with
 
 
+def exists(file: str | Path) -> bool:
+    """Whether there is a file of a name; none has a name that no file can have.
+
+    Args:
+        file: The file.
+
+    Returns:
+        True for a file, also through a link; False for a folder, a device or nothing.
+    """
+    try:
+        return Path(file).is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def check_folder(folder: str | Path) -> Path:
     """Refuse a folder that no file can be written into; nothing is made yet.
 

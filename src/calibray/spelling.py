@@ -1,9 +1,20 @@
-"""The tail of a message about an unknown name: what was perhaps meant, or what there is."""
+"""The words of messages: what was perhaps meant by an unknown name, and values short enough to be read."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from itertools import islice
+from typing import Final
+
+LONGEST: Final = 80
+"""The number of characters beyond which a value is shortened in a message."""
+
+LISTED: Final = 20
+"""The number of names beyond which a message does not list them all."""
+
+COMPARED: Final = 2_000
+"""The number of names beyond which a misspelled one is not compared with the rest."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -14,7 +25,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         known: The names there are.
 
     Returns:
-        ``did you mean 'x'?`` when one name is close, else all names.
+        ``did you mean 'x'?`` when one name is close, else the names, the first twenty where there are more.
 
     Example:
         >>> did_you_mean("concret", ["brick", "concrete"])
@@ -23,6 +34,30 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         'there are: brick, concrete'
     """
     names = [str(known_name) for known_name in known]
-    if close := get_close_matches(str(name), names, n=1):
+    compared = [each for each in islice(names, COMPARED) if len(each) <= LONGEST]
+    if len(str(name)) <= LONGEST and (close := get_close_matches(str(name), compared, n=1)):
         return f"did you mean {close[0]!r}?"
-    return f"there are: {', '.join(names)}" if names else "there are none"
+    if not names:
+        return "there are none"
+    more = f", ... ({len(names)} in all)" if len(names) > LISTED else ""
+    return f"there are: {', '.join(shortened(each) for each in names[:LISTED])}{more}"
+
+
+def shortened(text: str, longest: int = LONGEST) -> str:
+    """A text for a message, its middle left out where it is long.
+
+    Args:
+        text: The text.
+        longest: The number of characters it may have.
+
+    Returns:
+        The text, or its beginning and its end.
+
+    Example:
+        >>> shortened("abcdefghijkl", longest=9)
+        'abc...jkl'
+    """
+    if len(text) <= longest:
+        return text
+    half = (longest - 3) // 2
+    return f"{text[:half]}...{text[-half:]}"

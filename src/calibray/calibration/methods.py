@@ -54,14 +54,17 @@ def choose(problem: Problem) -> Optimizer:
     if METHODS[name].needs_derivatives() and not problem.differentiable:
         raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
     engine, parameters = problem.engine, problem.parameters
-    return optimizers.make(
-        name,
-        *parameters.search_bounds,
-        section.seed,
-        start=parameters.to_search(parameters.start),
-        starts=local_searches(engine.interactions) if isinstance(engine, Differentiable) else None,
-        options=section.options,
-    )
+    try:
+        return optimizers.make(
+            name,
+            *parameters.search_bounds,
+            section.seed,
+            start=parameters.to_search(parameters.start),
+            starts=local_searches(engine.interactions) if isinstance(engine, Differentiable) else None,
+            options=section.options,
+        )
+    except InputError as error:
+        raise InputError(f"{problem.setup.study.path}: method.options: {error}") from None
 
 
 def local_searches(interactions: int) -> int:

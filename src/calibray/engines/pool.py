@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
+from socket import create_connection, gaierror
+from time import monotonic, sleep
+from typing import Final
 
 from calibray.errors import InputError
+from calibray.spelling import shortened
 
-PATIENCE = 30  # how long to wait for a scheduler [s]
+PATIENCE = 30
+"""How long to wait for a scheduler [s]."""
+
+_ADDRESS: Final = re.compile(
+    r"(?:(?:tcp|tls|wss?)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]{1,253}):(?P<port>[0-9]{1,5})"
+)
 
 
 @contextmanager
@@ -47,10 +57,44 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
         from distributed import Client
     except ImportError:
         raise InputError("--scheduler needs Dask; install it with: pip install 'calibray[dask]'") from None
+    _await_scheduler(scheduler)
     try:
         client = Client(scheduler, timeout=PATIENCE)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error})") from None
+    # Whatever another program than a scheduler makes of Dask's greeting.
+    except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        raise _no_scheduler(scheduler, str(error)) from None
     with client:
         # A worker that dies gives its calls back to the scheduler, which gives them to others.
         yield client.get_executor(pure=False)
+
+
+def _await_scheduler(scheduler: str) -> None:
+    """Wait until something answers at an address; Dask itself would leave noise behind where nothing does.
+
+    Raises:
+        InputError: It is no address, or nothing answers there.
+    """
+    match = _ADDRESS.fullmatch(scheduler)
+    if match is None or not 1 <= int(match["port"]) <= 65_535:
+        raise InputError(
+            f"--scheduler {shortened(scheduler)}: is no address; give host and port, as tcp://10.0.0.1:8786"
+        )
+    host, end = match["host"].strip("[]"), monotonic() + PATIENCE
+    while True:
+        try:
+            create_connection((host, int(match["port"])), timeout=PATIENCE).close()
+        except (gaierror, UnicodeError) as error:
+            raise _no_scheduler(scheduler, str(error)) from None
+        except OSError as error:
+            if monotonic() > end:
+                raise _no_scheduler(scheduler, str(error)) from None
+            sleep(0.5)
+        else:
+            return
+
+
+def _no_scheduler(scheduler: str, fault: str) -> InputError:
+    return InputError(
+        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one, "
+        "or correct the address"
+    )

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.measurements.summary import summary
 from calibray.measurements.tables import Table
+from calibray.spelling import shortened
 from calibray.tables import glance
 from calibray.tables.glance import named
 
@@ -199,7 +200,7 @@ class Measurements:
         for part, mask in (("the hold-out", held_out), ("calibration", ~held_out)):
             if not mask.any():
                 raise InputError(
-                    f"{self.source}: where = {holdout!r} leaves no link for {part}; change the filter"
+                    f"{self.source}: where = {shortened(holdout)!r} leaves no link for {part}; change the filter"
                 )
         return held_out
 

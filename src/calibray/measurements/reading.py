@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements.links import Measurements
 from calibray.measurements.tables import Table, read_table
-from calibray.spelling import did_you_mean
+from calibray.spelling import did_you_mean, shortened
 
 Quantity = Literal["path_loss", "path_gain", "received_power"]
 Coordinates = Sequence[float | str]
@@ -52,7 +52,7 @@ def read_measurements(
         rx: Receiver position, likewise.
         value: Column of the measured values.
         quantity: What they are: "path_loss" [dB], "path_gain" [dB], or "received_power" [dBm].
-        where: Filter over the columns (a pandas query); rows that do not pass are left out before any check.
+        where: Filter over the columns (see `filters`); rows that do not pass are left out before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
         std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
@@ -72,7 +72,7 @@ def read_measurements(
         mask = table.where(where)
         if not mask.any():
             raise InputError(
-                f"{path}: where = {where!r} lets none of {len(table)} rows pass; change the filter"
+                f"{path}: where = {shortened(where)!r} lets none of {len(table)} rows pass; change the filter"
             )
         table = table.select(mask)
     measurements = Measurements(

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.spelling import did_you_mean
-
-FILTER_METHODS: Final = (
-    *("abs", "between", "isin", "isna", "notna"),
-    *("contains", "endswith", "lower", "startswith", "strip", "upper"),
-)
-"""The methods that a row filter may call; pandas itself would let a filter write files."""
+from calibray.files import exists
+from calibray.measurements.filters import evaluate
+from calibray.spelling import did_you_mean, shortened
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +47,7 @@ class Table:
         """Evaluate a row filter.
 
         Args:
-            expression: A pandas query over the columns, for instance ``"gpsmode == 4 and rx_x_m < -55"``.
+            expression: A filter over the columns (see `filters`), for instance ``"gpsmode == 4 and rx_x_m < -55"``.
 
         Returns:
             The mask [rows] of the rows that pass; a row for which the answer is unknown does not.
@@ -61,22 +55,10 @@ class Table:
         Raises:
             InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
         """
-        place = f"{self.source}: where = {expression!r}"
-        called = re.findall(r"\.\s*(\w+)\s*\(", expression)
-        if unsafe := next((name for name in called if name not in FILTER_METHODS), ""):
-            raise InputError(f"{place}: {unsafe}() is not allowed; {did_you_mean(unsafe, FILTER_METHODS)}")
         try:
-            # Empty scopes: a filter sees the columns and nothing of the program.
-            result = self.frame.eval(expression, engine="python", local_dict={}, global_dict={})
-        except NameError as error:
-            name = str(error).split("'")[1] if "'" in str(error) else str(error)
-            raise InputError(f"{place}: no column {name!r}; {did_you_mean(name, self.frame)}") from None
-        except Exception as error:  # pandas passes on whatever the expression's own operations raise
-            columns = ", ".join(map(str, self.frame))
-            raise InputError(f"{place}: not a valid filter ({error}); the columns are {columns}") from None
-        if not isinstance(result, pd.Series) or not pd.api.types.is_bool_dtype(result.dtype):
-            raise InputError(f"{place}: must be true or false for each row, for instance \"set == 'LOS'\"")
-        return result.to_numpy(dtype=bool, na_value=False)
+            return evaluate(expression, self.frame)
+        except InputError as error:
+            raise InputError(f"{self.source}: where = {shortened(expression)!r}: {error}") from None
 
     def column(self, name: str) -> pd.Series:
         """One column.
@@ -154,8 +136,8 @@ def read_table(path: str | Path) -> Table:
             and pyarrow is not installed.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    if not exists(path):
+        raise InputError(f"{shortened(str(path), 300)}: no such file")
     match path.suffix.lower():
         case ".csv":
             table = _read_csv(path)

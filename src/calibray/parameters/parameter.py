@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Final, Literal, get_args
@@ -207,7 +207,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
     return float(getattr(material, field))
 
 
-def check_material(name: str, materials: Mapping[str, Material] | Sequence[str]) -> None:
+def check_material(name: str, materials: Collection[str]) -> None:
     """Refuse a parameter of a material that a scene lacks.
 
     Args:

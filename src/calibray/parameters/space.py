@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -16,6 +17,9 @@ from calibray.parameters.parameter import Parameter, check_material
 
 _NO_LAW: Final = steady_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300
+
+MAX_PARAMETERS: Final = 10_000
+"""The number of parameters beyond which a study is refused."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +52,16 @@ class Parameters:
         object.__setattr__(self, "items", tuple(self.items))
         if not self.items:
             raise InputError('parameters: none given; name at least one, as "walls.relative_permittivity"')
-        if twice := [name for index, name in enumerate(self.names) if name in self.names[:index]]:
+        if len(self.items) > MAX_PARAMETERS:
+            raise InputError(
+                f"parameters: {len(self.items)}, must be at most {MAX_PARAMETERS}; let objects share a material"
+            )
+        counts = Counter(self.names)
+        if twice := [name for name, count in counts.items() if count > 1]:
             raise InputError(f"parameters: {twice[0]!r} stands twice; remove one")
         for parameter in self.items:
             constant = f"{parameter.material}.{parameter.constant}"
-            if parameter.name != constant and constant in self.names:
+            if parameter.name != constant and constant in counts:
                 raise InputError(
                     f"parameters: {constant!r} is the same at every carrier and {parameter.name!r} belongs to its law; "
                     "remove one"
@@ -150,8 +159,8 @@ class Parameters:
             least = PARAMETER_BOUNDS[parameter.constant].lower
             lawful = Parameter(name, least, _UNBOUNDED, start) if name != parameter.name else parameter
             found.setdefault(name, lawful)
-        names = list(found)
-        places = [names.index(f"{parameter.material}.{parameter.constant}") for parameter in self.items]
+        order = {name: place for place, name in enumerate(found)}
+        places = [order[f"{parameter.material}.{parameter.constant}"] for parameter in self.items]
         return Parameters(tuple(found.values()), frequency), np.array(places, dtype=np.int64)
 
     def law(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
@@ -192,19 +201,14 @@ class Parameters:
 
     def _laws(self) -> Iterator[tuple[int | None, int | None, tuple[float, float]]]:
         """Places of the coefficient and the exponent of every law, None where fixed, and what they are fixed at."""
-        done = set()
+        done, order = set(), {name: place for place, name in enumerate(self.names)}
         for parameter in self.items:
             constant = parameter.constant
             if parameter.field == constant or (parameter.material, constant) in done:
                 continue
             done.add((parameter.material, constant))
             names = LAWS[constant]
-            places = [
-                self.names.index(f"{parameter.material}.{name}")
-                if f"{parameter.material}.{name}" in self.names
-                else None
-                for name in names
-            ]
+            places = [order.get(f"{parameter.material}.{name}") for name in names]
             law = self.laws.get(parameter.material, _NO_LAW)
             yield *places, tuple(getattr(law, name[-1]) for name in names)
 
@@ -256,10 +260,10 @@ class Parameters:
             raise InputError(
                 f"parameters {', '.join(self.names)}: a law stands in no constants matrix; take them at a carrier"
             )
-        order = list(materials)
+        order = {name: row for row, name in enumerate(materials)}
         for name in self.names:
             check_material(name, order)
-        rows = np.array([order.index(parameter.material) for parameter in self.items], dtype=np.int64)
+        rows = np.array([order[parameter.material] for parameter in self.items], dtype=np.int64)
         columns = np.array([FIELDS.index(parameter.field) for parameter in self.items], dtype=np.int64)
         return rows, columns
 

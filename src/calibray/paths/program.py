@@ -18,13 +18,12 @@ import h5py
 import numpy as np
 
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.materials import FIELDS, Material
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
+from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, Content, read
+from calibray.paths.sealing import BLOCK, stamp, verify
 from calibray.paths.summary import as_html, as_text
-
-SCHEMA = "calibray/paths"
-SCHEMA_VERSION = 1
-
 
 Table = TypeVar("Table", Diffuse, Diffraction)
 
@@ -139,8 +138,9 @@ class Paths:
         target = Path(path)
         partial = target.with_name(target.name + ".part")
         try:
-            with h5py.File(partial, "w") as file:
+            with h5py.File(partial, "w", userblock_size=BLOCK) as file:
                 _write(self, file)
+            stamp(partial)
             partial.replace(target)
         except OSError as error:
             raise InputError(
@@ -162,24 +162,19 @@ class Paths:
             The path program, equal to the one saved.
 
         Raises:
-            InputError: The file does not exist, is no path file, or is of another schema version.
+            InputError: The file does not exist, is no path file, is of another schema version, is damaged, or has no
+                checksum (see `seal`).
         """
         source = Path(path)
-        if not source.is_file():
+        if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:
+            verify(source)
             with h5py.File(source, "r") as file:
-                if file.attrs.get("schema") != SCHEMA:
-                    raise InputError(
-                        f"{source}: is no Calibray path file (schema {file.attrs.get('schema')!r})"
-                    )
-                version = int(file.attrs["version"])
-                if version != SCHEMA_VERSION:
-                    raise InputError(
-                        f"{source}: has schema version {version}, need {SCHEMA_VERSION}; trace again"
-                    )
-                return _read(file)
-        except (OSError, KeyError) as error:
+                return _program(read(file))
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
             raise InputError(f"{source}: is damaged or no path file ({error}); trace again") from None
 
 
@@ -280,7 +275,7 @@ def _join(tables: list[Table]) -> Table:
 def _write(paths: Paths, file: h5py.File) -> None:
     file.attrs.update({"schema": SCHEMA, "version": SCHEMA_VERSION, "frequency_hz": paths.frequency})
     for key, value in paths.settings.items():
-        file.attrs[f"setting_{key}"] = value
+        file.attrs[f"{SETTING}{key}"] = value
     materials = file.create_group("materials")
     materials["name"] = np.array(list(paths.materials), dtype=h5py.string_dtype())
     materials["scattering_pattern"] = np.array(
@@ -288,50 +283,46 @@ def _write(paths: Paths, file: h5py.File) -> None:
     )
     for name in FIELDS:
         materials[name] = [getattr(material, name) for material in paths.materials.values()]
-    for group, names in _LAYOUT.items():
-        for name in names:
-            value = getattr(paths, name)
-            # MATLAB's h5read knows no complex type: real and imaginary part apart.
-            if np.iscomplexobj(value):
-                file[f"{group}/{name}_real"], file[f"{group}/{name}_imag"] = value.real, value.imag
-            else:
-                file[f"{group}/{name}"] = value
-    for table in (paths.diffuse, paths.diffraction):
-        for entry in fields(table):
-            file[f"{type(table).__name__.lower()}/{entry.name}"] = getattr(table, entry.name)
+    for name in DATASETS:
+        if not name.startswith("materials/"):
+            file[name] = _part(paths, name)
 
 
-def _read(file: h5py.File) -> Paths:
-    materials = file["materials"]
-    names = [name.decode() for name in materials["name"][()]]
-    patterns = [name.decode() for name in materials["scattering_pattern"][()]]
-    columns = {name: materials[name][()] for name in FIELDS}
-    arrays = {}
-    for group, entries in _LAYOUT.items():
-        for name in entries:
-            if f"{group}/{name}_real" in file:
-                arrays[name] = file[f"{group}/{name}_real"][()] + 1j * file[f"{group}/{name}_imag"][()]
-            else:
-                arrays[name] = file[f"{group}/{name}"][()]
+def _part(paths: Paths, name: str) -> np.ndarray:
+    """The array that a dataset holds; complex ones lie apart, for MATLAB's h5read knows no complex type."""
+    group, _, entry = name.partition("/")
+    record = getattr(paths, group) if group in _TABLES else paths
+    for suffix, part in (("_real", np.real), ("_imag", np.imag)):
+        if entry.endswith(suffix):
+            return part(getattr(record, entry.removesuffix(suffix)))
+    return getattr(record, entry)
+
+
+def _program(content: Content) -> Paths:
+    arrays = content.arrays
+    names, patterns = arrays["materials/name"].tolist(), arrays["materials/scattering_pattern"].tolist()
+    own: dict[str, np.ndarray] = {}
+    tables: dict[str, dict[str, np.ndarray]] = {group: {} for group in _TABLES}
+    for name, values in arrays.items():
+        group, _, entry = name.partition("/")
+        if entry.endswith("_real"):
+            entry, values = entry.removesuffix("_real"), values + 1j * arrays[f"{name[:-5]}_imag"]
+        if group != "materials" and not entry.endswith("_imag"):
+            tables.get(group, own)[entry] = values
     return Paths(
-        frequency=float(file.attrs["frequency_hz"]),
+        frequency=content.frequency,
         materials={
-            name: Material(**{key: float(columns[key][i]) for key in FIELDS}, scattering_pattern=patterns[i])
+            name: Material(
+                **{key: float(arrays[f"materials/{key}"][i]) for key in FIELDS},
+                scattering_pattern=patterns[i],
+            )
             for i, name in enumerate(names)
         },
-        **arrays,
-        diffuse=Diffuse(*(file[f"diffuse/{entry.name}"][()] for entry in fields(Diffuse))),
-        diffraction=Diffraction(*(file[f"diffraction/{entry.name}"][()] for entry in fields(Diffraction))),
-        settings={
-            key.removeprefix("setting_"): (value.item() if isinstance(value, np.generic) else value)
-            for key, value in file.attrs.items()
-            if key.startswith("setting_")
-        },
+        **own,
+        diffuse=Diffuse(**tables["diffuse"]),
+        diffraction=Diffraction(**tables["diffraction"]),
+        settings=content.settings,
     )
 
 
-_LAYOUT = {
-    "links": ("tx_position", "rx_position"),
-    "paths": (*_PATH_ARRAYS, "first"),
-    "interactions": _INTERACTION_ARRAYS,
-}
+_TABLES = ("diffuse", "diffraction")

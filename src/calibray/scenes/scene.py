@@ -12,7 +12,6 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -26,9 +25,9 @@ from calibray.materials import (
     itu_material,
 )
 from calibray.parameters.laws import steady_law
+from calibray.scenes.source import check_files, check_shape, parse, scene_path
 from calibray.spelling import did_you_mean
 
-BUNDLED_PREFIX: Final = "sionna:"
 DEFAULT_THICKNESS: Final = 0.1
 """Sionna's default for a material without one [m]."""
 
@@ -97,15 +96,16 @@ def read_scene(
             different materials, or a frequency lies outside an ITU range.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
-    path = _scene_path(str(source))
-    root = _parse(path, str(source))
+    path = scene_path(str(source))
+    root = parse(path, str(source))
     definitions = _bsdf_definitions(root)
     objects: list[SceneObject] = []
     materials: dict[str, Material] = {}
     laws: dict[str, ItuLaw] = {}
     origin: dict[str, str] = {}
+    order: dict[str, int] = {}
     for shape in root.findall("shape"):
-        _check_mesh(shape, path)
+        check_shape(shape, path)
         original, name = _materials_of(shape, definitions, split, path)
         if origin.setdefault(name, original) != original:
             raise InputError(
@@ -117,7 +117,7 @@ def read_scene(
             bsdf = definitions.get(original)
             materials[name] = _material(name, original, bsdf, constants, frequency, path)
             laws[name] = _law(materials[name], original, bsdf, constants, frequency)
-        _refer(shape, f"{TRACED}{list(materials).index(name)}")
+        _refer(shape, f"{TRACED}{order.setdefault(name, len(order))}")
         objects.append(SceneObject(_object_name(shape), name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
@@ -131,6 +131,7 @@ def read_scene(
         check_material_name(name, {**materials, **dict.fromkeys(origin.values())}, f"[materials] {name}")
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
+    check_files(root, path)
     for index, material in enumerate(materials.values()):
         root.insert(index, material_element(f"{TRACED}{index}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
@@ -151,40 +152,6 @@ def check_material_name(name: str, materials: Mapping[str, object], place: str) 
     if name in materials:
         return
     raise InputError(f"{place}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
-
-
-def _scene_path(source: str) -> Path:
-    if source.startswith(BUNDLED_PREFIX):
-        name = source.removeprefix(BUNDLED_PREFIX)
-        spec = find_spec("sionna")
-        if spec is None or not spec.submodule_search_locations:
-            raise InputError(f"scene {source!r}: sionna-rt is not installed; pip install sionna-rt")
-        folder = Path(next(iter(spec.submodule_search_locations))) / "rt" / "scenes"
-        path = folder / name / f"{name}.xml"
-        if not path.is_file():
-            known = sorted(
-                entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file()
-            )
-            raise InputError(f"scene {source!r}: Sionna RT bundles no such scene; it has {', '.join(known)}")
-        return path
-    path = Path(source)
-    if not path.is_file():
-        raise InputError(
-            f"scene file {source}: does not exist; check the path (or name a bundled one, sionna:munich)"
-        )
-    return path
-
-
-def _parse(path: Path, source: str) -> ElementTree.Element:
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise InputError(f"scene file {source}: is not well-formed XML ({error}); export it again") from None
-    if root.tag != "scene":
-        raise InputError(
-            f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>"
-        )
-    return root
 
 
 def _bsdf_definitions(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
@@ -242,15 +209,6 @@ def _merged(
     if isinstance(base, Material):
         return {**{name: getattr(base, name) for name in _MATERIAL_FIELDS}, **more}
     return {**base, **more}
-
-
-def _check_mesh(shape: ElementTree.Element, path: Path) -> None:
-    filename = shape.find("string[@name='filename']")
-    if filename is not None and not (path.parent / filename.get("value", "")).is_file():
-        raise InputError(
-            f"{path}: mesh {filename.get('value')!r} of shape {shape.get('id')!r} does not exist in {path.parent}; "
-            "copy the meshes folder beside the scene"
-        )
 
 
 def _material(

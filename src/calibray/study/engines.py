@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 from calibray.closed import CLOSED
 from calibray.engines.kinds import DEFAULT, KINDS
 from calibray.errors import InputError
+from calibray.spelling import shortened
 from calibray.study.faults import words
 
 
@@ -30,13 +31,14 @@ def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
         InputError: A value that another engine would take up is impossible for it.
     """
     # What is no table, or names no kind, is refused by the study itself.
-    if not isinstance(content, dict) or content.get("name", DEFAULT) not in KINDS:
+    name = content.get("name", DEFAULT) if isinstance(content, dict) else None
+    if not isinstance(name, str) or name not in KINDS:
         return content, {}
-    own = KINDS[content.get("name", DEFAULT)].model_fields
+    own = KINDS[name].model_fields
     known = {key: field for kind in KINDS.values() for key, field in kind.model_fields.items()}
     others = {key: value for key, value in content.items() if key not in own and key in known}
     for key, value in others.items():
-        _check(f"{source}: engine.{key} = {value!r}", known[key], value)
+        _check(f"{source}: engine.{key} = {shortened(repr(value))}", known[key], value)
     rest = {key: value for key, value in content.items() if key not in others}
     return {"name": DEFAULT, **rest}, others
 

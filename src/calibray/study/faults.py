@@ -10,7 +10,10 @@ from typing import Any, Final, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from calibray.errors import InputError
-from calibray.spelling import did_you_mean
+from calibray.spelling import did_you_mean, shortened
+
+MOST_FAULTS: Final = 20
+"""The number of faults beyond which the others are only counted."""
 
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -73,7 +76,10 @@ def explain(
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
         # A value that fits none of several types has one fault per type; the first says enough.
         lines.setdefault(key, line)
-    return InputError("\n".join(f"{source}: {line}" for line in lines.values()))
+    told = list(lines.values())[:MOST_FAULTS]
+    if more := len(lines) - len(told):
+        told.append(f"and {more} more like these; correct them first")
+    return InputError("\n".join(f"{source}: {line}" for line in told))
 
 
 def words(fault: Mapping[str, Any]) -> str:
@@ -98,7 +104,7 @@ def dotted(path: Sequence[str | int]) -> str:
         if isinstance(part, int):
             text += f"[{part}]"
         else:
-            name = f'"{part}"' if "." in part else part
+            name = shortened(f'"{part}"' if "." in part else part)
             text += f".{name}" if text else name
     return text
 
@@ -124,7 +130,7 @@ def _shown(path: Sequence[str | int], content: Any) -> str:
     """The value at a path, if it is short enough to help."""
     for part in path:
         content = content[part]
-    return "" if isinstance(content, Mapping) else f" = {content!r}"
+    return "" if isinstance(content, Mapping) else f" = {shortened(repr(content))}"
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:

@@ -18,10 +18,12 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator, model
 from calibray.closed import Section, Text
 from calibray.engines.kinds import DEFAULT, KINDS, AnyEngine
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, read_measurements
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
+from calibray.spelling import shortened
 from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
 from calibray.study.sections import (
@@ -133,16 +135,17 @@ class Study(Section):
                 names a scene or links that do not exist; one line for each fault.
         """
         path = Path(path)
+        if not exists(path):
+            raise InputError(f"{shortened(str(path), 300)}: no such study file")
         try:
             content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such study file") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
         except UnicodeDecodeError:
             raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{path}: not valid TOML: {error}") from None
+        except (ValueError, RecursionError) as error:
+            # A number of thousands of digits, or lists thousands deep, beside what TOML itself refuses.
+            raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
         study = cls.from_content(content, path)
         study._check_files()
         return study
@@ -166,7 +169,11 @@ class Study(Section):
         content = {**content, "engine": own}
         try:
             # By way of JSON, where lists pass for tuples and yet nothing is converted: "4" is no number.
-            study = cls.model_validate_json(json.dumps(content, default=str))
+            text = json.dumps(content, default=str)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
+        try:
+            study = cls.model_validate_json(text)
         except ValidationError as error:
             refusal = explain(error, cls, content, str(path), tagged=("engine",))
             raise refusal from None
@@ -351,8 +358,11 @@ class Study(Section):
                 written = getattr(self.antennas, end).pattern
                 files.append((f"antennas.{end}.pattern", written, antenna.gain_file))
         for key, written, file in files:
-            if not str(file).startswith(BUNDLED) and not Path(file).is_file():
-                raise InputError(f"{self._path}: {key} = {written!r}: no such file, {Path(file).resolve()}")
+            if not str(file).startswith(BUNDLED) and not exists(file):
+                raise InputError(
+                    f"{self._path}: {key} = {shortened(written)!r}: no such file, "
+                    f"{shortened(str(Path(file).absolute()), 300)}"
+                )
 
 
 def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:

@@ -12,6 +12,7 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
 from calibray.parameters import Scale
+from calibray.study.options import check_options
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _Antenna = checked(Antenna, config=CLOSED, frozen=True)
@@ -202,7 +203,7 @@ class FidelitySection(Section):
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
-    rounds: Annotated[int, Field(ge=0)] = 3
+    rounds: Annotated[int, Field(ge=0, le=100)] = 3
 
 
 class MethodSection(Section):
@@ -215,5 +216,10 @@ class MethodSection(Section):
     """
 
     name: Text = "auto"
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _usable(self) -> Self:
+        check_options(self.name, self.options)
+        return self

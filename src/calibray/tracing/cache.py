@@ -1,14 +1,17 @@
 """Traces kept between runs: the same scene, links, antennas, settings and versions are traced once.
 
 The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` switches it off.
+An entry that is damaged is dropped with a line in the log, which Python writes to stderr unless told otherwise.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +26,7 @@ from calibray.scenes import Scene
 from calibray.tracing.settings import Antenna, TraceSettings
 
 VARIABLE: Final = "CALIBRAY_CACHE"
+_LOG: Final = logging.getLogger(__name__)
 
 
 def trace_digest(
@@ -50,7 +54,7 @@ def trace_digest(
     """
     record = {
         "calibray": version("calibray"),
-        "schema": SCHEMA_VERSION,
+        "schema": [SCHEMA_VERSION, "sealed"],
         "tracer": dict(versions),
         "frequency": frequency,
         "settings": settings.record(),
@@ -68,7 +72,7 @@ def trace_digest(
 
 
 def find(digest: str) -> Paths | None:
-    """The trace with a fingerprint, or None if there is none that can be read.
+    """The trace with a fingerprint, or None if there is none; one that cannot be read is dropped.
 
     Args:
         digest: The fingerprint.
@@ -81,9 +85,10 @@ def find(digest: str) -> Paths | None:
         return None
     try:
         return Paths.load(path)
-    # Left by another version, or damaged: trace again.
-    except InputError:
-        path.unlink(missing_ok=True)
+    except InputError as error:
+        _LOG.warning("Kept trace dropped, tracing again: %s", error)
+        with suppress(OSError):
+            path.unlink()
         return None
 
 

@@ -8,11 +8,12 @@ of the lattice of all rays, and the launches together send out the rays that one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Final
+from typing import Final, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.tracing.settings import TraceSettings
 
@@ -47,6 +48,40 @@ class Launch:
     last: bool
 
 
+class Launches(Sequence[Launch]):
+    """The launches of a trace, each made when it is asked for: of 10^12 rays there are too many to be kept.
+
+    Args:
+        receivers: Transmitter [3], [m] and links [n] of each set of receivers that are traced together.
+        settings: The tracer's switches.
+        pieces: Number of launches to each set of receivers.
+    """
+
+    def __init__(
+        self,
+        receivers: Sequence[tuple[NDArray[np.float64], NDArray[np.int64]]],
+        settings: TraceSettings,
+        pieces: int,
+    ) -> None:
+        self._receivers, self._settings, self._pieces = receivers, settings, pieces
+
+    def __len__(self) -> int:
+        return len(self._receivers) * self._pieces
+
+    @overload
+    def __getitem__(self, index: int) -> Launch: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Launch]: ...
+    def __getitem__(self, index: int | slice) -> Launch | Sequence[Launch]:
+        if isinstance(index, slice):
+            return [self[place] for place in range(*index.indices(len(self)))]
+        place, piece = divmod(range(len(self))[index], self._pieces)
+        source, links = self._receivers[place]
+        first, end = (self._settings.samples * k // self._pieces for k in (piece, piece + 1))
+        seed, last = _seed(self._settings.seed, piece), piece == self._pieces - 1
+        return Launch(source, links, first, end - first, seed, last)
+
+
 @dataclass(frozen=True)
 class Plan:
     """The launches of a trace.
@@ -57,7 +92,7 @@ class Plan:
         buffer: Bytes of the buffer that holds the paths of a launch.
     """
 
-    launches: tuple[Launch, ...]
+    launches: Sequence[Launch]
     lanes: int
     buffer: int
 
@@ -80,20 +115,21 @@ def plan(tx: np.ndarray, settings: TraceSettings, lanes: int, buffer: int) -> Pl
         The launches.
     """
     depth = max(settings.max_depth, 1)
-    receivers = max(1, lanes // (settings.samples * depth))
+    together = max(1, lanes // (settings.samples * depth))
     pieces = min(settings.samples, -(-settings.samples * depth // lanes)) if settings.max_depth else 1
-    ends = np.linspace(0, settings.samples, pieces + 1).astype(np.int64).tolist()
     positions, group = np.unique(tx, axis=0, return_inverse=True)
-    launches = []
-    for k, position in enumerate(positions):
-        index = np.flatnonzero(group.reshape(-1) == k)
-        for part in np.array_split(index, -(-len(index) // receivers)):
-            launches += [
-                Launch(position, part, start, end - start, _seed(settings.seed, piece), end == ends[-1])
-                for piece, (start, end) in enumerate(pairwise(ends))
-            ]
-    largest = max(launch.rays * settings.max_depth * len(launch.links) for launch in launches)
-    return Plan(tuple(launches), largest, buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth))
+    members = np.split(
+        np.argsort(group.reshape(-1), kind="stable"), np.cumsum(np.bincount(group.reshape(-1)))[:-1]
+    )
+    receivers = [
+        (position, part)
+        for position, index in zip(positions, members, strict=True)
+        for part in np.array_split(index, -(-len(index) // together))
+    ]
+    rays = -(-settings.samples // pieces)
+    largest = rays * settings.max_depth * max(len(part) for _, part in receivers)
+    size = buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth)
+    return Plan(Launches(receivers, settings, pieces), largest, size)
 
 
 def _seed(seed: int, piece: int) -> int:

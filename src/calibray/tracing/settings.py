@@ -8,10 +8,14 @@ from math import isfinite
 from typing import Final
 
 from calibray.errors import InputError
+from calibray.spelling import shortened
 from calibray.tracing.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
+
+RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
+"""The numbers a trace may be given: no machine follows more, and Sionna RT's seeds have 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,7 @@ class TraceSettings:
     """Switches of the tracer, with Sionna RT's meaning.
 
     Attributes:
-        max_depth: Largest number of interactions of a path, at least 0.
+        max_depth: Largest number of interactions of a path, 0 to 100.
         line_of_sight: Find the direct path.
         specular_reflection: Follow specular reflections.
         refraction: Follow transmission through surfaces.
@@ -27,8 +31,8 @@ class TraceSettings:
         edge_diffraction: Let free edges diffract as well.
         diffraction_lit_region: Keep diffraction where the edge's source or image is in sight.
         diffuse_reflection: Follow diffuse reflections.
-        samples: Rays sent out per transmitter, at least 1.
-        seed: Seed of the tracer's random numbers, at least 0.
+        samples: Rays sent out per transmitter, 1 to 10^12.
+        seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
         InputError: A number lies outside its bound, or a switch is neither true nor false.
@@ -46,14 +50,16 @@ class TraceSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        least = {"max_depth": 0, "samples": 1, "seed": 0}
         for name, value in asdict(self).items():
-            if name not in least:
+            if name not in RANGES:
                 if not isinstance(value, bool):
-                    raise InputError(f"trace.{name} = {value!r}: must be true or false")
-            elif isinstance(value, bool) or not isinstance(value, int) or value < least[name]:
+                    raise InputError(f"trace.{name} = {shortened(repr(value))}: must be true or false")
+                continue
+            least, most = RANGES[name]
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(
-                    f"trace.{name} = {value!r}: must be a whole number of at least {least[name]}"
+                    f"trace.{name} = {shortened(repr(value))}: must be a whole number of at least {least} and at most "
+                    f"{most:,}"
                 )
 
     def record(self) -> dict[str, int | bool]:

@@ -32,8 +32,10 @@ def load(scene: Scene) -> rt.Scene:
         search.append(str(scene.path.parent.resolve()))
         mi.set_file_resolver(search)
         return load_scene_from_string(scene.xml)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{scene.path}: Sionna RT cannot load the scene: {str(error).strip()}") from None
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise InputError(
+            f"{scene.path}: Sionna RT cannot load the scene: {' '.join(str(error).split())}"
+        ) from None
     finally:
         mi.set_file_resolver(resolver)
 
