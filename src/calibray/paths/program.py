@@ -24,6 +24,7 @@ from calibray.paths.interactions import Diffraction, Diffuse, Kind
 from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, Content, read
 from calibray.paths.sealing import BLOCK, stamp, verify
 from calibray.paths.summary import as_html, as_text
+from calibray.paths.trial import survive
 
 Table = TypeVar("Table", Diffuse, Diffraction)
 
@@ -162,14 +163,15 @@ class Paths:
             The path program, equal to the one saved.
 
         Raises:
-            InputError: The file does not exist, is no path file, is of another schema version, is damaged, or has no
-                checksum (see `seal`).
+            InputError: The file does not exist, is no path file, is of another schema version, or is damaged. One from
+                before there were checksums is read by another process first.
         """
         source = Path(path)
         if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:
-            verify(source)
+            if not verify(source):
+                survive(source)
             with h5py.File(source, "r") as file:
                 return _program(read(file))
         except InputError as error:

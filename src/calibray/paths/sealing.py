@@ -66,28 +66,29 @@ def stamp(path: Path) -> None:
         file.write(block)
 
 
-def verify(path: Path) -> None:
+def verify(path: Path) -> bool:
     """Refuse a file that is not what was sealed.
 
     Args:
         path: The file.
 
+    Returns:
+        Whether it is sealed; files from before there were seals are not.
+
     Raises:
-        InputError: The file has no seal, or another content than when it was sealed; the message lacks its name.
+        InputError: The file is no HDF5 file, or has another content than when it was sealed; the message lacks its
+            name.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
         head = file.read(BLOCK)
-        if head.startswith(_MARK):
-            if _block(file) != head:
-                raise InputError("is damaged (its checksum does not agree); trace again")
-        elif head.startswith(_SIGNATURE):
-            raise InputError(
-                "has no checksum, so that nothing tells whether it is whole; trace again, or, where you trust it, "
-                f"seal it: python -c \"import calibray.paths as p; p.seal('{path}')\""
-            )
-        else:
+        if head.startswith(_SIGNATURE):
+            return False
+        if not head.startswith(_MARK):
             raise InputError("is damaged or no path file; trace again")
+        if _block(file) != head:
+            raise InputError("is damaged (its checksum does not agree); trace again")
+        return True
 
 
 def _block(file: BinaryIO) -> bytes:
