@@ -22,6 +22,8 @@ TABLE: Final = """CREATE TABLE IF NOT EXISTS claims (
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
 EXPIRY: Final = 300.0  # without a sign of life, of a run that the system cannot tell anything about [s]
 BEAT: Final = 60.0  # between signs of life [s]
+RELEASE_PATIENCE: Final = 500  # for a ledger that others write to [ms]
+_at_work: set[str] = set()  # the runs of this process
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
@@ -37,12 +39,13 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
         Those that no other run is on.
     """
     now, owner = time.time(), json.dumps(Owner.here().record())
+    _at_work.add(run)
     claimed = []
     for candidate in candidates:
         row = connection.execute(
             "SELECT run, owner, expires FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
         ).fetchone()
-        if row is None or row[0] == run or not _holds(row[1], row[2], now):
+        if row is None or row[0] == run or not _holds(*row, now):
             connection.execute(
                 "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?)",
                 (problem, candidate, run, owner, now + EXPIRY),
@@ -51,7 +54,7 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
     return claimed
 
 
-def _holds(owner: object, expires: object, now: float) -> bool:
+def _holds(run: object, owner: object, expires: object, now: float) -> bool:
     # A clock that was set back must not make a claim hold for longer than it could.
     if not isinstance(expires, float) or not now < expires <= now + 2 * EXPIRY:
         return False
@@ -59,7 +62,26 @@ def _holds(owner: object, expires: object, now: float) -> bool:
         holder = Owner.from_record(json.loads(owner))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return False
+    if holder == Owner.here():
+        return run in _at_work
     return holder is not None and not holder.gone
+
+
+def release(connection: sqlite3.Connection, run: str) -> None:
+    """Give up all claims of a run; where the ledger cannot be written, they end with the process.
+
+    Args:
+        connection: The ledger.
+        run: Whose the claims are.
+    """
+    _at_work.discard(run)
+    with suppress(sqlite3.Error):
+        (patience,) = connection.execute("PRAGMA busy_timeout").fetchone()
+        connection.execute(f"PRAGMA busy_timeout = {RELEASE_PATIENCE}")
+        try:
+            connection.execute("DELETE FROM claims WHERE run = ?", (run,))
+        finally:
+            connection.execute(f"PRAGMA busy_timeout = {patience}")
 
 
 @contextmanager

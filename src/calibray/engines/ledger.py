@@ -175,8 +175,7 @@ class Ledger:
             with claims.beating(self.path, self._run):
                 yield
         finally:
-            with suppress(sqlite3.Error):
-                self._connection.execute("DELETE FROM claims WHERE run = ?", (self._run,))
+            claims.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
         """Write an entry, unless another run was faster.
