@@ -99,7 +99,8 @@ def disturb(runner: subprocess.Popen, place: Path, name: str, kills: int, seed: 
     counts = Counter(harm.kind for harm in harms)
     print(
         f"{name:11}{found.kills:6}  {' '.join(f'{counts[kind]:>9}' for kind in SIGNALS + DISKS)}{len(found.asked):7}"
-        f"{len(found.committed):11}{again:13}{found.repeated:10}{found.lost:6}  {'yes' if same else 'NO ':4}{each:9.2f}",
+        f"{len(found.committed):11}{again:13}{found.repeated:10}{found.lost:6}  {'yes' if same else 'NO ':4}"
+        f"{each:9.2f}",
         flush=True,
     )
     return same and not found.repeated and not found.lost

@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 
+import h5py
 import pandas as pd
 import pytest
 
@@ -45,6 +46,13 @@ def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path)
         assert check_file(file, overwrite=True) == file
         write(file)
         assert check_file(file) == file
+
+
+def test_path_files_say_themselves_whose_they_are(tmp_path):
+    for schema, own in (("calibray/paths", True), ("other", False)):
+        with h5py.File(tmp_path / "paths.h5", "w") as file:
+            file.attrs["schema"] = schema
+        assert is_own(tmp_path / "paths.h5") == own
 
 
 def test_a_file_of_the_same_content_and_another_name_is_not_own(tmp_path):

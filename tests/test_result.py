@@ -11,6 +11,7 @@ import pytest
 import planted
 from calibray.calibration import calibrate
 from calibray.errors import InputError
+from calibray.files import SIGNATURES
 from calibray.result import FILES, Result
 from calibray.scenes import read_scene
 

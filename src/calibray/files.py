@@ -16,11 +16,12 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
-
-import pandas as pd
+from typing import TYPE_CHECKING, Final
 
 from calibray.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TABLES: Final = (".csv", ".parquet")
 PARTIAL: Final = ".part"  # what the name of an unfinished file ends with
@@ -134,12 +135,15 @@ def is_own(file: Path) -> bool:
         file: The file.
 
     Returns:
-        Whether it is signed; or a file of a result of the first version, which signed nothing.
+        Whether it is signed; or a path file, which says so itself; or a file of a result of the first version, which
+        signed nothing.
     """
     lines = _signatures(file.parent)
+    if _signature(file, file.name) in lines or _is_path_file(file):
+        return True
     if not lines:
         return file.name in FIRST_RESULT and _is_result(file.parent / FIRST_RESULT[0])
-    return _signature(file, file.name) in lines
+    return False
 
 
 def _signatures(folder: Path) -> list[str]:
@@ -153,6 +157,16 @@ def _sign(folder: Path, signature: str) -> None:
     if signature not in _signatures(folder):
         with (folder / SIGNATURES).open("a", encoding="utf-8") as stream:
             stream.write(f"{signature}\n")
+
+
+def _is_path_file(file: Path) -> bool:
+    import h5py
+
+    try:
+        with h5py.File(file, "r") as content:
+            return str(content.attrs.get("schema", "")).startswith("calibray/")
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
+        return False
 
 
 def _is_result(file: Path) -> bool:
