@@ -61,8 +61,13 @@ def soon(condition: Callable[[], bool]) -> bool:
     return condition()
 
 
+def a_time() -> str:
+    """Seconds to sleep for, of which no other test thinks."""
+    return f"4101.{time.time_ns() % 10**9:09d}"
+
+
 def sleeping(seconds: str) -> bool:
-    """Whether any process sleeps for so many seconds, which only one test names."""
+    """Whether any process sleeps for so many seconds."""
     lines = subprocess.run(
         ["ps", "-eo", "args"], capture_output=True, text=True, check=True
     ).stdout.splitlines()
@@ -100,16 +105,18 @@ def test_control_characters_do_not_reach_the_terminal(tmp_path):
 
 @LINUX
 @pytest.mark.parametrize(
-    ("script", "seconds", "timeout"),
+    ("script", "timeout"),
     [
-        ("setsid sleep 4101 & sleep 4101", "4101", 1.0),
-        ("(setsid sh -c 'sleep 4102 & sleep 4102' &) ; sleep 0.3; exit 1", "4102", 20.0),
-        (f"{ANSWER} (setsid nohup sleep 4103 >/dev/null 2>&1 &); sleep 0.3", "4103", 20.0),
-        (f"{ANSWER} (setsid sleep 4104 &); sleep 0.3", "4104", 20.0),  # it holds the pipes open
+        ("setsid sleep SECONDS & sleep SECONDS", 1.0),
+        ("(setsid sh -c 'sleep SECONDS & sleep SECONDS' &) ; sleep 0.3; exit 1", 20.0),
+        (f"{ANSWER} (setsid nohup sleep SECONDS >/dev/null 2>&1 &); sleep 0.3", 20.0),
+        # It holds the pipes open.
+        (f"{ANSWER} (setsid sleep SECONDS &); sleep 0.3", 20.0),
     ],
 )
-def test_every_child_is_gone_after_timeout_and_end(tmp_path, script, seconds, timeout):
-    outcome = shell(tmp_path, script, timeout).run(request())
+def test_every_child_is_gone_after_timeout_and_end(tmp_path, script, timeout):
+    seconds = a_time()
+    outcome = shell(tmp_path, script.replace("SECONDS", seconds), timeout).run(request())
     assert ("timeout" in outcome.failure) == (timeout == 1.0)
     assert bool(outcome.failure) == (ANSWER not in script)
     assert not sleeping(seconds)
@@ -123,7 +130,8 @@ from test_external_program import request, shell
 for line in sys.stdin:
     run = os.fork()  # imports once
     if not run:
-        shell(Path(sys.argv[2]), f"touch begun{line.strip()}; (setsid sleep 4105 &); sleep 4105").run(request())
+        script = f"touch begun{line.strip()}; (setsid sleep {sys.argv[3]} &); sleep {sys.argv[3]}"
+        shell(Path(sys.argv[2]), script).run(request())
     print(run, flush=True)
     os.waitpid(run, 0)
 """
@@ -131,7 +139,8 @@ for line in sys.stdin:
 
 @LINUX
 def test_when_calibray_is_killed_its_programs_and_folders_go_too(tmp_path, temporary):
-    command = [sys.executable, "-c", CALIBRAY, str(Path(__file__).parent), str(tmp_path)]
+    seconds = a_time()
+    command = [sys.executable, "-c", CALIBRAY, str(Path(__file__).parent), str(tmp_path), seconds]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(command, text=True, **pipes) as runner:
         for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT):
@@ -139,10 +148,10 @@ def test_when_calibray_is_killed_its_programs_and_folders_go_too(tmp_path, tempo
             runner.stdin.flush()
             run = int(runner.stdout.readline())
             assert soon((tmp_path / f"begun{int(number)}").exists)
-            assert soon(lambda: sleeping("4105"))
+            assert soon(lambda: sleeping(seconds))
             assert len(list(temporary.iterdir())) == 1
             os.kill(run, number)
-            assert soon(lambda: not sleeping("4105"))
+            assert soon(lambda: not sleeping(seconds))
             assert soon(lambda: not list(temporary.iterdir()))
         runner.kill()
 
