@@ -54,7 +54,7 @@ def test_files_in_hdf5(tmp_path):
 import sys, h5py, shutil
 shutil.copy(sys.argv[2], {folder!r} + "/kept.h5")
 with h5py.File(sys.argv[2]) as request, h5py.File(sys.argv[1], "w") as response:
-    response["path_loss_db"] = request["links/rx"][:, 0] + request["parameters/values"][1]
+    response["path_loss_db"] = 100 + request["links/rx"][:, 0] + request["parameters/values"][1]
 """
     (tmp_path / "model.py").write_text(program)
     programs.content(tmp_path)
@@ -63,7 +63,7 @@ with h5py.File(sys.argv[2]) as request, h5py.File(sys.argv[1], "w") as response:
     study = programs.study(tmp_path, command=command, format="hdf5")
     (tmp_path / "model.py").write_text(program)
     loss = engines.make(study).path_loss(CANDIDATES[:1])[0]
-    assert loss == pytest.approx(planted.links().rx_x + 4.0)
+    assert loss == pytest.approx(planted.links().rx_x + 104.0)
     with h5py.File(tmp_path / "kept.h5") as request:
         assert request.attrs["schema"] == "calibray.request"
         assert request["materials/marble"].attrs["relative_permittivity"] == 4.0

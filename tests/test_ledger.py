@@ -20,8 +20,8 @@ from calibray import engines
 from calibray.calibration import calibrate
 from calibray.cli.app import app
 from calibray.engines import Answer, Ledger, Recorded
+from calibray.engines.entry import LedgerEntry, key
 from calibray.engines.fingerprint import fingerprint
-from calibray.engines.ledger import Entry, key
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
@@ -57,7 +57,7 @@ class Counting:
         self.parameters, self.materials = PARAMETERS, {}
         self.calls, self.num_links, self.fails = 0, 2, fails
 
-    def answers(self, candidates):
+    def answers(self, candidates, stop=None):
         for index in reversed(range(len(candidates))):  # out of order, as a pool's are
             self.calls += 1
             total = candidates[index].sum()
@@ -72,13 +72,13 @@ class Counting:
 
 def test_an_entry_comes_back_bit_for_bit(ledger):
     loss = np.array([0.1 + 0.2, np.inf, -1e-310])
-    assert ledger.find("p", key(np.array([0.3, 1.0]))) is None
-    ledger.commit("p", key(np.array([0.3, 1.0])), Entry(loss, 1.5))
+    assert ledger.find("p", key(np.array([0.3, 1.0])), 3) is None
+    ledger.commit("p", key(np.array([0.3, 1.0])), LedgerEntry(loss, 1.5))
     with closing(Ledger(ledger.path)) as other:
-        found = other.find("p", key(np.array([0.3, 1.0])))
+        found = other.find("p", key(np.array([0.3, 1.0])), 3)
     assert (found.path_loss_db.tolist(), found.seconds, found.failure) == (loss.tolist(), 1.5, "")
-    assert ledger.find("p", key(np.array([0.1 + 0.2, 1.0]))) is None  # another double
-    assert ledger.find("q", key(np.array([0.3, 1.0]))) is None
+    assert ledger.find("p", key(np.array([0.1 + 0.2, 1.0])), 3) is None  # another double
+    assert ledger.find("q", key(np.array([0.3, 1.0])), 3) is None
 
 
 def test_zero_has_no_sign_in_a_key():
@@ -87,9 +87,9 @@ def test_zero_has_no_sign_in_a_key():
 
 def test_the_first_of_two_answers_stays(ledger):
     here = key(np.array([1.0, 2.0]))
-    assert ledger.commit("p", here, Entry(np.array([70.0]), 1.0)).path_loss_db.tolist() == [70.0]
+    assert ledger.commit("p", here, LedgerEntry(np.array([70.0]), 1.0)).path_loss_db.tolist() == [70.0]
     with closing(Ledger(ledger.path)) as other:
-        assert other.commit("p", here, Entry(np.array([71.0]), 1.0)).path_loss_db.tolist() == [70.0]
+        assert other.commit("p", here, LedgerEntry(np.array([71.0]), 1.0)).path_loss_db.tolist() == [70.0]
     assert len(ledger.table()) == 1
 
 
@@ -128,7 +128,7 @@ def test_an_engine_that_never_worked_leaves_nothing_behind(ledger):
 
 def test_a_batch_that_is_interrupted_keeps_what_had_arrived(ledger):
     class Interrupted(Counting):
-        def answers(self, candidates):
+        def answers(self, candidates, stop=None):
             yield next(super().answers(candidates))
             raise KeyboardInterrupt
 
@@ -142,12 +142,13 @@ def test_a_batch_that_is_interrupted_keeps_what_had_arrived(ledger):
 
 WRITER = """
 import sys, numpy as np
-from calibray.engines.ledger import Entry, Ledger, key
+from calibray.engines.entry import LedgerEntry, key
+from calibray.engines.ledger import Ledger
 name, first = sys.argv[2], int(sys.argv[3])
 ledger = Ledger(sys.argv[1])
 ledger.describe("shared", "command", ["a"])
 for k in range(first, first + 150):
-    ledger.commit("shared", key(np.array([float(k)])), Entry(np.array([float(k), len(name)]), 0.0))
+    ledger.commit("shared", key(np.array([float(k)])), LedgerEntry(np.array([float(k), len(name)]), 0.0))
 """
 
 

@@ -11,6 +11,7 @@ import pytest
 import planted
 from calibray.calibration import calibrate
 from calibray.errors import InputError
+from calibray.files import SIGNATURES
 from calibray.result import FILES, Result
 from calibray.scenes import read_scene
 
@@ -48,7 +49,7 @@ def folder(result, tmp_path):
 
 def test_what_is_saved_is_what_is_loaded(result, folder):
     loaded = Result.load(folder)
-    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, SIGNATURES])
     assert loaded.content() == result.content()
     assert loaded.materials == result.materials
     assert loaded.intervals == result.intervals

@@ -1,19 +1,38 @@
-"""Output files: refused before the work if they could not be written, and never half-written."""
+"""Output files: refused before the work if they could not be written, and never half-written.
+
+An output never takes the place of an input, of a link or a device, nor of a file that Calibray did not write or that
+was changed since. What it writes it signs: the digest and the name of each file stand in `.calibray` beside it.
+"""
 
 from __future__ import annotations
 
+import glob
+import hashlib
+import json
 import os
-from collections.abc import Iterator
+import stat
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
-
-import pandas as pd
+from typing import TYPE_CHECKING, Final
 
 from calibray.errors import InputError
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 TABLES: Final = (".csv", ".parquet")
 PARTIAL: Final = ".part"  # what the name of an unfinished file ends with
+SIGNATURES: Final = ".calibray"  # one line a file written, its SHA-256 and its name; only ever appended to
+FIRST_RESULT: Final = (
+    "result.json",
+    "links.csv",
+    "history.csv",
+    "scene.xml",
+)  # of the first version, not signed
+STALE: Final = 60.0  # age of an unfinished file whose process is gone [s]
 
 
 def exists(file: str | Path) -> bool:
@@ -52,17 +71,130 @@ def check_folder(folder: str | Path) -> Path:
     return target
 
 
-def check_file(file: str | Path) -> Path:
+def check_outputs(
+    folder: str | Path, names: Sequence[str], inputs: Iterable[Path] = (), overwrite: bool = False
+) -> Path:
+    """Refuse a folder that files cannot be written into, or that holds files in their place; nothing is made yet.
+
+    Args:
+        folder: The folder, which need not exist.
+        names: The files that will be written there.
+        inputs: Files that the work reads; none of them is ever replaced.
+        overwrite: Replace files that Calibray did not write.
+
+    Returns:
+        The folder's path.
+
+    Raises:
+        InputError: What `check_folder` refuses, or a file there must not be replaced.
+    """
+    target, sources = check_folder(folder), list(inputs)
+    for name in names:
+        check_replaceable(target / name, sources, overwrite)
+    return target
+
+
+def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
+    """Refuse to replace what must not be replaced; what does not exist may be written.
+
+    Args:
+        file: The output.
+        inputs: Files that the work reads; none of them is ever replaced.
+        overwrite: Replace a file that Calibray did not write.
+
+    Raises:
+        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that was
+            changed since, unless `overwrite`.
+    """
+    try:
+        status = file.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise InputError(
+            f"output file {file}: cannot be looked up ({error.strerror}); name another"
+        ) from None
+    if stat.S_ISLNK(status.st_mode):
+        raise InputError(f"output file {file}: is a link; name the file that it leads to, or another")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"output file {file}: is a folder, a device or a FIFO; name a file")
+    for source in inputs:
+        if source.exists() and file.samefile(source):
+            raise InputError(f"output file {file}: is an input of the study; name another")
+    if status.st_size and not overwrite and not is_own(file):
+        raise InputError(
+            f"output file {file}: was not written by Calibray, or was changed since; name another, move it away, or "
+            "give --overwrite"
+        )
+
+
+def is_own(file: Path) -> bool:
+    """Whether Calibray wrote a file as it is.
+
+    Args:
+        file: The file.
+
+    Returns:
+        Whether it is signed; or a path file, which says so itself; or a file of a result of the first version, which
+        signed nothing.
+    """
+    lines = _signatures(file.parent)
+    if _signature(file, file.name) in lines or _is_path_file(file):
+        return True
+    if not lines:
+        return file.name in FIRST_RESULT and _is_result(file.parent / FIRST_RESULT[0])
+    return False
+
+
+def _signatures(folder: Path) -> list[str]:
+    try:
+        return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+
+
+def _sign(folder: Path, signature: str) -> None:
+    if signature not in _signatures(folder):
+        with (folder / SIGNATURES).open("a", encoding="utf-8") as stream:
+            stream.write(f"{signature}\n")
+
+
+def _is_path_file(file: Path) -> bool:
+    import h5py
+
+    try:
+        with h5py.File(file, "r") as content:
+            return str(content.attrs.get("schema", "")).startswith("calibray/")
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
+        return False
+
+
+def _is_result(file: Path) -> bool:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and {"version", "study", "rmse_db", "rt_calls"} <= set(content)
+
+
+def _signature(file: Path, name: str) -> str:
+    with file.open("rb") as stream:
+        return f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name}"
+
+
+def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
     """Refuse a file that cannot be written; nothing is made yet.
 
     Args:
         file: The file, which need not exist; its folder must.
+        inputs: Files that the work reads; none of them is ever replaced.
+        overwrite: Replace a file that Calibray did not write.
 
     Returns:
         Its path.
 
     Raises:
-        InputError: It is a folder, or its folder does not exist or cannot be written.
+        InputError: It is a folder, its folder does not exist or cannot be written, or what `check_replaceable` refuses.
     """
     target = Path(file)
     if target.is_dir():
@@ -73,14 +205,17 @@ def check_file(file: str | Path) -> Path:
         )
     if not os.access(target.parent, os.W_OK | os.X_OK):
         raise InputError(f"output file {target}: {target.parent} cannot be written; name another")
+    check_replaceable(target, inputs, overwrite)
     return target
 
 
-def check_table(file: str | Path) -> Path:
+def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
     """Refuse a table that cannot be written; nothing is made yet.
 
     Args:
         file: The file; its ending says how it will be written.
+        inputs: Files that the work reads; none of them is ever replaced.
+        overwrite: Replace a file that Calibray did not write.
 
     Returns:
         Its path.
@@ -88,7 +223,7 @@ def check_table(file: str | Path) -> Path:
     Raises:
         InputError: The ending is another, or what `check_file` refuses.
     """
-    target = check_file(file)
+    target = check_file(file, inputs, overwrite)
     if target.suffix.lower() not in TABLES:
         raise InputError(f"output file {target}: tables end in {' or '.join(TABLES)}; name it so")
     return target
@@ -96,7 +231,7 @@ def check_table(file: str | Path) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A place beside a file to write the new one into; it takes the file's place once it is complete.
+    """A place beside a file to write the new one into; it is signed and takes the file's place once it is complete.
 
     Args:
         path: The file.
@@ -104,12 +239,28 @@ def replacing(path: Path) -> Iterator[Path]:
     Yields:
         Where to write; removed again if the writing fails.
     """
-    partial = path.with_name(path.name + PARTIAL)
+    _sweep(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}{PARTIAL}")
     try:
         yield partial
+        # Signed first: a run that is killed in between must not find a file that it does not take for its own.
+        _sign(path.parent, _signature(partial, path.name))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _sweep(path: Path) -> None:
+    """Remove unfinished files of runs that were killed while they wrote this one."""
+    for partial in path.parent.glob(f"{glob.escape(path.name)}.*-*{PARTIAL}"):
+        number = partial.name.removeprefix(f"{path.name}.").split("-")[0]
+        try:
+            if number.isdigit() and time.time() - partial.lstat().st_mtime > STALE:
+                os.kill(int(number), 0)
+        except ProcessLookupError:
+            partial.unlink(missing_ok=True)
+        except (OSError, OverflowError):
+            continue
 
 
 def write_text(path: Path, text: str) -> None:
@@ -133,7 +284,7 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
     Raises:
         InputError: What `check_table` refuses, or it is Parquet and pyarrow is not installed.
     """
-    target = check_table(path)
+    target = check_table(path, overwrite=True)  # whether it may be replaced was asked before the work
     if target.suffix.lower() == ".csv":
         write_text(target, table.to_csv(index=False))
         return

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from calibray import engines
-from calibray.calibration.methods import check_method, choose
+from calibray.calibration.methods import check_fit, check_method, choose
 from calibray.calibration.outcome import outcome
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
@@ -62,6 +62,7 @@ def calibrate(
     looked_for = setup is not None
     setup = setup or Setup.open(study, tracer)
     if engine is None:
+        check_fit(setup)
         ledger = None if out is None else Path(out) / LEDGER_FILE
         engine = engines.make(setup, None, progress, ledger, executor)
         looked_for = True

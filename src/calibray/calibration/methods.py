@@ -11,7 +11,9 @@ from calibray.calibration.problem import Problem
 from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, Optimizer
+from calibray.parameters import Parameters
 from calibray.spelling import did_you_mean
+from calibray.study import Setup, Study
 
 AUTO: Final = "auto"
 
@@ -48,23 +50,45 @@ def choose(problem: Problem) -> Optimizer:
     Raises:
         InputError: The method needs derivatives that the engine does not give, or its options cannot be used.
     """
-    section, name = problem.setup.study.method, problem.setup.study.method.name
+    engine = problem.engine
+    interactions = engine.interactions if isinstance(engine, Differentiable) else None
+    return _make(problem.setup.study, problem.parameters, problem.differentiable, interactions)
+
+
+def check_fit(setup: Setup) -> None:
+    """Refuse a method that cannot run on a study's engine, or its options, before anything is paid or written.
+
+    Args:
+        setup: The study, opened.
+
+    Raises:
+        InputError: The method does not exist, needs derivatives that the engine does not give, or its options cannot
+            be used.
+    """
+    check_method(setup.study.method.name)
+    differentiable = not setup.study.engine.dear
+    _make(setup.study, setup.parameters, differentiable, 1 if differentiable else None)
+
+
+def _make(
+    study: Study, parameters: Parameters, differentiable: bool, interactions: int | None
+) -> Optimizer:
+    section, name = study.method, study.method.name
     if name == AUTO:
-        name = "least-squares" if problem.differentiable else "vector-surrogate"
-    if METHODS[name].needs_derivatives() and not problem.differentiable:
+        name = "least-squares" if differentiable else "vector-surrogate"
+    if METHODS[name].needs_derivatives() and not differentiable:
         raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
-    engine, parameters = problem.engine, problem.parameters
     try:
         return optimizers.make(
             name,
             *parameters.search_bounds,
             section.seed,
             start=parameters.to_search(parameters.start),
-            starts=local_searches(engine.interactions) if isinstance(engine, Differentiable) else None,
+            starts=None if interactions is None else local_searches(interactions),
             options=section.options,
         )
     except InputError as error:
-        raise InputError(f"{problem.setup.study.path}: method.options: {error}") from None
+        raise InputError(f"{study.path}: method.options: {error}") from None
 
 
 def local_searches(interactions: int) -> int:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from threading import Event
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.engines.exchange import Request, Surroundings
-from calibray.engines.program import Outcome, Program
+from calibray.engines.external_program import GLANCE, ExternalProgram, Outcome
 from calibray.engines.protocol import Answer, check_candidates, gather
 from calibray.errors import EngineError
 from calibray.materials import Material
@@ -40,7 +41,7 @@ class Command:
 
     def __init__(
         self,
-        program: Program,
+        program: ExternalProgram,
         surroundings: Surroundings,
         materials: dict[str, Material],
         parameters: Parameters,
@@ -57,7 +58,7 @@ class Command:
         self._carriers = carriers or {}
         self._failed, self._give_up_after = 0, give_up_after
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, as the program answers.
 
         Args:
@@ -74,24 +75,25 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
 
-    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """The answers to candidates, each as soon as it is there.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
+            stop: Set from outside to begin no further call and to kill those under way; what was answered by then is
+                still given.
 
         Yields:
             The answers, in the order in which they arrive.
 
         Raises:
             InputError: A value is outside physics.
-            EngineError: Too many calls failed one after the other; all answers were given before.
+            EngineError: Too many calls failed one after the other, or the files of a call could not be written; all
+                answers were given before.
         """
+        stop = stop or Event()
         requests = [self._request(candidate) for candidate in candidates]
-        if self._executor is None:
-            outcomes = ((index, self._program.run(request)) for index, request in enumerate(requests))
-        else:
-            outcomes = self._in_parallel(requests)
+        outcomes = self._in_turn(requests, stop) if self._executor is None else self._at_once(requests, stop)
         for done, (index, outcome) in enumerate(outcomes, start=1):
             self.calls += 1
             if self._progress is not None:
@@ -106,29 +108,48 @@ class Command:
                     "again"
                 )
 
-    def _in_parallel(self, requests: list[Request]) -> Iterator[tuple[int, Outcome]]:
+    def _in_turn(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
+        for index, request in enumerate(requests):
+            if stop.is_set():
+                return
+            yield index, self._program.run(request)
+
+    def _at_once(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
         # An event reaches threads only; programs on other machines run on until their time is up.
-        stop = Event() if isinstance(self._executor, ThreadPoolExecutor) else None
+        near = stop if isinstance(self._executor, ThreadPoolExecutor) else None
         futures = {
-            self._executor.submit(self._program.run, request, stop): k for k, request in enumerate(requests)
+            self._executor.submit(self._program.run, request, near): k for k, request in enumerate(requests)
         }
+        left, interruption = set(futures), None
         try:
-            for future in as_completed(futures):
-                yield futures[future], self._outcome(future)
+            while left and not stop.is_set():
+                for future in wait(left, GLANCE, FIRST_COMPLETED).done:
+                    outcome = self._outcome(future)
+                    left.remove(future)
+                    yield futures[future], outcome
+        except (Exception, KeyboardInterrupt) as error:
+            interruption = error
         finally:
-            if stop is not None:
-                stop.set()
-            for future in futures:
+            stop.set()
+            for future in left:
                 future.cancel()
+        # What others have answered by now is given before the run ends.
+        for future in wait(left, None if near else 0).done:
+            if not future.cancelled() and not future.exception():
+                yield futures[future], future.result()
+        if interruption is not None:
+            raise interruption
 
     def _outcome(self, future: Future[Outcome]) -> Outcome:
         try:
             return future.result()
+        except EngineError:
+            raise
         except Exception as error:  # a worker that died costs the candidates it was on, not the batch
             lost = np.full(self.num_links, np.inf)
             return Outcome(lost, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
 
-    def _request(self, candidate: np.ndarray) -> Request:
+    def _request(self, candidate: NDArray[np.float64]) -> Request:
         return Request(
             self._surroundings,
             self.parameters.materials(candidate, self.materials),

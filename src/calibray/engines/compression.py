@@ -11,7 +11,6 @@ and a link that misses half the tolerance is fitted again to more candidates, or
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final
@@ -25,6 +24,7 @@ from calibray.errors import InputError
 from calibray.fields import layout, path_losses, path_powers
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
+from calibray.progress import Progress
 
 TOLERANCE_DB: Final = 0.01
 FEW: Final = 64  # paths of a link that are not worth compressing
@@ -42,8 +42,6 @@ BLOCK: Final = 400_000_000  # powers, paths times candidates, held at once
 FIRST_INTERVALS: Final = 4096  # of a table of coefficients
 LAST_INTERVALS: Final = 65536
 TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def compress(
         parameters: What will vary, and between which bounds.
         tolerance_db: Largest error of a link's path loss [dB].
         seed: Seed of the candidates.
-        progress: Called with (links done, links in all).
+        progress: Called with "compressing", links done and links in all.
 
     Returns:
         The compressed program and its error.
@@ -105,7 +103,7 @@ def compress(
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
                 weight[pool[ends[link] : ends[link + 1]]], error[link] = fitted
             if progress is not None:
-                progress(int(link) + 1, paths.num_links)
+                progress("compressing", int(link) + 1, paths.num_links)
     kept = np.flatnonzero(weight > 0)
     few = take(paths, kept)
     few = replace(

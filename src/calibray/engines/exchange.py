@@ -6,13 +6,18 @@ The formats are documented for programs' authors in `docs/command-engine.md`.
 from __future__ import annotations
 
 import json
+import os
+import reprlib
+import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.materials import Material
 from calibray.tracing.settings import Antenna
@@ -21,6 +26,8 @@ SCHEMA: Final = "calibray.request"
 VERSION: Final = 1
 FORMATS: Final = ("json", "hdf5")
 ANSWER: Final = "path_loss_db"
+PATH_LOSS_DB: Final = (20.0, 300.0)  # what a program's answers must lie within
+RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # that a response may have, and more for each link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
@@ -46,9 +53,9 @@ class Surroundings:
     bandwidth: float | None
     combining: str
     antennas: tuple[Antenna, Antenna]
-    tx: np.ndarray
-    rx: np.ndarray
-    link_frequency: np.ndarray | None = None
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    link_frequency: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +150,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
         group.create_group(name.replace("/", "_")).attrs.update({"name": name, **asdict(material)})
 
 
-def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:
+def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.float64]:
     """Read the path loss that a program answered.
 
     Args:
@@ -157,27 +164,52 @@ def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:
     Raises:
         Unusable: The file is missing or malformed, or its values are not one path loss per link.
     """
-    if not path.is_file():
-        raise Unusable("it wrote no response file")
-    values = _read_json(path) if file_format == "json" else _read_hdf5(path)
+    content = _content(path, num_links)
+    values = _read_json(content) if file_format == "json" else _read_hdf5(content, num_links)
     if values.shape != (num_links,):
         raise Unusable(
             f"its response holds {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
         )
-    wrong = np.isnan(values) | np.isneginf(values)
+    lower, upper = PATH_LOSS_DB
+    wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
     if wrong.any():
         link = int(np.argmax(wrong))
+        sign = "; path loss is positive: does it answer gains?" if -upper <= values[link] < 0 else ""
         raise Unusable(
-            f"its response holds {ANSWER}[{link}] = {values[link]}; must be a number, or infinite without a path"
+            f"its response holds {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
+            f"{upper:g} dB, or infinite without a path{sign}"
         )
     return values
 
 
-def _read_json(path: Path) -> np.ndarray:
+def _content(path: Path, num_links: int) -> bytes:
+    """The bytes of a response; of a plain file alone, for a program may leave anything there."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        # Neither follows a link nor waits for the other end of a FIFO.
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise Unusable("it wrote no response file") from None
+    except OSError as error:
+        raise Unusable(
+            f"its response cannot be read ({error.strerror}); it must be a file, and no link to one"
+        ) from None
+    status, limit = os.fstat(handle), RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links
+    if not stat.S_ISREG(status.st_mode):
+        os.close(handle)
+        raise Unusable("its response is no file but a folder, a FIFO or a device")
+    with os.fdopen(handle, "rb") as file:
+        if status.st_size > limit:
+            raise Unusable(f"its response has {status.st_size:,} bytes, must have {limit:,} or fewer")
+        return file.read(limit)
+
+
+def _read_json(response: bytes) -> NDArray[np.float64]:
+    try:
+        content = json.loads(response.decode("utf-8"))
     except ValueError as error:
         raise Unusable(f"its response is no JSON ({error})") from None
+    except RecursionError:
+        raise Unusable("its response nests lists or objects too deeply") from None
     if not isinstance(content, dict) or ANSWER not in content:
         raise Unusable(f"its response has no key {ANSWER!r}")
     entries = content[ANSWER]
@@ -189,19 +221,36 @@ def _number(entry: Any) -> float:
     if entry in _WITHOUT_PATH:
         return np.inf
     if isinstance(entry, bool) or not isinstance(entry, int | float):
-        raise Unusable(f"its response holds {json.dumps(entry)[:80]} in {ANSWER}, which is no number")
+        text = json.dumps(entry) if isinstance(entry, str | bool) else reprlib.repr(entry)
+        raise Unusable(f"its response holds {text[:80]} in {ANSWER}, which is no number")
     try:
         return float(entry)
     except OverflowError:
         raise Unusable(f"its response holds a number in {ANSWER} that is too large") from None
 
 
-def _read_hdf5(path: Path) -> np.ndarray:
+def _read_hdf5(response: bytes, num_links: int) -> NDArray[np.float64]:
     try:
-        with h5py.File(path, "r") as file:
-            values = np.asarray(file[ANSWER][()], dtype=float)
-    except KeyError:
-        raise Unusable(f"its response has no dataset {ANSWER!r}") from None
-    except (OSError, TypeError, ValueError, AttributeError) as error:
+        with h5py.File(BytesIO(response), "r") as file:
+            link = file.get(ANSWER, getlink=True)
+            if link is None:
+                raise Unusable(f"its response has no dataset {ANSWER!r}")
+            if not isinstance(link, h5py.HardLink):
+                raise Unusable(
+                    f"its response has {ANSWER!r} by a link to elsewhere; write the numbers themselves"
+                )
+            dataset = file[ANSWER]
+            if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
+                raise Unusable(f"its response has {ANSWER!r}, which is no dataset of numbers")
+            if dataset.is_virtual or dataset.external:
+                raise Unusable(f"its response has {ANSWER!r} in other files; write the numbers themselves")
+            if dataset.size != num_links:  # looked at before it is read: a small file may unfold to any size
+                raise Unusable(
+                    f"its response holds {ANSWER} of shape {dataset.shape}, must be ({num_links},): one per link"
+                )
+            values = np.asarray(dataset[()], dtype=float)
+    except Unusable:
+        raise
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise Unusable(f"its response is no HDF5 file with the numbers {ANSWER!r} ({error})") from None
     return values.reshape(-1) if values.size == max(values.shape, default=1) else values

@@ -61,4 +61,4 @@ def make(
     engine = section.open(setup, paths, progress, executor)
     if ledger is None or not section.dear:
         return engine
-    return Recorded(engine, Ledger(ledger), fingerprint(setup), name)
+    return Recorded(engine, Ledger(ledger), fingerprint(setup), name, progress)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from threading import Event
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.engines.protocol import Answer, check_candidates
@@ -30,7 +32,7 @@ class CarrierTracer:
 
     tracer: Tracer
     links: Measurements
-    index: np.ndarray
+    index: NDArray[np.intp]
 
 
 class Retrace:
@@ -59,7 +61,7 @@ class Retrace:
         self._parts, self._progress = tuple(parts), progress
         self._combining, self._bandwidth = combining, bandwidth
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, each with a trace of its own.
 
         Args:
@@ -74,11 +76,12 @@ class Retrace:
         values = check_candidates(candidates, len(self.parameters))
         return np.stack([answer.path_loss_db for answer in self.answers(values)])
 
-    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """The answers to candidates, each as soon as it is there.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
+            stop: Set from outside to begin no further call.
 
         Yields:
             The answers, in the order of the candidates.
@@ -87,6 +90,8 @@ class Retrace:
             InputError: A value is outside physics.
         """
         for index, candidate in enumerate(candidates):
+            if stop is not None and stop.is_set():
+                return
             started = time.perf_counter()
             loss = np.empty(self.num_links)
             for part in self._parts:
@@ -96,7 +101,7 @@ class Retrace:
                 self._progress("running", index + 1, len(candidates))
             yield Answer(index, loss, time.perf_counter() - started)
 
-    def _one(self, part: CarrierTracer, candidate: np.ndarray) -> np.ndarray:
+    def _one(self, part: CarrierTracer, candidate: NDArray[np.float64]) -> NDArray[np.float64]:
         tracer = part.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
         solution = tracer.solve(part.links, materials)

@@ -69,11 +69,11 @@ class CommandSection(EngineSection):
         """The program over a study's links; see `EngineSection.open`."""
         from calibray.engines.command import Command
         from calibray.engines.exchange import Surroundings
-        from calibray.engines.program import Program
+        from calibray.engines.external_program import ExternalProgram
 
         study, links = setup.study, setup.links
         folder = study.path.resolve().parent
-        program = Program(self.command, folder, self.timeout, self.retries, self.format)
+        program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format)
         surroundings = Surroundings(
             frequency=study.scene.frequency,
             bandwidth=study.scene.bandwidth,
