@@ -212,7 +212,9 @@ def result(folder: Path) -> tuple:
     content = json.loads((folder / "out" / "result.json").read_text())
     clocked = {"seconds", "trace_seconds", "ledger_hits", "study_file"}
     kept = {name: value for name, value in content.items() if name not in clocked}
-    history = np.genfromtxt(folder / "out" / "history.csv", delimiter=",", skip_header=1)[:, :4].tolist()
+    history = np.genfromtxt(folder / "out" / "result-history.csv", delimiter=",", skip_header=1)[
+        :, :4
+    ].tolist()
     return kept, history
 
 

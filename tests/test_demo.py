@@ -82,7 +82,7 @@ def test_files_exist_and_open(demo):
     assert content["methods"]["gwo"]["rt_calls"] == 600
     assert content["methods"]["auto"]["excess_rmse_db"] == 0
     for method in finished.results:
-        assert (out / method / "scene.xml").is_file()
+        assert (out / method / "result-scene.xml").is_file()
     assert [len(table.rows) for table in tables(finished)] == [3, 3, 3, 3]
 
 

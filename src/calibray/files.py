@@ -32,6 +32,7 @@ FIRST_RESULT: Final = (
     "history.csv",
     "scene.xml",
 )  # of the first version, not signed
+PATH_SEAL: Final = b"calibray/paths sha256 "  # what a path file begins with
 STALE: Final = 60.0  # age of an unfinished file whose process is gone [s]
 
 
@@ -160,13 +161,9 @@ def _sign(folder: Path, signature: str) -> None:
 
 
 def _is_path_file(file: Path) -> bool:
-    import h5py
-
-    try:
-        with h5py.File(file, "r") as content:
-            return str(content.attrs.get("schema", "")).startswith("calibray/")
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
-        return False
+    """Whether a file carries the seal of path files (see `calibray.paths.sealing`); nothing of it is interpreted."""
+    with file.open("rb") as stream:
+        return stream.read(len(PATH_SEAL)) == PATH_SEAL
 
 
 def _is_result(file: Path) -> bool:

@@ -14,9 +14,9 @@ from calibray.calibration.search import search
 from calibray.calibration.settle import settle
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
-from calibray.files import check_folder
+from calibray.files import check_outputs
 from calibray.progress import Progress
-from calibray.result import Result
+from calibray.result import FILES, Result
 from calibray.study import Setup, Study
 from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import TracerFactory
@@ -32,6 +32,7 @@ def calibrate(
     executor: Executor | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
+    overwrite: bool = False,
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
@@ -44,6 +45,7 @@ def calibrate(
         engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
         executor: What runs the calls of a batch on the engine "command".
         progress: Called as the work goes on.
+        overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.
 
     Returns:
@@ -57,7 +59,7 @@ def calibrate(
     setup = study if isinstance(study, Setup) else None
     check_method((setup.study if setup else study).method.name)
     if out is not None:
-        check_folder(out)
+        check_outputs(out, FILES, (setup.study if setup else study).files(), overwrite)
     started = time.perf_counter()
     looked_for = setup is not None
     setup = setup or Setup.open(study, tracer)
@@ -74,5 +76,6 @@ def calibrate(
     problem, trail, gap = settle(problem, trail, progress)
     result = outcome(problem, trail, gap, enclosed, time.perf_counter() - traced, traced - started)
     if out is not None:
-        result.save(out)
+        # Asked before the work: what was computed is not lost to a file that came in the meantime.
+        result.save(out, overwrite=True)
     return result

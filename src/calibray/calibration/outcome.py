@@ -88,6 +88,7 @@ def outcome(
         laws=parameters.law(trail.best),
         enclosed=enclosed,
         scene=setup.scene,
+        files=setup.files,
     )
 
 

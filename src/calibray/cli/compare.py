@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import StudyFile, log
+from calibray.cli.console import Overwrite, StudyFile, log
 
 
 def compare(
@@ -27,6 +27,7 @@ def compare(
     seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, from seeds 0 to N - 1.")] = 25,
     budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls of a run.")] = 225,
     workers: Annotated[int, typer.Option(metavar="N", help="Processes that run at once.")] = 1,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run methods from many seeds on a study's stored paths, at equal budgets of RT calls."""
     import os
@@ -41,9 +42,12 @@ def compare(
     from calibray.comparison.arena import study_arena
     from calibray.comparison.comparison import compare as run_all
     from calibray.comparison.tables import optimum, table
+    from calibray.files import check_outputs
     from calibray.report.excess import FILES, write
+    from calibray.study import Study
     from calibray.tables.text import render
 
+    check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     names = [name.strip() for name in methods.split(",") if name.strip()]
     with progress_bars(log) as progress:
         finished = run_all(

@@ -14,3 +14,8 @@ log = Console(stderr=True, highlight=False)
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]
+
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files there that Calibray did not write.")
+]
+"""Whether output may take the place of a user's file; an input is never replaced."""

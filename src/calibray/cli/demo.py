@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import log
+from calibray.cli.console import Overwrite, log
 
 
 def demo(
@@ -22,16 +22,17 @@ def demo(
         ),
     ] = "replay",
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
     from calibray.cli.progress import progress_bars
     from calibray.comparison.experiment import run_demo
     from calibray.comparison.paper import tables
-    from calibray.files import check_folder
+    from calibray.files import check_outputs
     from calibray.report.demo import FIGURES, write
     from calibray.tables.text import render
 
-    check_folder(out)
+    check_outputs(out, ["result.json", *FIGURES], (), overwrite)
     with progress_bars(log) as progress:
         finished = run_demo(engine, seed, progress)
     write(finished, out)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibray.cli.console import Overwrite
+
 
 def ledger(
     folder: Annotated[
@@ -22,6 +24,7 @@ def ledger(
     forget_failed: Annotated[
         bool, typer.Option("--forget-failed", help="Take out failed calls, so that they are run again.")
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """List or export the RT calls that were paid for."""
     from contextlib import closing
@@ -32,7 +35,7 @@ def ledger(
     from calibray.tables.text import render
 
     if out is not None:
-        check_table(out)
+        check_table(out, (), overwrite)
     with closing(open_ledger(folder)) as store:
         if forget_failed:
             typer.echo(f"Taken out: {store.forget_failures()} failed calls", err=True)

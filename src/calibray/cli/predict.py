@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import log
+from calibray.cli.console import Overwrite, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,6 +36,11 @@ def predict(
             "--out", "-o", metavar="FILE", help="CSV or Parquet file to write instead of CSV on stdout."
         ),
     ] = None,
+    anyway: Annotated[
+        bool,
+        typer.Option("--anyway", help="Predict although a file of the scene or an antenna changed since."),
+    ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
     import numpy as np
@@ -53,9 +58,9 @@ def predict(
     )
     _refuse_column(links_file, links.frame)
     if out is not None:
-        check_table(out)
+        check_table(out, [links_file, *study.files()], overwrite)
     with progress_bars(log) as progress:
-        path_loss_db = result.predict(links, progress)
+        path_loss_db = result.predict(links, progress, anyway=anyway)
     table = links.frame.assign(**{PREDICTED: path_loss_db})
     if out is None:
         typer.echo(table.to_csv(index=False), nl=False)

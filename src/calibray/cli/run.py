@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import StudyFile, log
+from calibray.cli.console import Overwrite, StudyFile, log
 
 
 def run(
@@ -33,6 +33,7 @@ def run(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
     from calibray.calibration import calibrate
@@ -44,7 +45,9 @@ def run(
 
     study = Study.load(study_file).replace(engine=engine)
     with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
-        result = calibrate(study, method, seed, out, executor=executor, progress=progress)
+        result = calibrate(
+            study, method, seed, out, executor=executor, progress=progress, overwrite=overwrite
+        )
     if as_json:
         typer.echo(json.dumps(result.content(), indent=2))
     else:

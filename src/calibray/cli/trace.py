@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import StudyFile, log
+from calibray.cli.console import Overwrite, StudyFile, log
 from calibray.errors import InputError
 
 
@@ -22,6 +22,7 @@ def trace(
             "--check", help="Trace again with twice the samples and another seed, and tell what changes."
         ),
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
     from functools import partial
@@ -38,7 +39,7 @@ def trace(
     study = Study.load(study_file)
     _refuse_idleness(out, check)
     if out is not None:
-        check_file(out)
+        check_file(out, study.files(), overwrite)
     setup = study.opened()
     links, tracer = setup.links, setup.tracer
     if told := report.announcement(tracer.plan(links), len(links)):

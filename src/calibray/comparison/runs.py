@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calibray.errors import InputError
+
 
 @dataclass(frozen=True)
 class MethodRun:
@@ -67,6 +69,9 @@ class Runs:
     Args:
         path: The file; made when the first run is added.
         problem: Fingerprint of all that a run depends on besides method, budget and seed.
+
+    Raises:
+        InputError: The file is of another kind.
     """
 
     def __init__(self, path: Path, problem: str) -> None:
@@ -79,6 +84,8 @@ class Runs:
                 record = json.loads(line)
             except ValueError:  # the line that a killed process was writing
                 continue
+            if not isinstance(record, dict) or "problem" not in record:
+                raise InputError(f"{path}: holds something else than finished runs; name another folder")
             if record.pop("problem") == problem:
                 run = MethodRun(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
                 self._runs[run.method, run.budget, run.seed] = run

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,11 @@ if TYPE_CHECKING:
 
 
 def predict(
-    result: Result, links: Measurements | pd.DataFrame, progress: Progress | None = None
+    result: Result,
+    links: Measurements | pd.DataFrame,
+    progress: Progress | None = None,
+    *,
+    anyway: bool = False,
 ) -> NDArray[np.float64]:
     """Path loss at links that were never measured.
 
@@ -30,12 +35,14 @@ def predict(
             column, if it has one. The study's column of frequencies gives the links' carriers; without it all
             links have the scene's.
         progress: Called with the stage "tracing" after every launch.
+        anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         Path loss, offsets included [n], [dB]; +inf where no path leads.
 
     Raises:
-        InputError: A column is missing, a position cannot be used, or a group has no calibrated offset.
+        InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
+            scene or an antenna changed since the calibration.
     """
     study = result.study
     if not isinstance(links, Measurements):
@@ -43,6 +50,8 @@ def predict(
         links = links_from_frame(links, group=per, frequency=study.links.frequency)
     offset = _offset(result, links)
     setup = Setup.open(study, links=links)
+    if not anyway:
+        _check_files(result, setup)
     paths = setup.trace(result.materials, progress)
     if links.frequency is None:
         return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + offset
@@ -58,3 +67,20 @@ def _offset(result: Result, links: Measurements) -> NDArray[np.float64]:
         known = ", ".join(result.offsets_db)
         raise InputError(f"{links.source}: group {unknown[0]!r} has no calibrated offset; known: {known}")
     return np.array([result.offsets_db[name] for name in links.group_names])[links.group_index]
+
+
+def _check_files(result: Result, setup: Setup) -> None:
+    """Refuse a scene that is not the one that was calibrated; results of the version before cannot tell."""
+    if not result.files:
+        return
+    # By name, for the folder may have moved as a whole.
+    before, now = (
+        sorted((Path(file).name, digest) for file, digest in files.items())
+        for files in (result.files, setup.files)
+    )
+    changed = sorted({name for name, _ in set(before) ^ set(now)})
+    if changed:
+        raise InputError(
+            f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may no longer hold; "
+            "calibrate again, or give --anyway (anyway=True)"
+        )

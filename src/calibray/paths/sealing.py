@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from calibray.errors import InputError
-from calibray.files import replacing
+from calibray.files import PATH_SEAL, replacing
 
 BLOCK: Final = 512
 """The bytes of the block; the least that HDF5 allows."""
 
-_MARK: Final = b"calibray/paths sha256 "
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _CHUNK: Final = 2**20
 
@@ -39,7 +38,7 @@ def seal(path: str | Path) -> None:
     try:
         with target.open("rb") as file:
             head = file.read(BLOCK)
-            start = BLOCK if head.startswith(_MARK) or not any(head) else 0
+            start = BLOCK if head.startswith(PATH_SEAL) or not any(head) else 0
             file.seek(start)
             if not file.read(len(_SIGNATURE)) == _SIGNATURE:
                 raise InputError(f"{target}: is no HDF5 file; only path files can be sealed")
@@ -84,7 +83,7 @@ def verify(path: Path) -> bool:
         head = file.read(BLOCK)
         if head.startswith(_SIGNATURE):
             return False
-        if not head.startswith(_MARK):
+        if not head.startswith(PATH_SEAL):
             raise InputError("is damaged or no path file; trace again")
         if _block(file) != head:
             raise InputError("is damaged (its checksum does not agree); trace again")
@@ -97,4 +96,4 @@ def _block(file: BinaryIO) -> bytes:
     while chunk := file.read(_CHUNK):
         digest.update(chunk)
     length = os.fstat(file.fileno()).st_size - start
-    return (_MARK + f"{digest.hexdigest()} {length} bytes\n".encode()).ljust(BLOCK, b"\0")
+    return (PATH_SEAL + f"{digest.hexdigest()} {length} bytes\n".encode()).ljust(BLOCK, b"\0")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibray.comparison.labels import label
+from calibray.files import replacing
 
 if TYPE_CHECKING:
     from calibray.result import Result
@@ -108,7 +109,8 @@ def write(figure: Figure, path: Path) -> Path:
     Returns:
         The file.
     """
-    FigureCanvasAgg(figure).print_png(path)
+    with replacing(path) as partial:
+        FigureCanvasAgg(figure).print_png(partial)
     return path
 
 

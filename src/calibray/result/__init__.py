@@ -1,5 +1,5 @@
 """What a calibration found: a record that imports no machinery, its files and its tables."""
 
-from calibray.result.record import FILES, VERSION, Result
+from calibray.result.record import FILES, Result
 
-__all__ = ["FILES", "VERSION", "Result"]
+__all__ = ["FILES", "Result"]

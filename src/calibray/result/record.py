@@ -12,19 +12,22 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import check_folder, write_text
+from calibray.files import check_outputs, write_text
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.progress import Progress
+from calibray.result.rows import COLUMNS, read_rows
+from calibray.result.stored import VERSION, read_stored
 from calibray.result.tables import summary
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.study import Study
 from calibray.tables import glance
 from calibray.tracing.enclosed import Enclosed
 
-VERSION: Final = 1
-FILES: Final = ("result.json", "links.csv", "history.csv", "scene.xml")
+FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
+"""What a result is written to; users have files called links.csv and scene.xml themselves."""
+
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 
 
@@ -61,6 +64,7 @@ class Result:
         groups_without_path: Groups that have no offset, because no link of theirs to calibrate on has a path.
         enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
+        files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
     """
 
     study: Study
@@ -88,6 +92,7 @@ class Result:
     groups_without_path: tuple[str, ...] = ()
     enclosed: Enclosed | None = None
     scene: Scene | None = None
+    files: dict[str, str] = field(default_factory=dict)
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -112,18 +117,19 @@ class Result:
     def _repr_html_(self) -> str:
         return glance.html(*summary(self))
 
-    def save(self, folder: str | Path) -> None:
-        """Write `result.json`, `links.csv`, `history.csv` and the calibrated `scene.xml`.
+    def save(self, folder: str | Path, overwrite: bool = False) -> None:
+        """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
         Each file is written beside its place and then moved there, so that none is ever half-written.
 
         Args:
             folder: Folder to write into; made if absent.
+            overwrite: Replace files that Calibray did not write.
 
         Raises:
-            InputError: The folder cannot be written.
+            InputError: The folder cannot be written, or a file there must not be replaced.
         """
-        target = check_folder(folder)
+        target = check_outputs(folder, FILES, self.study.files(), overwrite)
         try:
             target.mkdir(parents=True, exist_ok=True)
             self._write(target)
@@ -169,6 +175,7 @@ class Result:
             "groups_without_path": list(self.groups_without_path),
             "links": self.counts,
             "antennas_indoors": None if self.enclosed is None else self.enclosed.indoors,
+            "files": self.files,
         }
 
     @classmethod
@@ -182,34 +189,28 @@ class Result:
             The result.
 
         Raises:
-            InputError: The folder holds no result, or one of another version.
+            InputError: The folder holds no result, one of another version, or one that was damaged or edited.
         """
         source = Path(folder) / RESULT_FILE
-        try:
-            content = json.loads(source.read_text(encoding="utf-8"))
-            links, history = (pd.read_csv(source.with_name(name)) for name in (LINKS_FILE, HISTORY_FILE))
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"{source}: is no result of `calibray run` ({error}); name its --out folder"
-            ) from None
-        if content.get("version") != VERSION:
-            raise InputError(
-                f"{source}: has version {content.get('version')}, need {VERSION}; run the study again"
-            )
-        study = Study.from_content(content.pop("study"), content.pop("study_file"))
-        del content["version"]
-        # Results of the version before say nothing of what follows.
-        counts, indoors = content.pop("links", {}), content.pop("antennas_indoors", None)
-        if indoors is not None:
-            ends = (tuple(counts[f"rows_with_enclosed_{end}"]) for end in ("tx", "rx"))
-            content["enclosed"] = Enclosed(*ends, indoors)
-        content["groups_without_path"] = tuple(content.get("groups_without_path", ()))
-        content["intervals"] = {name: Interval(**entry) for name, entry in content["intervals"].items()}
-        content["materials"] = {name: Material(**entry) for name, entry in content["materials"].items()}
-        return cls(study=study, links=links, history=history, **content)
+        stored, study = read_stored(source)
+        links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
+        given = {name: getattr(stored, name) for name in type(stored).model_fields}
+        for name in ("version", "study_file", "links", "antennas_indoors"):
+            del given[name]
+        # Results of the version before say nothing of enclosed antennas.
+        if stored.links is not None and stored.antennas_indoors is not None:
+            tx, rx = stored.links.rows_with_enclosed_tx or (), stored.links.rows_with_enclosed_rx or ()
+            given["enclosed"] = Enclosed(tx, rx, stored.antennas_indoors)
+        given["intervals"] = {name: Interval(**asdict(each)) for name, each in stored.intervals.items()}
+        given["materials"] = {name: Material(**asdict(each)) for name, each in stored.materials.items()}
+        return cls(**{**given, "study": study, "links": links, "history": history})
 
     def predict(
-        self, links: Measurements | pd.DataFrame, progress: Progress | None = None
+        self,
+        links: Measurements | pd.DataFrame,
+        progress: Progress | None = None,
+        *,
+        anyway: bool = False,
     ) -> NDArray[np.float64]:
         """Path loss at links that were never measured; see `calibray.inference.prediction.predict`.
 
@@ -218,13 +219,15 @@ class Result:
                 column, if it has one. The study's column of frequencies gives the links' carriers; without it all
                 links have the scene's.
             progress: Called with the stage "tracing" after every launch.
+            anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
         Returns:
             Path loss, offsets included [n], [dB]; +inf where no path leads.
 
         Raises:
-            InputError: A column is missing, a position cannot be used, or a group has no calibrated offset.
+            InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
+                the scene or an antenna changed since the calibration.
         """
         from calibray.inference.prediction import predict
 
-        return predict(self, links, progress)
+        return predict(self, links, progress, anyway=anyway)

@@ -342,6 +342,12 @@ class Study(Section):
         content = self.content() | {"parameters": list(self.content()["parameters"].items())}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
+    def files(self) -> tuple[Path, ...]:
+        """The files that the study names, and its own; those of a bundled scene are left out."""
+        antennas = [Path(each.gain_file) for each in self.antenna_pair if each.gain_file is not None]
+        scene = [] if self.scene.file.startswith(BUNDLED) else [Path(self.scene_source)]
+        return (self._path, self.links_path, *scene, *antennas)
+
     def _resolve(self, key: str, file: str) -> Path:
         try:
             return self._path.parent / expand(file, os.environ)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +112,13 @@ class Setup:
             return None
         tracer, links = self.tracer, self.links
         return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """SHA-256 of every file that the scene and the antennas are read from, by path as the study finds it."""
+        antennas = [Path(each.gain_file) for each in self.study.antenna_pair if each.gain_file is not None]
+        files = dict.fromkeys([self.scene.path, *cache.meshes(self.scene), *antennas])
+        return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
     def tracer_at(self, frequency: float) -> Tracer:
         """The ray tracer with the scene at another carrier.

@@ -1,0 +1,66 @@
+"""The tables of a result's folder, read and checked: a row for every link, and a row for every RT call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from calibray.errors import InputError
+
+LINKS: Final = {
+    "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",
+    "held_out": "b", "retrace_gap_db": "f",
+}  # fmt: skip
+HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f", "seconds": "f"}
+COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
+"""The columns of each file, and the kinds of their numbers."""
+
+FIRST_NAMES: Final = {"result-links.csv": "links.csv", "result-history.csv": "history.csv"}
+"""What the version before called the files."""
+
+FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
+"""Columns that hold a number in every row; in others, a link without a path is infinite or left open."""
+
+
+def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
+    """Read one of a result's tables.
+
+    Args:
+        folder: The result's folder.
+        name: The file's name; what the version before called it serves as well.
+        columns: The columns that it must have, and the kinds of their values: "i", "f" or "b".
+
+    Returns:
+        Its rows; further columns as they are.
+
+    Raises:
+        InputError: The file does not exist, or lacks a column, or holds something else in it.
+    """
+    file = folder / name
+    if not file.exists():
+        file = folder / FIRST_NAMES[name]
+    try:
+        table = pd.read_csv(file)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{file}: is no table of `calibray run` ({str(error).splitlines()[0]}); name its --out folder"
+        ) from None
+    for column, kind in columns.items():
+        if column not in table:
+            raise InputError(f"{file}: has no column {column!r}; run the study again")
+        found = table[column].dtype.kind
+        # Whole numbers pass for numbers; a table without rows tells no kinds.
+        if len(table) and found != kind and not (kind == "f" and found == "i"):
+            raise InputError(
+                f"{file}: column {column!r} holds something else than it should; run the study again"
+            )
+        if column in FINITE and not np.isfinite(table[column]).all():
+            raise InputError(
+                f"{file}: column {column!r} holds a value that is not finite; run the study again"
+            )
+    if not len(table):
+        raise InputError(f"{file}: has no rows; run the study again")
+    return table
