@@ -70,9 +70,7 @@ def check_fit(setup: Setup) -> None:
     _make(setup.study, setup.parameters, differentiable, 1 if differentiable else None)
 
 
-def _make(
-    study: Study, parameters: Parameters, differentiable: bool, interactions: int | None
-) -> Optimizer:
+def _make(study: Study, parameters: Parameters, differentiable: bool, interactions: int | None) -> Optimizer:
     section, name = study.method, study.method.name
     if name == AUTO:
         name = "least-squares" if differentiable else "vector-surrogate"
