@@ -93,7 +93,10 @@ class Command:
         """
         stop = stop or Event()
         requests = [self._request(candidate) for candidate in candidates]
-        outcomes = self._in_turn(requests, stop) if self._executor is None else self._at_once(requests, stop)
+        executor = self._executor
+        outcomes = (
+            self._in_turn(requests, stop) if executor is None else self._at_once(requests, stop, executor)
+        )
         for done, (index, outcome) in enumerate(outcomes, start=1):
             self.calls += 1
             if self._progress is not None:
@@ -114,12 +117,12 @@ class Command:
                 return
             yield index, self._program.run(request)
 
-    def _at_once(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
+    def _at_once(
+        self, requests: list[Request], stop: Event, executor: Executor
+    ) -> Iterator[tuple[int, Outcome]]:
         # An event reaches threads only; programs on other machines run on until their time is up.
-        near = stop if isinstance(self._executor, ThreadPoolExecutor) else None
-        futures = {
-            self._executor.submit(self._program.run, request, near): k for k, request in enumerate(requests)
-        }
+        near = stop if isinstance(executor, ThreadPoolExecutor) else None
+        futures = {executor.submit(self._program.run, request, near): k for k, request in enumerate(requests)}
         left, interruption = set(futures), None
         try:
             while left and not stop.is_set():

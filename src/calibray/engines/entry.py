@@ -68,7 +68,7 @@ class LedgerEntry:
 def read_entry(
     problem: str,
     candidate: bytes,
-    columns: tuple[object, object, object, object],
+    columns: tuple[object, ...],
     num_links: int | None = None,
 ) -> LedgerEntry | str:
     """An entry from a row of a ledger, where it is whole.

@@ -229,7 +229,11 @@ class Ledger:
             f"SELECT problem, engine, parameters, candidate, {ENTRY} FROM answers JOIN problems USING (problem)"
         ).fetchall()
         entries = [(row, read_entry(row[0], row[3], row[4:])) for row in rows]
-        return [Rescued(*row[:4], entry) for row, entry in entries if isinstance(entry, LedgerEntry)]
+        return [
+            Rescued(problem, engine, parameters, candidate, entry)
+            for (problem, engine, parameters, candidate, *_), entry in entries
+            if isinstance(entry, LedgerEntry)
+        ]
 
     def forget_failures(self, problem: str | None = None) -> int:
         """Take out failed calls, so that they are run again.
@@ -271,12 +275,12 @@ class Ledger:
             ).fetchall()
         records = []
         for number, problem, engine, when, parameters, candidate, *columns in rows:
-            entry = read_entry(problem, candidate, columns)
+            entry = read_entry(problem, candidate, tuple(columns))
             try:
-                values = zip(json.loads(parameters), np.frombuffer(candidate, "<f8").tolist(), strict=True)
-                values = dict(values)
+                names, numbers = json.loads(parameters), np.frombuffer(candidate, "<f8").tolist()
+                values = dict(zip(names, numbers, strict=True))
             except (TypeError, ValueError):
-                entry = "no candidate"
+                entry, values = "no candidate", {}
             if not isinstance(entry, LedgerEntry):
                 log.warning("%s: call %d is damaged (%s); left out", self.path, number, entry)
                 continue

@@ -36,7 +36,8 @@ def set_up(connection: sqlite3.Connection, path: Path) -> None:
 
     Raises:
         InputError: The file is a database of something else, or of another version.
-        sqlite3.Error: The file cannot be used, or is damaged.
+        sqlite3.OperationalError: Others have locked the file for too long, or it cannot be used.
+        sqlite3.DatabaseError: The file is damaged.
     """
     deadline = time.monotonic() + PATIENCE
     while True:
