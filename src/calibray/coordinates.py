@@ -170,7 +170,9 @@ class Frame:
         lost = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
         if len(lost):
             where = f"({np.ravel(x)[lost[0]]:g}, {np.ravel(y)[lost[0]]:g})"
-            raise InputError(f"position {where} of {crs} lies outside the projection {self.crs}; check the axes")
+            raise InputError(
+                f"position {where} of {crs} lies outside the projection {self.crs}; check the axes"
+            )
         return easting - self.easting, northing - self.northing
 
 
@@ -191,7 +193,9 @@ def parse_crs(crs: object) -> CRS:
         return pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"crs = {crs!r}: PROJ does not know it ({reason}); name an EPSG code, EPSG:4326") from None
+        raise InputError(
+            f"crs = {crs!r}: PROJ does not know it ({reason}); name an EPSG code, EPSG:4326"
+        ) from None
 
 
 def transformer(source: object, target: object) -> Transformer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from calibray.errors import InputError
 from calibray.extras import library
 from calibray.materials import ITU_MATERIALS
+from calibray.progress import Progress
 from calibray.scenes.meshes import Mesh
 from calibray.scenes.scene import find_scene
 
@@ -99,11 +100,12 @@ class Diagnosis:
         return sum(item.faces for item in self.objects)
 
 
-def diagnose(source: str | Path) -> Diagnosis:
+def diagnose(source: str | Path, progress: Progress | None = None) -> Diagnosis:
     """Examine a scene.
 
     Args:
         source: Path of a Mitsuba XML file, or `sionna:NAME`.
+        progress: Called with ("examining", meshes done, meshes in all).
 
     Returns:
         What it is like.
@@ -112,32 +114,38 @@ def diagnose(source: str | Path) -> Diagnosis:
         InputError: It does not exist, is no scene, or a mesh of it is missing or cannot be read.
     """
     path, root = find_scene(source)
-    meshes = read_meshes(path, root)
-    objects = tuple(health(name, material, mesh) for name, material, mesh in meshes)
-    corners = np.concatenate([mesh.vertices for _, _, mesh in meshes])
-    bounds = (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+    examined: list[ObjectHealth] = []
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for name, material, mesh in read_meshes(path, root):
+        examined.append(health(name, material, mesh))
+        low, high = np.minimum(low, mesh.vertices.min(axis=0)), np.maximum(high, mesh.vertices.max(axis=0))
+        if progress is not None:
+            progress("examining", len(examined), len(root.findall("shape")))
+    objects, bounds = tuple(examined), (*low.tolist(), *high.tolist())
     findings = [*_material_findings(root, objects), *_scale_findings(bounds)]
     for item in objects:
         findings += _object_findings(item)
     order = ("error", "warning", "note")
-    return Diagnosis(str(source), bounds, objects, tuple(sorted(findings, key=lambda one: order.index(one.severity))))
+    return Diagnosis(
+        str(source), bounds, objects, tuple(sorted(findings, key=lambda one: order.index(one.severity)))
+    )
 
 
-def read_meshes(path: Path, root: ElementTree.Element) -> list[tuple[str, str, Mesh]]:
-    """Read the meshes of a scene: PLY and OBJ files, and rectangles and cubes.
+def read_meshes(path: Path, root: ElementTree.Element) -> Iterator[tuple[str, str, Mesh]]:
+    """Read the meshes of a scene, PLY and OBJ files, one after the other.
 
     Args:
         path: Its XML file.
         root: The element `scene`.
 
-    Returns:
-        Object, material and mesh, transformed as the file says.
+    Yields:
+        Object, material and mesh, turned over where the file says so; shapes without a file are passed by.
 
     Raises:
         InputError: A mesh is missing or cannot be read, or there is none.
     """
     trimesh = library("trimesh", "scenes")
-    found = []
+    found = 0
     for shape in root.findall("shape"):
         name = (shape.get("id") or "?").removeprefix("mesh-")
         filename = shape.find("string[@name='filename']")
@@ -145,21 +153,30 @@ def read_meshes(path: Path, root: ElementTree.Element) -> list[tuple[str, str, M
             continue
         file = path.parent / filename.get("value", "")
         if not file.is_file():
-            raise InputError(f"{path}: mesh {file} of {name!r} does not exist; copy the meshes folder beside the scene")
+            raise InputError(
+                f"{path}: mesh {file} of {name!r} does not exist; copy the meshes folder beside the scene"
+            )
         try:
             loaded = trimesh.load_mesh(file, process=False, maintain_order=True)
             mesh = Mesh(np.asarray(loaded.vertices, dtype=float), np.asarray(loaded.faces, dtype=np.int64))
         except Exception as error:  # whatever trimesh's readers raise on a broken file
-            raise InputError(f"{path}: mesh {file} of {name!r} cannot be read ({error}); export it again") from None
+            raise InputError(
+                f"{path}: mesh {file} of {name!r} cannot be read ({error}); export it again"
+            ) from None
         if not len(mesh.faces):
-            raise InputError(f"{path}: mesh {file} of {name!r} has no face; remove the object, or export it again")
+            raise InputError(
+                f"{path}: mesh {file} of {name!r} has no face; remove the object, or export it again"
+            )
         reference = shape.find("ref")
         nested = shape.find("bsdf")
         material = next((part.get("id", "") for part in (reference, nested) if part is not None), "")
-        found.append((name, material.removeprefix("mat-"), mesh))
+        turned = shape.find("boolean[@name='flip_normals']")
+        if turned is not None and turned.get("value") == "true":
+            mesh = Mesh(mesh.vertices, mesh.faces[:, ::-1])
+        found += 1
+        yield name, material.removeprefix("mat-"), mesh
     if not found:
         raise InputError(f"{path}: the scene has no mesh; export the scene with its meshes")
-    return found
 
 
 def health(name: str, material: str, mesh: Mesh) -> ObjectHealth:
@@ -282,7 +299,11 @@ def _object_findings(item: ObjectHealth) -> list[Finding]:
             "remove the copies",
         ),
     )  # fmt: skip
-    return [Finding(severity, item.name, f"{count} {problem}", remedy) for count, severity, problem, remedy in faults if count]
+    return [
+        Finding(severity, item.name, f"{count} {problem}", remedy)
+        for count, severity, problem, remedy in faults
+        if count
+    ]
 
 
 def _material_findings(root: ElementTree.Element, objects: Sequence[ObjectHealth]) -> list[Finding]:
@@ -292,12 +313,16 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[ObjectHealth
         identifier = bsdf.get("id") or bsdf.get("name")
         if not identifier:
             findings.append(
-                Finding("error", "", f"a BSDF of type {bsdf.get('type')!r} has no id", "give it one: mat-NAME")
+                Finding(
+                    "error", "", f"a BSDF of type {bsdf.get('type')!r} has no id", "give it one: mat-NAME"
+                )
             )
         elif bsdf.get("type") != "itu-radio-material" and identifier.removeprefix("mat-") in known:
             findings.append(
                 Finding(
-                    "error", identifier, "has a name of ITU-R P.2040's, which Sionna RT refuses",
+                    "error",
+                    identifier,
+                    "has a name of ITU-R P.2040's, which Sionna RT refuses",
                     f"name it mat-itu_{identifier.removeprefix('mat-')} for ITU's constants, or otherwise",
                 )  # fmt: skip
             )
@@ -308,11 +333,21 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[ObjectHealth
     for item in objects:
         if item.material not in defined:
             findings.append(
-                Finding("error", item.name, f"refers to no material of the scene ({item.material!r})", "give it one")
+                Finding(
+                    "error",
+                    item.name,
+                    f"refers to no material of the scene ({item.material!r})",
+                    "give it one",
+                )
             )
         if item.name in defined:
             findings.append(
-                Finding("error", item.name, "is called like a material, which Sionna RT refuses", "rename the object")
+                Finding(
+                    "error",
+                    item.name,
+                    "is called like a material, which Sionna RT refuses",
+                    "rename the object",
+                )
             )
     return findings
 
@@ -325,25 +360,39 @@ def _scale_findings(bounds: Sequence[float]) -> list[Finding]:
     if across < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
         return [
             Finding(
-                "error", "", f"the scene is {size} large, as if in degrees of longitude and latitude",
+                "error",
+                "",
+                f"the scene is {size} large, as if in degrees of longitude and latitude",
                 "project it to metres (calibray scene does)",
             )  # fmt: skip
         ]
     findings = []
     if across > LARGEST:
         findings.append(
-            Finding("error", "", f"the scene is {size} m large, as if in millimetres", "scale it by 0.001 to metres")
+            Finding(
+                "error",
+                "",
+                f"the scene is {size} m large, as if in millimetres",
+                "scale it by 0.001 to metres",
+            )
         )
     elif centre > 100 * max(across, 1000.0):
         findings.append(
             Finding(
-                "error", "", f"the scene lies {centre:.0f} m from its origin, where single precision is coarse",
+                "error",
+                "",
+                f"the scene lies {centre:.0f} m from its origin, where single precision is coarse",
                 "move the origin into the scene (calibray scene does)",
             )  # fmt: skip
         )
     if 0 < extent[2] < 0.005 * across and extent[2] < 1:
         findings.append(
-            Finding("note", "", f"the scene is {size} m large, flat as a sheet", "check that heights were exported")
+            Finding(
+                "note",
+                "",
+                f"the scene is {size} m large, flat as a sheet",
+                "check that heights were exported",
+            )
         )
     return findings
 
@@ -371,20 +420,33 @@ def draw_positions(
     path, root = find_scene(source)
     figure = Figure(figsize=(8, 8), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    for _, _, mesh in read_meshes(path, root):
-        corners = mesh.vertices[mesh.faces]
-        height = np.ptp(mesh.vertices[:, 2])
-        # Walls are lines when seen from above; the ground would hide everything and is left out.
-        if height > 0.5:
-            axes.add_collection(PolyCollection(corners[:, :, :2], facecolor="0.85", edgecolor="0.45", linewidth=0.4))
+    meshes = [mesh for _, _, mesh in read_meshes(path, root)]
+    whole = np.ptp(np.concatenate([mesh.vertices[:, :2] for mesh in meshes]), axis=0)
+    for mesh in meshes:
+        if not _is_ground(mesh, whole):
+            seen = mesh.vertices[mesh.faces][:, :, :2]
+            # Walls are lines when seen from above.
+            axes.add_collection(PolyCollection(seen, facecolor="0.85", edgecolor="0.45", linewidth=0.4))
     marks = {"receivers": (rx, "o", "tab:blue", 12), "transmitters": (tx, "^", "tab:red", 50)}
     for what, places in (inside or {}).items():
         marks[what] = (places, "x", "tab:orange", 30)
     for what, (places, marker, color, size) in marks.items():
         points = np.asarray(places, dtype=float).reshape(-1, 3)
         if len(points):
-            axes.scatter(points[:, 0], points[:, 1], size, color, marker, label=f"{len(points)} {what}", zorder=3)
+            axes.scatter(
+                points[:, 0], points[:, 1], size, color, marker, label=f"{len(points)} {what}", zorder=3
+            )
     axes.autoscale_view()
     axes.legend(loc="upper right")
     axes.set_title(path.name)
     return figure
+
+
+def _is_ground(mesh: Mesh, whole: NDArray[np.float64]) -> bool:
+    """Whether a mesh is a sheet under the whole scene, which would hide everything in a drawing."""
+    sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    level = np.abs(normal[:, 2]) > 0.5 * np.linalg.norm(normal, axis=1)
+    wide = (np.ptp(mesh.vertices[:, :2], axis=0) > 0.8 * whole).all()
+    seen, extent = np.abs(normal[:, 2]).sum() / 2, float(np.prod(whole))
+    return bool(level.all() and wide and seen > 0.5 * extent)

@@ -74,7 +74,11 @@ class Windows:
         points = np.rint(start + (end - start) * shares[:, None]).astype(int)
         strips = [((int(x), int(y)), (WALL, WINDOW)[index % 2]) for index, (x, y) in enumerate(points)]
         # A strip that is thinner than the rounding is none.
-        return [strip for strip, after in zip(strips, [*strips[1:], (edge[1], WALL)], strict=True) if strip[0] != after[0]]
+        return [
+            strip
+            for strip, after in zip(strips, [*strips[1:], (edge[1], WALL)], strict=True)
+            if strip[0] != after[0]
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,9 @@ class Shell:
     kind: NDArray[np.int64]
 
 
-def extrude(cells: Sequence[Cell], windows: Windows | None = None, ground: NDArray[np.float64] | None = None) -> Shell:
+def extrude(
+    cells: Sequence[Cell], windows: Windows | None = None, ground: NDArray[np.float64] | None = None
+) -> Shell:
     """Raise buildings on their cells.
 
     Args:
@@ -104,7 +110,9 @@ def extrude(cells: Sequence[Cell], windows: Windows | None = None, ground: NDArr
         The shell: closed, but for the bottoms that were to stay open.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
-    standing = [tuple((_whole(low), _whole(high), owner) for low, high, owner in cell.stands) for cell in cells]
+    standing = [
+        tuple((_whole(low), _whole(high), owner) for low, high, owner in cell.stands) for cell in cells
+    ]
     cell_of = {edge: index for index, rings in enumerate(outlines) for ring in rings for edge in _edges(ring)}
     walls = {edge: _walls(standing, cell_of, edge) for edge in cell_of}
     strips = _strips(walls, windows)
@@ -114,13 +122,15 @@ def extrude(cells: Sequence[Cell], windows: Windows | None = None, ground: NDArr
     levels = _columns(walls, strips)
     for (start, end), stands in walls.items():
         points = strips.get((start, end), [(start, WALL)])
-        for ((left, strip), (right, _)) in pairwise([*points, (end, WALL)]):
+        for (left, strip), (right, _) in pairwise([*points, (end, WALL)]):
             for low, high, building in stands:
                 made = list(upright(left, right, levels[left], levels[right], low, high))
                 triangles += made
                 owner += [building] * len(made)
                 kind += [strip] * len(made)
-    lids = _lids(outlines, standing, strips, None if ground is None else [_whole(height) for height in ground])
+    lids = _lids(
+        outlines, standing, strips, None if ground is None else [_whole(height) for height in ground]
+    )
     return Shell(
         np.concatenate([np.array(triangles, dtype=np.int64).reshape(-1, 3, 3), lids.corners]),
         np.concatenate([np.array(owner, dtype=np.int64), lids.owner]),
@@ -152,7 +162,9 @@ def _walls(standing: Sequence[tuple[Interval, ...]], cell_of: dict[Edge, int], e
     return rest
 
 
-def _strips(walls: dict[Edge, list[Interval]], windows: Windows | None) -> dict[Edge, list[tuple[Point, int]]]:
+def _strips(
+    walls: dict[Edge, list[Interval]], windows: Windows | None
+) -> dict[Edge, list[tuple[Point, int]]]:
     """Where the strips of every edge with a wall begin; both directions of an edge have the same corners."""
     if windows is None or windows.share == 0:
         return {}
@@ -221,7 +233,11 @@ def _lids(
     corners, owner, kind = [np.zeros((0, 3, 3), dtype=np.int64)], [], []
     for index, stands in enumerate(standing):
         flat = triangles[first[index] : first[index + 1]]
-        faces = [(high, building, ROOF) for low, high, building in stands if all(high != other[0] for other in stands)]
+        faces = [
+            (high, building, ROOF)
+            for low, high, building in stands
+            if all(high != other[0] for other in stands)
+        ]
         for low, _, building in stands:
             if all(low != other[1] for other in stands) and (ground is None or low > ground[building]):
                 faces.append((low, building, UNDERSIDE))

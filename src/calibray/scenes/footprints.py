@@ -20,7 +20,16 @@ GRID: Final = 0.01
 
 HeightSource = Literal["height", "levels", "default"]
 
-_UNITS: Final = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0, "ft": 0.3048, "'": 0.3048}
+_UNITS: Final = {
+    "": 1.0,
+    "m": 1.0,
+    "metre": 1.0,
+    "meter": 1.0,
+    "metres": 1.0,
+    "meters": 1.0,
+    "ft": 0.3048,
+    "'": 0.3048,
+}
 _LENGTH: Final = re.compile(r"\s*(-?\d+(?:[.,]\d+)?)\s*([a-z]*|')\s*", re.IGNORECASE)
 _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
 

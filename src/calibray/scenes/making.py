@@ -63,7 +63,9 @@ class SurfaceMaterial:
                 f"name it {self.name.removeprefix('itu_').removeprefix('itu-') + '_wall'!r}, say"
             )
         if self.itu not in known:
-            raise InputError(f"material {self.name}: ITU-R P.2040 has no {self.itu!r}; {did_you_mean(self.itu, known)}")
+            raise InputError(
+                f"material {self.name}: ITU-R P.2040 has no {self.itu!r}; {did_you_mean(self.itu, known)}"
+            )
         if not (np.isfinite(self.thickness) and self.thickness > 0):
             raise InputError(f"material {self.name}: thickness = {self.thickness!r} must be greater than 0 m")
 
@@ -90,7 +92,12 @@ class Palette:
 
     def of(self, kind: int) -> SurfaceMaterial:
         """The material of a kind of surface of `extrusion`."""
-        return {WALL: self.wall, WINDOW: self.window, ROOF: self.roof or self.wall, UNDERSIDE: self.roof or self.wall}[kind]
+        return {
+            WALL: self.wall,
+            WINDOW: self.window,
+            ROOF: self.roof or self.wall,
+            UNDERSIDE: self.roof or self.wall,
+        }[kind]
 
 
 @dataclass(frozen=True)
@@ -210,9 +217,13 @@ def finish(
     constants: dict[str, Mapping[str, float | str]] = {}
     for material in materials:
         if constants.setdefault(material.name, material.constants()) != material.constants():
-            raise InputError(f"material {material.name!r}: is given twice with other constants; use another name")
+            raise InputError(
+                f"material {material.name!r}: is given twice with other constants; use another name"
+            )
     if clash := sorted({item.name for item in objects} & set(constants)):
-        raise InputError(f"material {clash[0]!r}: a mesh has the same name, which Sionna RT refuses; use another")
+        raise InputError(
+            f"material {clash[0]!r}: a mesh has the same name, which Sionna RT refuses; use another"
+        )
     triangles = dict.fromkeys(sorted(used), 0)
     for item in objects:
         triangles[item.material] += len(item.mesh.faces)
@@ -259,7 +270,9 @@ def _bases(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float6
         return np.zeros(len(footprints))
     shapely = library("shapely", "scenes")
     step = float(min(np.diff(terrain.x).min(), np.diff(terrain.y).min())) / 2
-    corners, building = shapely.get_coordinates(shapely.segmentize(footprints.polygon, step), return_index=True)
+    corners, building = shapely.get_coordinates(
+        shapely.segmentize(footprints.polygon, step), return_index=True
+    )
     lowest = np.full(len(footprints), np.inf)
     np.minimum.at(lowest, building, terrain.heights(*corners.T))
     return np.floor((lowest - SINK) * 100) / 100
@@ -271,7 +284,8 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
     material = np.array(names)[shell.kind]
     if buildings is None:
         return [
-            MeshObject(f"all-{name}", name, _mesh(shell.corners[material == name])) for name in sorted(set(material))
+            MeshObject(f"all-{name}", name, _mesh(shell.corners[material == name]))
+            for name in sorted(set(material))
         ]
     order = np.lexsort((material, shell.owner))
     groups = np.flatnonzero(

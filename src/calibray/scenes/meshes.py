@@ -123,17 +123,17 @@ def scene_xml(
         lines.append(f"    <!-- {escape(comment).replace('--', '- -')} -->")
     for name, constants in materials.items():
         kind = "itu-radio-material" if "type" in constants else "radio-material"
-        lines.append(f"    <bsdf type=\"{kind}\" id={quoteattr(f'mat-{name}')}>")
+        lines.append(f'    <bsdf type="{kind}" id={quoteattr(f"mat-{name}")}>')
         for key, value in constants.items():
             tag, text = ("string", value) if isinstance(value, str) else ("float", f"{value:.6g}")
             lines.append(f'        <{tag} name="{key}" value={quoteattr(text)}/>')
         lines.append("    </bsdf>")
     for item in objects:
         lines += [
-            f"    <shape type=\"ply\" id={quoteattr(f'mesh-{item.name}')}>",
-            f"        <string name=\"filename\" value={quoteattr(f'meshes/{item.name}.ply')}/>",
+            f'    <shape type="ply" id={quoteattr(f"mesh-{item.name}")}>',
+            f'        <string name="filename" value={quoteattr(f"meshes/{item.name}.ply")}/>',
             '        <boolean name="face_normals" value="true"/>',
-            f"        <ref id={quoteattr(f'mat-{item.material}')} name=\"bsdf\"/>",
+            f'        <ref id={quoteattr(f"mat-{item.material}")} name="bsdf"/>',
             "    </shape>",
         ]
     return "\n".join([*lines, "</scene>", ""])

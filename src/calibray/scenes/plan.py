@@ -89,7 +89,9 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
             None if np.isnan(thickness) else thickness,
         )  # fmt: skip
         if found.length < SHORTEST or high <= 0 or thickness <= 0:
-            raise InputError(f"{place}: its length, height and thickness must be greater than 0; correct or remove it")
+            raise InputError(
+                f"{place}: its length, height and thickness must be greater than 0; correct or remove it"
+            )
         segments.append(found)
     if not segments:
         raise InputError(f"floor plan {path}: holds no segment; give at least one wall")

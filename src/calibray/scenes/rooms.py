@@ -86,8 +86,14 @@ def make_plan_scene(
     for _, kind, height in lids:
         material = {**TYPES, **(types or {})}[kind]
         materials.append(material)
-        objects.append(MeshObject(f"all-{material.name}", material.name, welded(_lid(outline, height), MILLIMETRE)))
-    counts = {"lines": len(segments), "sheets": len(sheets), **({"lines merged as faces of one wall": merged} if merged else {})}
+        objects.append(
+            MeshObject(f"all-{material.name}", material.name, welded(_lid(outline, height), MILLIMETRE))
+        )
+    counts = {
+        "lines": len(segments),
+        "sheets": len(sheets),
+        **({"lines merged as faces of one wall": merged} if merged else {}),
+    }
     return finish(folder, objects, materials, frame, counts, {})
 
 
@@ -102,7 +108,9 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
             base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
         else:
             names = sorted({*types, *known})
-            raise InputError(f"type {sheet.kind!r}: has no material, {did_you_mean(sheet.kind, names)} Or name its own")
+            raise InputError(
+                f"type {sheet.kind!r}: has no material, {did_you_mean(sheet.kind, names)} Or name its own"
+            )
         found.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
     thicknesses: dict[str, set[float]] = defaultdict(set)
     for material in found:
@@ -122,11 +130,15 @@ def _joined(sheets: Sequence[Segment]) -> list[Segment]:
         start, end = np.array(sheet.start), np.array(sheet.end)
         others = [other for other in joined if other is not sheet]
         start, end = _led(start, start - end, others), _led(end, end - start, others)
-        joined[index] = replace(sheet, start=(float(start[0]), float(start[1])), end=(float(end[0]), float(end[1])))
+        joined[index] = replace(
+            sheet, start=(float(start[0]), float(start[1])), end=(float(end[0]), float(end[1]))
+        )
     return joined
 
 
-def _led(end: NDArray[np.float64], outward: NDArray[np.float64], others: Sequence[Segment]) -> NDArray[np.float64]:
+def _led(
+    end: NDArray[np.float64], outward: NDArray[np.float64], others: Sequence[Segment]
+) -> NDArray[np.float64]:
     """An end of a sheet, moved along the sheet to the nearest wall within reach."""
     outward = outward / np.hypot(*outward)
     steps = []
@@ -186,7 +198,9 @@ def _walls(pieces: Pieces) -> list[MeshObject]:
     triangles: dict[str, list[Any]] = defaultdict(list)
     for (left, right), stands in pieces.items():
         for low, high, material in stands:
-            triangles[material] += upright(left, right, sorted(levels[left]), sorted(levels[right]), low, high)
+            triangles[material] += upright(
+                left, right, sorted(levels[left]), sorted(levels[right]), low, high
+            )
     return [
         MeshObject(f"all-{name}", name, welded(np.array(corners, dtype=np.int64), MILLIMETRE))
         for name, corners in sorted(triangles.items())

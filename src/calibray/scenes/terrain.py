@@ -62,7 +62,9 @@ class Terrain:
         columns, rows = len(self.x), len(self.y)
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         across = corner + columns + 1
-        faces = np.stack([[corner, corner + 1, across], [corner, across, corner + columns]]).transpose(2, 0, 1)
+        faces = np.stack([[corner, corner + 1, across], [corner, across, corner + columns]]).transpose(
+            2, 0, 1
+        )
         return Mesh(np.column_stack([east.ravel(), north.ravel(), self.z.ravel()]), faces.reshape(-1, 3))
 
 
@@ -104,7 +106,9 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     try:
         with rasterio.open(path) as model:
             if model.crs is None:
-                raise InputError(f"height model {path}: has no reference system; give a GeoTIFF that states it")
+                raise InputError(
+                    f"height model {path}: has no reference system; give a GeoTIFF that states it"
+                )
             crs, affine = model.crs.to_wkt(), model.transform
             west, south, east, north = np.asarray(bounds, dtype=float)
             along = np.linspace(0, 1, 21)
@@ -113,7 +117,12 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
             # One cell more on each side, for the interpolation.
             first = np.floor([row.min() - 1, column.min() - 1]).astype(int)
             last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
-            if column.min() < 0 or row.min() < 0 or column.max() > model.width - 1 or row.max() > model.height - 1:
+            if (
+                column.min() < 0
+                or row.min() < 0
+                or column.max() > model.width - 1
+                or row.max() > model.height - 1
+            ):
                 raise InputError(
                     f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m around "
                     f"{frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2].round(5).tolist()}; "
@@ -138,7 +147,9 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     grid_x, grid_y = np.meshgrid(x, y)
     column, row = _pixels(grid_x, grid_y, frame, crs, affine)
     axes = tuple(np.arange(low, high + 1, dtype=float) for low, high in zip(first, last, strict=True))
-    at = np.stack([np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1)
+    at = np.stack(
+        [np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1
+    )
     return Terrain(x, y, RegularGridInterpolator(axes, filled)(at) - frame.height, repairs)
 
 
@@ -161,4 +172,6 @@ def _filled(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64]
     if not missing.any():
         return heights.filled(np.nan), {}
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return heights.filled(np.nan)[tuple(nearest)], {"heights missing, taken from the nearest": int(missing.sum())}
+    return heights.filled(np.nan)[tuple(nearest)], {
+        "heights missing, taken from the nearest": int(missing.sum())
+    }

@@ -85,7 +85,9 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
             f"footprints {path}: cannot be read ({error}); give GeoJSON, a Shapefile or a GeoPackage"
         ) from None
     if meta["crs"] is None:
-        raise InputError(f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON")
+        raise InputError(
+            f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
+        )
     outlines = shapely.from_wkb(geometry)
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))
     if not is_polygon.any():
