@@ -73,7 +73,7 @@ class Frame:
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
         # A tenth of a microdegree is 1 cm: the string stays short, and states the origin exactly.
-        centre = f"+lat_0={round(latitude, 7)!r} +lon_0={round(longitude, 7)!r}"
+        centre = f"+lat_0={round(float(latitude), 7)!r} +lon_0={round(float(longitude), 7)!r}"
         return cls(f"+proj=aeqd {centre} +datum=WGS84 +units=m", height=height)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Positions on the globe: longitude and latitude of a log to the scene's metres, and tracks joined with logs by time."""
+"""Positions on the globe: longitude and latitude to the scene's metres, and tracks joined with logs by time."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class HeightRule:
 
 
 def parse_length(text: str | None) -> float | None:
-    """A length as people write it on maps.
+    r"""A length as people write it on maps.
 
     Args:
         text: A number, with a unit or without: `12`, `12.5 m`, `40 ft`, `40'6"`.
@@ -92,7 +92,7 @@ def parse_length(text: str | None) -> float | None:
         The length [m]; None if there is none, or it cannot be read.
 
     Example:
-        >>> parse_length("12,5 m"), parse_length("10'6\\""), parse_length("tall")
+        >>> parse_length("12,5 m"), parse_length("10'6\""), parse_length("tall")
         (12.5, 3.2004, None)
     """
     if text is None:

@@ -124,8 +124,8 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
                 or row.max() > model.height - 1
             ):
                 raise InputError(
-                    f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m around "
-                    f"{frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2].round(5).tolist()}; "
+                    f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
+                    f"around {frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2].round(5).tolist()}; "
                     "give a larger one, or lower the margin"
                 )
             first, last = np.maximum(first, 0), np.minimum(last, [model.height - 1, model.width - 1])
@@ -141,7 +141,8 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     columns, rows = (max(2, int(np.ceil(length / spacing)) + 1) for length in (east - west, north - south))
     if columns * rows > MOST_POINTS:
         raise InputError(
-            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MOST_POINTS}; give a wider one"
+            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MOST_POINTS}; "
+            "give a wider one"
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
     grid_x, grid_y = np.meshgrid(x, y)
