@@ -117,7 +117,9 @@ def test_a_rule_without_sense_is_refused(wrong):
 def layer(path: Path, heights: list, driver: str, crs: str = "EPSG:32632", **columns) -> Path:
     """Three squares in UTM metres about the planted place."""
     origin = Frame.utm(11.5755, 48.1374)
-    squares = [shapely.Polygon(moved(SQUARE, 50 * index + origin.easting, origin.northing)) for index in range(3)]
+    squares = [
+        shapely.Polygon(moved(SQUARE, 50 * index + origin.easting, origin.northing)) for index in range(3)
+    ]
     fields = {"hoehe": np.array(heights), **{name: np.array(values) for name, values in columns.items()}}
     pyogrio.raw.write(
         path, shapely.to_wkb(squares), list(fields.values()), list(fields), driver=driver, crs=crs,
@@ -198,7 +200,9 @@ def height_model(path: Path, missing: bool = False) -> Path:
 
 def test_a_plane_is_interpolated_exactly(tmp_path):
     frame = Frame.utm(11.5755, 48.1374, height=490.0)
-    terrain = read_terrain(height_model(tmp_path / "dem.tif"), frame, (-103.0, -50.0, 203.0, 151.0), spacing=7.0)
+    terrain = read_terrain(
+        height_model(tmp_path / "dem.tif"), frame, (-103.0, -50.0, 203.0, 151.0), spacing=7.0
+    )
     east, north = np.meshgrid(terrain.x, terrain.y)
     np.testing.assert_allclose(terrain.z, 10.0 + 0.05 * east + 0.02 * north, atol=1e-9)
     assert np.diff(terrain.x).max() <= 7.0
@@ -212,7 +216,9 @@ def test_a_model_in_another_system_lies_right(tmp_path):
     terrain = read_terrain(height_model(tmp_path / "dem.tif"), FRAME, (-100, -100, 100, 100))
     utm = Frame.utm(11.5755, 48.1374)
     corner = utm.to_scene(*FRAME.to_geographic([100.0, 100.0, 0.0])[:2])
-    assert terrain.heights([100.0], [100.0])[0] == pytest.approx(500 + 0.05 * corner[0] + 0.02 * corner[1], abs=1e-6)
+    assert terrain.heights([100.0], [100.0])[0] == pytest.approx(
+        500 + 0.05 * corner[0] + 0.02 * corner[1], abs=1e-6
+    )
     assert 21 <= len(terrain.x) <= 22
 
 
@@ -249,5 +255,7 @@ def test_a_height_model_that_does_not_do_is_refused(tmp_path, bounds, spacing, m
 @pytest.mark.parametrize("package", ["osmium", "shapely", "pyproj"])
 def test_a_missing_library_is_named_with_its_extra(extract, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=rf"{package} is not installed .*pip install 'calibray\[(scenes|geo)\]'"):
+    with pytest.raises(
+        InputError, match=rf"{package} is not installed .*pip install 'calibray\[(scenes|geo)\]'"
+    ):
         read_openstreetmap(extract)

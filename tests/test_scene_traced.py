@@ -77,7 +77,9 @@ def test_eaves_diffract_if_roofs_are_of_the_walls_material(tmp_path):
     found = {}
     for name, roof in (("one", None), ("two", SurfaceMaterial("slate", "concrete", 0.3))):
         palette = Palette(wall=STONE, roof=roof)
-        made = make_scene(footprints([shapely.box(-200, 0, 200, 12)], [8.0]), tmp_path / name, palette=palette)
+        made = make_scene(
+            footprints([shapely.box(-200, 0, 200, 12)], [8.0]), tmp_path / name, palette=palette
+        )
         _, paths = traced(made.path, [[0, -20, 12.0]], [[0, 17, 1.5]], diffraction=True, max_depth=1)
         found[name] = int((paths.kind == Kind.DIFFRACTION).sum())
     assert found["one"] >= 1

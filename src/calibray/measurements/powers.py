@@ -93,7 +93,7 @@ def with_transmitters(
     known = Table(transmitters, source="transmitters").labels(name)
     if len(set(known)) != len(known):
         raise InputError(f"transmitters: one of {', '.join(known[:5])} stands twice; remove one")
-    if lost := sorted(set(of_link) - set(known)):
+    if lost := sorted(set(of_link.tolist()) - set(known.tolist())):
         raise InputError(f"links: transmitter {lost[0]!r} is not known; {did_you_mean(lost[0], known)}")
     row = {label: index for index, label in enumerate(known.tolist())}
     found = transmitters.drop(columns=name).iloc[[row[label] for label in of_link.tolist()]]

@@ -159,8 +159,8 @@ def _object_findings(item: ObjectHealth) -> list[Finding]:
         ),
         (
             item.flipped_faces,
-            "warning",
-            f"{share} with the normal turned inward or against their neighbours'",
+            "note",
+            f"{share} with the normal turned inward or against their neighbours'; Sionna RT copes, others do not",
             "recalculate normals outside (Blender: Shift-N)",
         ),
         (item.empty_faces, "warning", f"{share} without area", "dissolve degenerate faces, and export again"),

@@ -54,7 +54,13 @@ def draw_positions(
         points = np.asarray(places, dtype=float).reshape(-1, 3)
         if len(points):
             axes.scatter(
-                points[:, 0], points[:, 1], size, color, marker, label=f"{len(points)} {what}", zorder=3
+                points[:, 0],
+                points[:, 1],
+                s=size,
+                c=color,
+                marker=marker,
+                label=f"{len(points)} {what}",
+                zorder=3,
             )
     axes.autoscale_view()
     axes.legend(loc="upper right")

@@ -88,8 +88,9 @@ def _edge_uses(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
 def _flipped(vertices: NDArray[np.float64], faces: NDArray[np.int64], by_place: NDArray[np.int64]) -> int:
     """Faces that look the wrong way.
 
-    Faces are turned alike along the edges that two of them share; then each connected piece has one right way: its
-    signed volume about a point below its middle is positive, and a level sheet looks up.
+    Faces are turned alike along the edges that two of them share. A connected piece that is closed, or open at its
+    bottom alone, has one right way then: its volume is positive; and a level sheet looks up. Of any other piece, such
+    as a wall, it is not known which side is outside, and the faces that look unlike most are counted.
     """
     if not len(faces):
         return 0
@@ -97,20 +98,36 @@ def _flipped(vertices: NDArray[np.float64], faces: NDArray[np.int64], by_place: 
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     base = np.full((piece.max() + 1, 3), np.inf)
     np.minimum.at(base, piece, np.minimum(np.minimum(a, b), c))
-    middle = np.zeros_like(base)
-    np.add.at(middle, piece, (a + b + c) / 3)
-    base[:, :2] = (middle / np.bincount(piece)[:, None])[:, :2]
     normal = np.cross(b - a, c - a) * turn[:, None]
     volume = np.bincount(piece, (normal * (a - base[piece])).sum(axis=1) / 6)
     area = np.bincount(piece, np.linalg.norm(normal, axis=1) / 2)
     upward = np.bincount(piece, normal[:, 2])
-    sheet = np.abs(volume) < 1e-3 * area**1.5
-    # An upright sheet has no right way: either is as good.
-    right = np.where(sheet, np.sign(np.where(np.abs(upward) < 1e-3 * area, 0, upward)), np.sign(volume))
+    is_sheet = np.abs(volume) < 1e-3 * area**1.5
+    is_level = np.abs(upward) > area
+    lowest = base[:, 2]
+    is_closed = np.bincount(piece, _open_above(vertices, faces, by_place, lowest[piece])) == 0
+    right = np.where(
+        is_sheet & is_level, np.sign(upward), np.where(is_closed & ~is_sheet, np.sign(volume), 0.0)
+    )
     wrong = turn * right[piece] < 0
     undecided = right[piece] == 0
     odd = np.minimum(np.bincount(piece, turn > 0), np.bincount(piece, turn < 0))
     return int(wrong.sum() + odd[np.unique(piece[undecided])].sum())
+
+
+def _open_above(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    by_place: NDArray[np.int64],
+    lowest: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """How many edges of every face have no other face and do not lie at the bottom of its piece [F]."""
+    edges = by_place[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, edge, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    is_open = (uses == 1)[edge.reshape(-1)].reshape(-1, 3)
+    height = vertices[faces][:, :, 2]
+    above = np.maximum(height, np.roll(height, -1, axis=1)) > lowest[:, None] + 2 * _SAME
+    return (is_open & above).sum(axis=1)
 
 
 def _turned(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
