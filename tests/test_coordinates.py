@@ -57,7 +57,7 @@ def test_utm_has_its_zones_and_its_origin():
 def test_a_frame_is_recorded():
     frame = Frame("EPSG:32632", 691_000.0, 5_334_000.0, 510.0)
     assert Frame.from_record(frame.record()) == frame
-    with pytest.raises(InputError, match="needs crs, easting"):
+    with pytest.raises(InputError, match="needs crs"):
         Frame.from_record({"crs": "EPSG:32632"})
 
 
@@ -76,7 +76,7 @@ def test_a_system_that_is_no_frame_is_refused(crs, message):
 
 def test_positions_off_the_globe_are_refused():
     frame = Frame.local(11.5755, 48.1374)
-    with pytest.raises(InputError, match="latitude of position 1 is 111.6, must be -90 to 90"):
+    with pytest.raises(InputError, match=r"latitude of position 1 is 111\.6, must be -90 to 90"):
         frame.to_scene([48.1, 48.2], [11.6, 111.6])
     with pytest.raises(InputError, match="UTM goes from -80 to 84"):
         Frame.utm(0.0, 89.0)

@@ -67,7 +67,10 @@ def test_no_average_crosses_transmitters():
 
 
 def test_cells_stretches_and_windows():
-    rows = pd.DataFrame({"rx_x": [-0.1, 0.1, 9.9, 10.1], "rx_y": [1.0] * 4, "t": ["2026-05-01T10:00:00Z", "2026-05-01T10:00:04Z", "2026-05-01T12:00:05+02:00", "2026-05-01T10:01:00Z"]})  # fmt: skip
+    times = ["10:00:00Z", "10:00:04Z", "12:00:05+02:00", "10:01:00Z"]
+    rows = pd.DataFrame(
+        {"rx_x": [-0.1, 0.1, 9.9, 10.1], "rx_y": 1.0, "t": [f"2026-05-01T{time}" for time in times]}
+    )
     assert by_cell(rows, 10.0).tolist() == [0, 1, 1, 2]
     assert by_distance(rows, 10.0).tolist() == [0, 0, 1, 1]
     assert by_time(rows, 5.0, "t").tolist() == [0, 0, 1, 12]
@@ -100,7 +103,8 @@ def test_what_cannot_be_averaged_is_refused(call, message):
 
 def gpx(points: str, head: str = "") -> str:
     return (
-        f'<?xml version="1.0"?>{head}<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><wpt lat="1" lon="1"/>'
+        f'<?xml version="1.0"?>{head}<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">'
+        '<wpt lat="1" lon="1"/>'
         f"<trk><trkseg>{points}</trkseg></trk></gpx>"
     )
 

@@ -84,7 +84,7 @@ def test_a_frame_of_its_own_is_centred_on_the_buildings(extract):
     found, frame = read_openstreetmap(extract, rule=HeightRule(default=5.0))
     assert found.bounds == pytest.approx([-110, -10, 110, 10], abs=0.02)
     assert found.top[2] == 5.0
-    where = frame.to_geographic(found.bounds[:2].tolist() + [0])
+    where = frame.to_geographic([*found.bounds[:2], 0.0])
     np.testing.assert_allclose(FRAME.to_scene(*where[:2])[:2], [0, 0], atol=0.02)
 
 
