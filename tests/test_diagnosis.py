@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.scenes.diagnosis import Diagnosis, diagnose
+from calibray.scenes.diagnosis import SceneDiagnosis, diagnose
 from calibray.scenes.drawing import draw_positions
 from calibray.scenes.extrusion import Windows
 from calibray.scenes.health import health
@@ -26,11 +26,11 @@ def cube(size: float = 10.0, at: float = 0.0) -> Mesh:
     return Mesh(corners * size + [at, at, 0], np.array(faces))
 
 
-def scene(folder: Path, mesh: Mesh, materials=STONE, name: str = "body") -> Diagnosis:
+def scene(folder: Path, mesh: Mesh, materials=STONE, name: str = "body") -> SceneDiagnosis:
     return diagnose(write_scene(folder, [MeshObject(name, next(iter(materials)), mesh)], materials))
 
 
-def problems(found: Diagnosis) -> list[str]:
+def problems(found: SceneDiagnosis) -> list[str]:
     return [finding.problem for finding in found.findings]
 
 

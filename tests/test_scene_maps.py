@@ -19,7 +19,7 @@ from calibray.errors import InputError
 from calibray.scenes.footprints import HeightRule
 from calibray.scenes.making import make_scene
 from calibray.scenes.openstreetmap import read_openstreetmap
-from calibray.scenes.terrain import read_terrain
+from calibray.scenes.terrain import lowered, read_terrain
 from calibray.scenes.vectors import read_footprints
 from planted_maps import FRAME, write_extract
 
@@ -209,6 +209,14 @@ def test_a_plane_is_interpolated_exactly(tmp_path):
     assert (terrain.x[0], terrain.x[-1], terrain.y[0], terrain.y[-1]) == (-103.0, 203.0, -50.0, 151.0)
     x, y = np.random.default_rng(1).uniform(-50, 150, (2, 40))
     np.testing.assert_allclose(terrain.heights(x, y), 10.0 + 0.05 * x + 0.02 * y, atol=1e-9)
+
+
+def test_the_origin_is_moved_to_the_lowest_ground(tmp_path):
+    terrain = read_terrain(height_model(tmp_path / "dem.tif"), FRAME, (-100, -100, 100, 100))
+    low, frame = lowered(terrain, FRAME)
+    assert 0 <= low.z.min() < 1
+    np.testing.assert_allclose(low.z + frame.height, terrain.z)
+    assert frame.crs == FRAME.crs
 
 
 def test_a_model_in_another_system_lies_right(tmp_path):

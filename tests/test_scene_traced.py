@@ -38,7 +38,7 @@ def traced(scene: Path, tx: list, rx: list, **settings) -> tuple[Tracer, Paths]:
         read_scene(scene, FREQUENCY), FREQUENCY, TraceSettings(**{"samples": 20_000, **settings}),
         Antenna("dipole"), Antenna("dipole"),
     )  # fmt: skip
-    return tracer, tracer.trace(SimpleNamespace(tx=np.array(tx, float), rx=np.array(rx, float))).paths()
+    return tracer, tracer.trace(SimpleNamespace(tx=np.array(tx, float), rx=np.array(rx, float)))
 
 
 def test_a_made_scene_has_the_path_loss_of_one_made_by_hand(tmp_path):

@@ -150,7 +150,7 @@ def averaged(
     samples["level"] = levels
     samples["label"] = label
     groups = samples.groupby([*keep, "label"], sort=False, dropna=False)
-    mean = groups[[*coordinates, "linear"]].mean()
+    mean: pd.DataFrame = groups[[*coordinates, "linear"]].mean()  # type: ignore[assignment]
     power = 10 * np.log10(mean.pop("linear")) + levels.max()
     mean[value] = power if sense == "power" else -power
     mean["std_db"] = groups["level"].std()

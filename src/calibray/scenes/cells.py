@@ -9,7 +9,7 @@ walls and roofs that meet share their vertices.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,11 @@ from calibray.scenes.footprints import GRID, Footprints
 
 Interval = tuple[float, float, int]
 """Bottom [m], top [m] and number of the building that stands between them."""
+
+Length = TypeVar("Length", int, float)
+
+SLIVER: Final = 0.1
+"""Overlaps of less area [m^2] come from the grid and are not counted."""
 
 THINNEST: Final = 0.005  # [m], half of the grid: what is thinner is an artefact of it
 
@@ -49,7 +54,7 @@ def take_apart(
         top: Where each ends [n], [m].
 
     Returns:
-        The cells, and how many footprints overlapped another and were cut.
+        The cells, and how many footprints share ground with another one.
     """
     shapely = library("shapely", "scenes")
     tree = shapely.STRtree(footprints.polygon)
@@ -67,12 +72,15 @@ def take_apart(
             cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[alone])]
             continue
         pieces, covers = _overlay(footprints.polygon[members])
-        cut += int((covers[:, covers.sum(axis=0) > 1].any(axis=1)).sum())
+        twice = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > SLIVER)
+        cut += int(covers[:, twice].any(axis=1).sum())
         for piece, cover in zip(pieces, covers.T, strict=True):
             here = members[cover]
             if footprints.part[here].any():
                 here = here[footprints.part[here]]
-            cells.append(Cell(piece, _stacked([(bottom[one], top[one], int(one)) for one in here])))
+            cells.append(
+                Cell(piece, _stacked([(float(bottom[one]), float(top[one]), int(one)) for one in here]))
+            )
     return cells, cut
 
 
@@ -93,14 +101,16 @@ def _stacked(stands: list[Interval]) -> tuple[Interval, ...]:
     """Intervals without overlaps: what is covered twice belongs to the one with the higher top."""
     free: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
-        remains = [(float(bottom), float(top), owner)]
+        remains = [(bottom, top, owner)]
         for taken_bottom, taken_top, _ in free:
             remains = [rest for one in remains for rest in outside(one, taken_bottom, taken_top)]
         free += remains
     return tuple(sorted(free))
 
 
-def outside(interval: Interval, bottom: float, top: float) -> list[Interval]:
+def outside(
+    interval: tuple[Length, Length, int], bottom: Length, top: Length
+) -> list[tuple[Length, Length, int]]:
     """What is left of an interval outside another.
 
     Args:

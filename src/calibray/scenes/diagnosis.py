@@ -42,7 +42,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class SceneDiagnosis:
     """What a scene is like.
 
     Attributes:
@@ -63,7 +63,7 @@ class Diagnosis:
         return sum(item.faces for item in self.objects)
 
 
-def diagnose(source: str | Path, progress: Progress | None = None) -> Diagnosis:
+def diagnose(source: str | Path, progress: Progress | None = None) -> SceneDiagnosis:
     """Examine a scene.
 
     Args:
@@ -89,7 +89,7 @@ def diagnose(source: str | Path, progress: Progress | None = None) -> Diagnosis:
     for item in objects:
         findings += _object_findings(item)
     order = ("error", "warning", "note")
-    return Diagnosis(
+    return SceneDiagnosis(
         str(source), bounds, objects, tuple(sorted(findings, key=lambda one: order.index(one.severity)))
     )
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.extras import library
-from calibray.scenes.cells import Cell, Interval, outside
+from calibray.scenes.cells import Cell, outside
 
 MILLIMETRE: Final = 0.001
 WALL, WINDOW, ROOF, UNDERSIDE = range(4)
@@ -28,6 +28,7 @@ WALL, WINDOW, ROOF, UNDERSIDE = range(4)
 Point = tuple[int, int]
 Edge = tuple[Point, Point]
 Corner = tuple[int, int, int]
+Stand = tuple[int, int, int]  # bottom [mm], top [mm], number of the building
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
     return pairwise([*ring, ring[0]])
 
 
-def _walls(standing: Sequence[tuple[Interval, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Interval]:
+def _walls(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
     """What stands to the left of an edge and not to its right [mm]."""
     twin = cell_of.get((edge[1], edge[0]))
     rest = list(standing[cell_of[edge]])
@@ -162,9 +163,7 @@ def _walls(standing: Sequence[tuple[Interval, ...]], cell_of: dict[Edge, int], e
     return rest
 
 
-def _strips(
-    walls: dict[Edge, list[Interval]], windows: Windows | None
-) -> dict[Edge, list[tuple[Point, int]]]:
+def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> dict[Edge, list[tuple[Point, int]]]:
     """Where the strips of every edge with a wall begin; both directions of an edge have the same corners."""
     if windows is None or windows.share == 0:
         return {}
@@ -179,7 +178,7 @@ def _strips(
 
 
 def _columns(
-    walls: dict[Edge, list[Interval]], strips: dict[Edge, list[tuple[Point, int]]]
+    walls: dict[Edge, list[Stand]], strips: dict[Edge, list[tuple[Point, int]]]
 ) -> dict[Point, list[int]]:
     """The heights at which some wall that meets a corner begins or ends [mm], ascending."""
     levels: dict[Point, set[int]] = defaultdict(set)
@@ -220,7 +219,7 @@ def upright(
 
 def _lids(
     outlines: Sequence[list[list[Point]]],
-    standing: Sequence[tuple[Interval, ...]],
+    standing: Sequence[tuple[Stand, ...]],
     strips: dict[Edge, list[tuple[Point, int]]],
     ground: Sequence[int] | None,
 ) -> Shell:

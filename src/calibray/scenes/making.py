@@ -182,7 +182,7 @@ def make_scene(
         {
             "buildings": len(footprints),
             **footprints.repairs,
-            **({"overlapping another, cut": cut} if cut else {}),
+            **({"sharing ground with another, cut": cut} if cut else {}),
             **(terrain.repairs if terrain is not None else {}),
         },
         {source: names for source, names in footprints.guessed().items() if names},
@@ -293,7 +293,7 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
     )
     return [
         MeshObject(
-            f"{buildings[shell.owner[rows[0]]]}-{material[rows[0]]}",
+            f"{buildings[int(shell.owner[rows[0]])]}-{material[rows[0]]}",
             str(material[rows[0]]),
             _mesh(shell.corners[rows]),
         )

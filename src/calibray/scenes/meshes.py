@@ -78,7 +78,7 @@ def welded(triangles: NDArray[np.integer], scale: float) -> Mesh:
     vertices, faces = np.unique(np.reshape(triangles, (-1, 3)), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
     corners = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return joined([Mesh(vertices * scale, faces[corners])])
+    return joined([Mesh(vertices.astype(np.float64) * scale, faces[corners])])
 
 
 def ply_bytes(mesh: Mesh) -> bytes:

@@ -16,8 +16,8 @@ from calibray.errors import InputError
 from calibray.extras import library
 from calibray.files import check_folder
 from calibray.materials import ITU_MATERIALS
-from calibray.scenes.cells import Interval, outside
-from calibray.scenes.extrusion import MILLIMETRE, Point, flat_triangles, upright
+from calibray.scenes.cells import outside
+from calibray.scenes.extrusion import MILLIMETRE, Point, Stand, flat_triangles, upright
 from calibray.scenes.making import Made, SurfaceMaterial, finish
 from calibray.scenes.meshes import MeshObject, welded
 from calibray.scenes.plan import OPENINGS, Segment, merge_faces
@@ -173,7 +173,7 @@ def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
         over[index].append(owner)
     pieces: Pieces = {}
     for index, owners in over.items():
-        stands: list[Interval] = []
+        stands: list[Stand] = []
         for owner in sorted(owners, key=lambda one: (sheets[one].kind not in OPENINGS, one)):
             rest = [(_whole(sheets[owner].bottom), _whole(sheets[owner].top), owner)]
             for low, high, _ in stands:
@@ -181,7 +181,7 @@ def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
             stands += rest
         (x0, y0), (x1, y1) = shapely.get_coordinates(noded[index])[[0, -1]]
         edge = (_whole(x0), _whole(y0)), (_whole(x1), _whole(y1))
-        pieces[edge] = [(int(low), int(high), materials[owner]) for low, high, owner in stands]
+        pieces[edge] = [(low, high, materials[owner]) for low, high, owner in stands]
     return pieces
 
 

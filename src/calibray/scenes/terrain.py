@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +80,20 @@ def level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
     """
     west, south, east, north = np.asarray(bounds, dtype=float)
     return Terrain(np.array([west, east]), np.array([south, north]), np.full((2, 2), float(height)))
+
+
+def lowered(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:
+    """Move the frame's origin down or up so that the lowest ground is less than a metre above z = 0.
+
+    Args:
+        terrain: The ground.
+        frame: The scene's frame.
+
+    Returns:
+        The same ground, and the frame that it is in now.
+    """
+    lowest = float(np.floor(terrain.z.min()))
+    return replace(terrain, z=terrain.z - lowest), replace(frame, height=frame.height + lowest)
 
 
 def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: float | None = None) -> Terrain:
