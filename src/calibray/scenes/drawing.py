@@ -43,7 +43,7 @@ def draw_positions(
     meshes = [mesh for _, _, mesh in read_meshes(path, root)]
     whole = np.ptp(np.concatenate([mesh.vertices[:, :2] for mesh in meshes]), axis=0)
     for mesh in meshes:
-        if not _is_ground(mesh, whole):
+        if not is_ground(mesh, whole):
             seen = mesh.vertices[mesh.faces][:, :, :2]
             # Walls are lines when seen from above.
             axes.add_collection(PolyCollection(seen, facecolor="0.85", edgecolor="0.45", linewidth=0.4))
@@ -68,8 +68,16 @@ def draw_positions(
     return figure
 
 
-def _is_ground(mesh: Mesh, whole: NDArray[np.float64]) -> bool:
-    """Whether a mesh is a sheet under the whole scene, which would hide everything in a drawing."""
+def is_ground(mesh: Mesh, whole: NDArray[np.float64]) -> bool:
+    """Whether a mesh is a sheet under the whole scene.
+
+    Args:
+        mesh: The mesh.
+        whole: Extent of the scene to the east and to the north [2], [m].
+
+    Returns:
+        True if no face of it is steep, and it covers most of the scene.
+    """
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])
     level = np.abs(normal[:, 2]) > 0.5 * np.linalg.norm(normal, axis=1)

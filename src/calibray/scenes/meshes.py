@@ -14,6 +14,8 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.files import replacing
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -158,7 +160,9 @@ def write_scene(
     """
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     for item in objects:
-        (folder / "meshes" / f"{item.name}.ply").write_bytes(ply_bytes(item.mesh))
+        with replacing(folder / "meshes" / f"{item.name}.ply") as partial:
+            partial.write_bytes(ply_bytes(item.mesh))
     path = folder / "scene.xml"
-    path.write_bytes(scene_xml(objects, materials, comment).encode("utf-8"))
+    with replacing(path) as partial:
+        partial.write_bytes(scene_xml(objects, materials, comment).encode("utf-8"))
     return path
