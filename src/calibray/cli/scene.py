@@ -159,15 +159,10 @@ def plan(
     """Make a scene of a floor plan: one sheet for every wall, door and window."""
     from calibray.report import scenes as report
     from calibray.scenes.plan import read_plan
-    from calibray.scenes.rooms import WALL_THICKNESS, make_plan_scene
+    from calibray.scenes.rooms import make_plan_scene
     from calibray.tables.text import render
 
-    types = {}
-    for given in material or []:
-        kind, parted, constants = given.partition("=")
-        if not parted:
-            raise InputError(f"--material {given}: must be TYPE=ITU, for instance drywall=plasterboard:0.1")
-        types[kind] = _material(kind, constants, WALL_THICKNESS)
+    types = _types(material or [])
     made = make_plan_scene(read_plan(file, height, unit), out, types, floor, ceiling, merge)
     typer.echo(render(report.made(made)))
 
@@ -223,6 +218,19 @@ def _frame(origin: str | None, utm: bool) -> Frame | None:
     except ValueError:
         raise InputError(f"--origin {origin}: must be longitude and latitude, 11.5755,48.1374") from None
     return Frame.utm(longitude, latitude) if utm else Frame.local(longitude, latitude)
+
+
+def _types(given: list[str]) -> dict[str, SurfaceMaterial]:
+    """Materials by type of wall, from words such as `drywall=plasterboard:0.1`."""
+    from calibray.scenes.rooms import WALL_THICKNESS
+
+    types = {}
+    for words in given:
+        kind, parted, constants = words.partition("=")
+        if not parted:
+            raise InputError(f"--material {words}: must be TYPE=ITU, for instance drywall=plasterboard:0.1")
+        types[kind] = _material(kind, constants, WALL_THICKNESS)
+    return types
 
 
 def _number_or_column(text: str) -> str | float:
