@@ -9,6 +9,7 @@ over several kilometres.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -112,13 +113,12 @@ class Frame:
         Raises:
             InputError: It is no such record.
         """
-        try:
-            crs, easting, northing, height = (record[key] for key in cls.__dataclass_fields__)  # type: ignore[index]
-            return cls(str(crs), float(easting), float(northing), float(height))
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"frame {record!r}: needs crs, easting, northing and height") from None
+        keys = ("easting", "northing", "height")
+        if not isinstance(record, Mapping) or not isinstance(record.get("crs"), str):
+            raise InputError(f"frame {record!r}: needs crs, easting, northing and height")
+        if not all(isinstance(record.get(key), float | int) for key in keys):
+            raise InputError(f"frame {record!r}: needs easting, northing and height in metres")
+        return cls(record["crs"], *(float(record[key]) for key in keys))
 
     def record(self) -> dict[str, str | float]:
         """The frame as JSON takes it."""

@@ -144,14 +144,16 @@ def joined_by_time(
     """
     column = Table(log, source="log").column(time)
     try:
-        is_number = pd.api.types.is_numeric_dtype(column)
-        when = pd.to_datetime(column, utc=True, **({"unit": "s"} if is_number else {"format": "ISO8601"}))
+        if pd.api.types.is_numeric_dtype(column):
+            when = pd.to_datetime(column, utc=True, unit="s")
+        else:
+            when = pd.to_datetime(column, utc=True, format="ISO8601")
     except (ValueError, OverflowError) as error:
         raise InputError(
             f"log, column {time!r}: a time cannot be read ({error}); give ISO 8601 or seconds"
         ) from None
     seconds = _seconds(when) - clock
-    points = _seconds(track["time"])
+    points = _seconds(pd.Series(track["time"]))
     after = np.clip(np.searchsorted(points, seconds, side="left"), 0, len(points) - 1)
     before = np.where(points[after] == seconds, after, np.maximum(after - 1, 0))
     # Outside the track, and at times that are missing, neither bound holds.

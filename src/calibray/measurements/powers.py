@@ -54,7 +54,7 @@ def long_table(
         )
     others = [name for name in wide if name not in columns]
     for name in columns:
-        cells = pd.to_numeric(table.column(name), errors="coerce")
+        cells = pd.Series(pd.to_numeric(table.column(name), errors="coerce"))
         if (text := (cells.isna() & wide[name].notna()).to_numpy()).any():
             first = int(np.flatnonzero(text)[0])
             raise InputError(

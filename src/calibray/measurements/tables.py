@@ -235,4 +235,4 @@ def _read_excel(path: Path) -> Table:
     frame.columns = named
     rows = np.arange(2, len(frame) + 2)
     filled = frame.notna().any(axis=1).to_numpy()
-    return Table(frame[filled].reset_index(drop=True), rows[filled], str(path))
+    return Table(frame.loc[filled].reset_index(drop=True), rows[filled], str(path))

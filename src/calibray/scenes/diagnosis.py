@@ -16,7 +16,7 @@ from calibray.materials import ITU_MATERIALS
 from calibray.progress import Progress
 from calibray.scenes.health import ObjectHealth, health
 from calibray.scenes.meshes import Mesh
-from calibray.scenes.scene import find_scene
+from calibray.scenes.source import find_scene
 
 Severity = Literal["error", "warning", "note"]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.scenes.diagnosis import read_meshes
 from calibray.scenes.meshes import Mesh
-from calibray.scenes.scene import find_scene
+from calibray.scenes.source import find_scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +46,7 @@ def draw_positions(
         if not is_ground(mesh, whole):
             seen = mesh.vertices[mesh.faces][:, :, :2]
             # Walls are lines when seen from above.
-            axes.add_collection(PolyCollection(seen, facecolor="0.85", edgecolor="0.45", linewidth=0.4))
+            axes.add_collection(PolyCollection(list(seen), facecolor="0.85", edgecolor="0.45", linewidth=0.4))
     marks = {"receivers": (rx, "o", "tab:blue", 12), "transmitters": (tx, "^", "tab:red", 50)}
     for what, places in (inside or {}).items():
         marks[what] = (places, "x", "tab:orange", 30)

@@ -12,7 +12,7 @@ from calibray.errors import InputError
 from calibray.extras import library
 from calibray.scenes.diagnosis import read_meshes
 from calibray.scenes.drawing import is_ground
-from calibray.scenes.scene import find_scene
+from calibray.scenes.source import find_scene
 
 
 def outlines(source: str | Path, height: float = 2.0) -> Any:

@@ -101,12 +101,12 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
 def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.float64]:
     if name not in frame:
         return np.full(len(frame), np.nan)
-    values = pd.to_numeric(frame[name], errors="coerce")
-    if (bad := np.flatnonzero((values.isna() & frame[name].notna()) | np.isinf(values))).size:
+    values = pd.Series(pd.to_numeric(frame[name], errors="coerce")).to_numpy(dtype=np.float64)
+    if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:
         raise InputError(
             f"floor plan {path}, row {bad[0] + 2}: {name} = {frame[name].iloc[bad[0]]!r} is not a number; correct it"
         )
-    return values.to_numpy(dtype=float)
+    return values
 
 
 def merge_faces(segments: Sequence[Segment], thickest: float = 0.6) -> tuple[list[Segment], int]:

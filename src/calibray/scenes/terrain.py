@@ -186,7 +186,7 @@ def _filled(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64]
         raise InputError(f"height model {path}: has no height within the scene; give one that covers it")
     if not missing.any():
         return heights.filled(np.nan), {}
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
     return heights.filled(np.nan)[tuple(nearest)], {
         "heights missing, taken from the nearest": int(missing.sum())
     }
