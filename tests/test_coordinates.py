@@ -57,7 +57,7 @@ def test_utm_has_its_zones_and_its_origin():
 def test_a_frame_is_recorded():
     frame = Frame("EPSG:32632", 691_000.0, 5_334_000.0, 510.0)
     assert Frame.from_record(frame.record()) == frame
-    with pytest.raises(InputError, match="needs crs"):
+    with pytest.raises(InputError, match="needs easting"):
         Frame.from_record({"crs": "EPSG:32632"})
 
 

@@ -122,6 +122,25 @@ def test_random_towns_are_closed():
         assert set(uses) <= {2, 4}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_any_outlines_make_closed_bodies_of_the_volume_that_their_cells_have(seed):
+    """Outlines that cross themselves and each other, touch in corners, parts among them, some above the ground."""
+    rng = np.random.default_rng(seed)
+    polygons = []
+    for _ in range(25):
+        corners = rng.uniform(0, 60, 2) + rng.normal(0, 8, (rng.integers(3, 9), 2))
+        polygons.append(shapely.Polygon(np.round(corners) if rng.random() < 0.3 else corners))
+    tops = rng.choice([3.0, 6.0, 9.0, 12.5], 25)
+    bottoms = np.minimum(rng.choice([0.0, 0.0, 3.0], 25), tops - 3)
+    found = footprints(polygons, tops, bottoms, rng.random(25) < 0.2)
+    cells, _ = take_apart(found, found.bottom, found.top)
+    made = body(extrude(cells, Windows(0.3, module=3.0) if seed % 2 else None))
+    _, uses = np.unique(np.sort(made.edges, axis=1), axis=0, return_counts=True)
+    assert set(uses % 2) == {0}
+    expected = sum(cell.polygon.area * (high - low) for cell in cells for low, high, _ in cell.stands)
+    assert made.volume == pytest.approx(expected, rel=1e-4)
+
+
 def test_outlines_that_cross_themselves_are_repaired_and_counted():
     bow = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
     found = footprints([bow, BOX(20, 0, 20.5, 0.5), L_SHAPE], [5, 5, 5])
