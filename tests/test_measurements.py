@@ -245,8 +245,8 @@ def test_faults_are_refused_with_their_place(tmp_path, text, changes, message):
 def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.csv: no such file"):
         read_measurements(tmp_path / "nowhere.csv", [0, 0, 1], [1, 1, 1], "loss")
-    with pytest.raises(InputError, match=r"cannot read a \.xlsx table"):
-        read_measurements(table_file(tmp_path, TABLE, "links.xlsx"), [0, 0, 1], [1, 1, 1], "loss")
+    with pytest.raises(InputError, match=r"cannot read a \.ods table"):
+        read_measurements(table_file(tmp_path, TABLE, "links.ods"), [0, 0, 1], [1, 1, 1], "loss")
     latin = tmp_path / "latin.csv"
     latin.write_bytes("stra\u00dfe,loss\n".encode("latin-1"))
     with pytest.raises(InputError, match="not UTF-8 text"):

@@ -15,7 +15,7 @@ import pytest
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.scenarios import campaign, demo_study_path, district, sounder, world
-from calibray.scenarios.meshes import Mesh, joined, ply_bytes
+from calibray.scenes.meshes import Mesh, joined, ply_bytes
 from calibray.study import Study
 from calibray.tracing.factory import trace
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import zipfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.extras import library
 from calibray.files import exists
 from calibray.measurements.filters import evaluate
 from calibray.spelling import did_you_mean, shortened
@@ -123,17 +126,18 @@ class Table:
 
 
 def read_table(path: str | Path) -> Table:
-    """Read a CSV or Parquet file.
+    """Read a CSV, Parquet or Excel file.
 
     Args:
-        path: The file; its ending, .csv or .parquet, says how it is read. CSV means UTF-8 and commas.
+        path: The file; its ending, .csv, .parquet or .xlsx, says how it is read. CSV means UTF-8 and commas; of an
+            Excel file the first sheet is read.
 
     Returns:
         Its rows, blank lines left out.
 
     Raises:
-        InputError: The file does not exist, is of another kind, is empty, or is malformed; or it is Parquet
-            and pyarrow is not installed.
+        InputError: The file does not exist, is of another kind, is empty, or is malformed; or what reads
+            it, pyarrow or openpyxl, is not installed.
     """
     path = Path(path)
     if not exists(path):
@@ -143,8 +147,12 @@ def read_table(path: str | Path) -> Table:
             table = _read_csv(path)
         case ".parquet":
             table = _read_parquet(path)
+        case ".xlsx":
+            table = _read_excel(path)
         case suffix:
-            raise InputError(f"{path}: cannot read a {suffix or 'nameless'} table; use .csv or .parquet")
+            raise InputError(
+                f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .parquet or .xlsx"
+            )
     if len(table) == 0:
         raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
     return table
@@ -205,3 +213,26 @@ def _read_parquet(path: Path) -> Table:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from None
     return Table(frame.reset_index(drop=True), source=str(path))
+
+
+def _read_excel(path: Path) -> Table:
+    openpyxl = library("openpyxl", "excel")
+    try:
+        frame = pd.read_excel(path, engine="openpyxl")
+    except (
+        zipfile.BadZipFile,
+        KeyError,
+        ValueError,
+        openpyxl.utils.exceptions.InvalidFileException,
+    ) as error:
+        raise InputError(f"{path}: not an Excel file ({str(error).splitlines()[0]})") from None
+    named = [str(name) for name in frame.columns]
+    if repeated := [
+        name for name in named if re.fullmatch(r"(.*)\.\d+", name) and name.rpartition(".")[0] in named
+    ]:
+        name = repeated[0].rpartition(".")[0]
+        raise InputError(f"{path}: column {name!r} stands twice; rename one")
+    frame.columns = named
+    rows = np.arange(2, len(frame) + 2)
+    filled = frame.notna().any(axis=1).to_numpy()
+    return Table(frame.loc[filled].reset_index(drop=True), rows[filled], str(path))

@@ -14,9 +14,9 @@ from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import lamp_places, scene_objects
-from calibray.scenarios.meshes import write_scene
 from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
+from calibray.scenes.meshes import write_scene
 from calibray.tracing.factory import trace
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from calibray.scenarios.meshes import Mesh, SceneObject, joined
+from calibray.scenes.meshes import Mesh, MeshObject, joined
 
 SEED: Final = 2026
 EXTENT: Final = (2100.0, 1700.0)  # [m], east-west and north-south
@@ -86,7 +86,7 @@ def scene_objects(
     buildings: Iterable[Building],
     concrete: Callable[[Building], str] = lambda building: "concrete",
     glass: Callable[[Building], str] = lambda building: "glass",
-) -> list[SceneObject]:
+) -> list[MeshObject]:
     """The district as objects of a scene, one for each material.
 
     Args:
@@ -108,8 +108,8 @@ def scene_objects(
     return [
         *_by_material("structures", structures),
         *_by_material("windows", windows),
-        SceneObject("ground", "soil", soil),
-        SceneObject("streets", "asphalt", asphalt),
+        MeshObject("ground", "soil", soil),
+        MeshObject("streets", "asphalt", asphalt),
     ]
 
 
@@ -274,10 +274,10 @@ def _ground() -> tuple[Mesh, Mesh]:
     )
 
 
-def _by_material(name: str, meshes: dict[str, list[Mesh]]) -> list[SceneObject]:
+def _by_material(name: str, meshes: dict[str, list[Mesh]]) -> list[MeshObject]:
     several = len(meshes) > 1
     return [
-        SceneObject(f"{name}_{index}" if several else name, material, joined(meshes[material]))
+        MeshObject(f"{name}_{index}" if several else name, material, joined(meshes[material]))
         for index, material in enumerate(sorted(meshes))
     ]
 

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from calibray.scenarios.district import Building, district, lamp_posts, scene_objects
-from calibray.scenarios.meshes import SceneObject
+from calibray.scenes.meshes import MeshObject
 
 SEED: Final = 1
 FREQUENCY: Final = 4e9  # [Hz]
@@ -105,7 +105,7 @@ class World:
     tx: np.ndarray
     rx: np.ndarray
 
-    def scene_objects(self) -> list[SceneObject]:
+    def scene_objects(self) -> list[MeshObject]:
         """The objects of the true world: buildings joined by level, and the lamp posts."""
         level = {building.name: pair for building, pair in zip(self.buildings, self.level, strict=True)}
         objects = scene_objects(
@@ -113,7 +113,7 @@ class World:
             lambda building: f"concrete_{level[building.name][0]}",
             lambda building: f"glass_{level[building.name][1]}",
         )
-        return [*objects, SceneObject("lamp_posts", "steel", lamp_posts())]
+        return [*objects, MeshObject("lamp_posts", "steel", lamp_posts())]
 
     def materials(self) -> dict[str, dict[str, float]]:
         """Constants of the materials of `scene_objects`, by name."""

@@ -85,6 +85,22 @@ def parse(path: Path, source: str) -> ElementTree.Element:
     return root
 
 
+def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
+    """Find a scene's file and read its XML.
+
+    Args:
+        source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
+
+    Returns:
+        The file, and its root element.
+
+    Raises:
+        InputError: The file does not exist or is no Mitsuba scene.
+    """
+    path = scene_path(str(source))
+    return path, parse(path, str(source))
+
+
 class _Builder(ElementTree.TreeBuilder):
     """Elements as ElementTree makes them, but not so deep in each other that nothing could walk them."""
 

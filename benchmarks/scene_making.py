@@ -1,0 +1,134 @@
+"""What a scene of 5,000 buildings takes to make and to trace, beside reading the map alone.
+
+    python benchmarks/scene_making.py [--buildings 5000] [--windows 0.3] [--trace]
+
+A town of blocks is planted as an OpenStreetMap extract: rows of houses that share walls, of heights given, from
+storeys or missing. Reading is pyosmium's part alone, the same areas assembled and nothing made of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import osmium
+import shapely
+
+from calibray.coordinates import Frame
+from calibray.scenes.extrusion import Windows
+from calibray.scenes.making import Made, make_scene
+from calibray.scenes.openstreetmap import read_openstreetmap
+
+PLACE = (11.5755, 48.1374)
+ROW = 10  # houses that share walls
+
+
+def plant(path: Path, buildings: int) -> None:
+    """Write an extract of rows of houses."""
+    random = np.random.default_rng(0)
+    columns = int(np.ceil(np.sqrt(buildings / ROW / 4)))
+    corners, ways = [], []
+    for number in range(buildings):
+        row, place = divmod(number, ROW)
+        west, south = 160.0 * (row % columns) + 14.0 * place, 40.0 * (row // columns)
+        depth = 12.0 + random.integers(0, 3)
+        bay = random.uniform(3.0, 9.0)
+        # A house with a bay at its back: eight corners.
+        back = [(bay + 3, depth), (bay + 3, depth + 2), (bay, depth + 2), (bay, depth)]
+        ring = [(0, 0), (14, 0), (14, depth), *back, (0, depth)]
+        corners += [(west + x, south + y, 0.0) for x, y in ring]
+        tags = [
+            ("height", f"{random.uniform(6, 25):.1f}"),
+            ("building:levels", str(random.integers(1, 8))),
+            ("name", "x"),
+        ]
+        ways.append((number, len(ring), tags[random.integers(0, 3)]))
+    degrees = Frame.local(*PLACE).to_geographic(corners)
+    with path.open("w") as file:
+        file.write('<osm version="0.6">')
+        for index, (longitude, latitude, _) in enumerate(degrees, start=1):
+            file.write(f'<node id="{index}" version="1" lat="{latitude:.7f}" lon="{longitude:.7f}"/>')
+        for number, count, (key, value) in ways:
+            first = 8 * number + 1
+            nodes = "".join(f'<nd ref="{node}"/>' for node in [*range(first, first + count), first])
+            file.write(
+                f'<way id="{number + 1}" version="1">{nodes}<tag k="building" v="yes"/>'
+                f'<tag k="{key}" v="{value}"/></way>'
+            )
+        file.write("</osm>")
+
+
+def read_alone(path: Path) -> int:
+    """Assemble the areas with pyosmium and their geometry with shapely, and do nothing with them."""
+    wanted, geometry = osmium.filter.KeyFilter("building"), osmium.geom.WKBFactory()
+    areas = osmium.FileProcessor(path).with_areas(wanted).with_filter(wanted)
+    return len([shapely.from_wkb(geometry.create_multipolygon(area)) for area in areas if area.is_area()])
+
+
+def resident() -> float:
+    """Largest memory that this process has had so far [MiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def timed(function, *arguments) -> tuple[float, object]:
+    """Seconds that a call takes, and what it returns."""
+    start = time.perf_counter()
+    returned = function(*arguments)
+    return time.perf_counter() - start, returned
+
+
+def trace(made: Made) -> float:
+    """Seconds to load and trace ten links of the scene."""
+    from calibray.scenes import read_scene
+    from calibray.tracing.settings import Antenna, TraceSettings
+    from calibray.tracing.sionna import Tracer
+
+    def run() -> int:
+        settings = TraceSettings(max_depth=3, samples=200_000)
+        tracer = Tracer(read_scene(made.path, 3.5e9), 3.5e9, settings, Antenna(), Antenna())
+        rx = np.random.default_rng(1).uniform((-200, -200, 1.5), (200, 200, 1.6), (10, 3))
+        return tracer.trace(SimpleNamespace(tx=np.tile([0.0, 0.0, 40.0], (10, 1)), rx=rx)).num_paths
+
+    return timed(run)[0]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--buildings", type=int, default=5000)
+    parser.add_argument("--windows", type=float, default=0.3)
+    parser.add_argument("--trace", action="store_true")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        extract = Path(folder) / "town.osm"
+        plant(extract, arguments.buildings)
+        read_alone(extract)
+        alone, count = timed(read_alone, extract)
+        before = resident()
+        reading, (footprints, frame) = timed(read_openstreetmap, extract)
+        for name, windows in (
+            ("walls alone", None),
+            (f"{arguments.windows:.0%} window", Windows(arguments.windows)),
+        ):
+            making, made = timed(
+                lambda windows=windows: make_scene(footprints, Path(folder) / "scene", frame, windows=windows)
+            )
+            total = reading + making
+            print(
+                f"{count} buildings, {name}: {sum(made.triangles.values())} triangles, {total:.1f} s, "
+                f"{total / alone:.0f} times reading alone; {resident():.0f} MiB, {before:.0f} before"
+            )
+        print(f"{made.counts}")
+        if arguments.trace:
+            seconds = trace(made)
+            print(
+                f"loaded and ten links traced: {seconds:.1f} s, {seconds / total:.1f} times making; "
+                f"{resident():.0f} MiB"
+            )
