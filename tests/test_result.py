@@ -124,7 +124,7 @@ def test_the_scene_written_is_the_calibrated_one(result, folder):
 @pytest.mark.parametrize("failing", FILES)
 def test_a_file_that_could_not_be_written_leaves_nothing_half_written(result, tmp_path, failing):
     (tmp_path / failing / "in the way").mkdir(parents=True)
-    with pytest.raises(InputError, match=f"output folder {tmp_path}: cannot be written"):
+    with pytest.raises(InputError, match=f"output file {tmp_path / failing}: is a folder"):
         result.save(tmp_path)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
 
