@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -16,6 +19,9 @@ from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
 from calibray.result import Result
+from calibray.result.tables import offsets
+from calibray.study import Setup
+from calibray.tables.text import render
 
 PAPER_CALLS = {"gwo": 600, "sgwo-im": 225}
 METHOD_NAMES = ("auto", *METHODS)
@@ -282,3 +288,47 @@ def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, m
 def test_an_option_that_a_method_lacks_is_refused(tmp_path, exact):
     with pytest.raises(InputError, match=r"method\.options\.wolfes: the method 'gwo' has no such setting"):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})
+
+
+def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(tmp_path):
+    """The receiver in the building is a group of its own; of two links held out one has no path."""
+    table = planted.campaign(noise_db=0.1).assign(place=lambda each: each.half)
+    table.loc[planted.INSIDE, "place"] = "cellar"
+    study = planted.study(tmp_path, table, offset={"per": "place"})
+    result = calibrate(study, engine=planted.engine(blocked=True))
+    assert sorted(result.offsets_db) == ["east", "west"]
+    assert result.groups_without_path == ("cellar",)
+    assert re.search(r"^cellar +no link with a path$", render(offsets(result)), re.MULTILINE)
+    assert result.content()["groups_without_path"] == ["cellar"]
+
+    held = planted.study(
+        tmp_path, table, holdout={"where": f"rx_x in [{table.rx_x[planted.INSIDE]}, {table.rx_x[0]}]"}
+    )
+    result = calibrate(held, engine=planted.engine(blocked=True))
+    judged = result.links[result.links.held_out & result.links.has_path]
+    assert result.counts["held_out"] == len(judged) == 1
+    assert result.holdout_rmse_db == pytest.approx(abs(judged.after_db - judged.measured_db).item(), abs=1e-9)
+
+
+def test_antennas_inside_bodies_are_known_before_the_calibration_and_to_python(tmp_path, monkeypatch):
+    table = planted.campaign(blocked=False).assign(**planted.links(blocked=True)[["rx_x", "rx_y", "rx_z"]])
+    seen = []
+    original = Setup.enclosed.func
+
+    def enclosed(self):
+        seen.append("looked")
+        return original(self)
+
+    looked = cached_property(enclosed)
+    looked.__set_name__(Setup, "enclosed")
+    monkeypatch.setattr(Setup, "enclosed", looked)
+    module = sys.modules["calibray.calibration.calibrate"]
+    monkeypatch.setattr(module, "search", lambda *_: seen.append("searched") or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        calibrate(planted.study(tmp_path, table))
+    assert seen == ["looked", "searched"]
+    monkeypatch.undo()
+    study = planted.study(tmp_path, table, method={"name": "auto", "options": {"starts": 4}})
+    result = calibrate(study, out=tmp_path / "out")
+    assert result.enclosed.rx == (planted.INSIDE + 2,)
+    assert Result.load(tmp_path / "out").enclosed == result.enclosed

@@ -34,8 +34,7 @@ class FreeSpaceSection(EngineSection):
     name: Literal["free-space"] = "free-space"
     exponent: float
 
-    @property
-    def answers_by(self):
+    def answers_by(self, setup):
         return None
 
     def open(self, setup, paths, progress, executor):

@@ -14,6 +14,7 @@ import pytest
 
 from calibray.engines import Replay
 from calibray.errors import InputError
+from calibray.files import SIGNATURES
 from calibray.scenarios import campaign, demo_study_path, district, sounder, world
 from calibray.scenes.meshes import Mesh, joined, ply_bytes
 from calibray.study import Study
@@ -51,9 +52,9 @@ def replay():
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
-    }
+    """The files of a folder; the signatures of what was just written are left out."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != SIGNATURES)
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def directed_edges(faces: np.ndarray) -> Counter[tuple[int, int]]:

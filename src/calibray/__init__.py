@@ -3,7 +3,27 @@
 Names are loaded when first used, so that importing the package costs nothing.
 """
 
+from typing import TYPE_CHECKING
+
 from calibray.lazy import lazily
+
+if TYPE_CHECKING:
+    from calibray import engines as engines
+    from calibray import optimizers as optimizers
+    from calibray.calibration.calibrate import calibrate as calibrate
+    from calibray.fields import path_gains as path_gains
+    from calibray.fields import path_loss as path_loss
+    from calibray.fields.channel import channel_statistics as channel_statistics
+    from calibray.fields.channel import power_delay_profile as power_delay_profile
+    from calibray.materials import Material as Material
+    from calibray.materials import itu_material as itu_material
+    from calibray.measurements import Measurements as Measurements
+    from calibray.measurements import read_measurements as read_measurements
+    from calibray.paths import Paths as Paths
+    from calibray.result import Result as Result
+    from calibray.study import Setup as Setup
+    from calibray.study import Study as Study
+    from calibray.study.tracing import trace as trace
 
 _HOMES = {
     "Material": "calibray.materials",

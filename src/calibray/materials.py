@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import epsilon_0
 
 from calibray.errors import InputError
 from calibray.spelling import did_you_mean
@@ -173,6 +172,9 @@ def complex_relative_permittivity(material: Material, frequency: float) -> compl
         >>> complex_relative_permittivity(Material(4.0, 0.0, 0.1), frequency=1e9)
         (4+0j)
     """
+    # SciPy takes long to load; who only names materials does without.
+    from scipy.constants import epsilon_0
+
     _check_frequency(frequency)
     # ITU-R P.2040-1 eq. 9b
     loss = material.conductivity / (2 * pi * frequency * epsilon_0)

@@ -10,7 +10,26 @@ of an engine stands in `engines.kinds`, light enough to be read with the study; 
 they are used.
 """
 
+from typing import TYPE_CHECKING
+
 from calibray.lazy import lazily
+
+if TYPE_CHECKING:
+    from calibray.engines.carriers import ReplayCarriers as ReplayCarriers
+    from calibray.engines.command import Command as Command
+    from calibray.engines.ledger import LEDGER_FILE as LEDGER_FILE
+    from calibray.engines.ledger import Ledger as Ledger
+    from calibray.engines.ledger import open_ledger as open_ledger
+    from calibray.engines.making import make as make
+    from calibray.engines.pool import open_executor as open_executor
+    from calibray.engines.protocol import Answer as Answer
+    from calibray.engines.protocol import Answering as Answering
+    from calibray.engines.protocol import Differentiable as Differentiable
+    from calibray.engines.protocol import Engine as Engine
+    from calibray.engines.protocol import check_candidates as check_candidates
+    from calibray.engines.recorded import Recorded as Recorded
+    from calibray.engines.replay import Replay as Replay
+    from calibray.engines.retrace import Retrace as Retrace
 
 _HOMES = {
     "LEDGER_FILE": "calibray.engines.ledger",

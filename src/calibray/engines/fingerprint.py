@@ -33,7 +33,7 @@ def fingerprint(setup: Setup) -> str:
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     record = {
         "engine": study.engine.name,
-        "made by": study.engine.answers_by,
+        "made by": study.engine.answers_by(setup),
         "frequency": study.scene.frequency,
         "bandwidth": study.scene.bandwidth,
         "combining": study.objective.combining,

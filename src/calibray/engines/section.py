@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calibray.closed import Section
 from calibray.engines.protocol import Engine
-from calibray.paths import Paths
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
+    from calibray.paths import Paths
     from calibray.study.setup import Setup
 
 
@@ -31,10 +31,13 @@ class EngineSection(Section, ABC):
     dear: ClassVar[bool]
     external: ClassVar[bool]
 
-    @property
     @abstractmethod
-    def answers_by(self) -> list[str] | None:
-        """What answers besides the study itself, as words or versions, so that a ledger can tell; None for nothing."""
+    def answers_by(self, setup: Setup) -> list[str] | None:
+        """What answers besides the study itself, as words or versions, so that a ledger can tell; None for nothing.
+
+        Args:
+            setup: The opened study.
+        """
 
     @abstractmethod
     def open(

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 CONFIDENCE: Final = 0.95
 
@@ -53,6 +52,9 @@ def intervals(
     Returns:
         One interval per parameter.
     """
+    # SciPy is for who computes intervals; a result that holds some is read without it.
+    from scipy.special import stdtrit
+
     freedom = max(len(residuals) - len(best) - nuisances, 1)
     reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # Student's t: standard errors either side
     variance = float(residuals @ residuals) / freedom

@@ -1,18 +1,31 @@
 """Paths: the path program, and the chains of interactions that any tracer hands over to make one."""
 
-from calibray.paths.interactions import Diffraction, Diffuse, Kind
-from calibray.paths.program import Paths, concatenate, take, take_links
-from calibray.paths.schema import SCHEMA_VERSION
-from calibray.paths.sealing import seal
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "SCHEMA_VERSION",
-    "Diffraction",
-    "Diffuse",
-    "Kind",
-    "Paths",
-    "concatenate",
-    "seal",
-    "take",
-    "take_links",
-]
+from calibray.lazy import lazily
+
+if TYPE_CHECKING:
+    from calibray.paths.interactions import Diffraction as Diffraction
+    from calibray.paths.interactions import Diffuse as Diffuse
+    from calibray.paths.interactions import Kind as Kind
+    from calibray.paths.program import Paths as Paths
+    from calibray.paths.program import concatenate as concatenate
+    from calibray.paths.program import take as take
+    from calibray.paths.program import take_links as take_links
+    from calibray.paths.schema import SCHEMA_VERSION as SCHEMA_VERSION
+    from calibray.paths.sealing import seal as seal
+
+_HOMES = {
+    "SCHEMA_VERSION": "calibray.paths.schema",
+    "Diffraction": "calibray.paths.interactions",
+    "Diffuse": "calibray.paths.interactions",
+    "Kind": "calibray.paths.interactions",
+    "Paths": "calibray.paths.program",
+    "concatenate": "calibray.paths.program",
+    "seal": "calibray.paths.sealing",
+    "take": "calibray.paths.program",
+    "take_links": "calibray.paths.program",
+}
+
+__all__ = sorted(_HOMES)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

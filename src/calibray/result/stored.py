@@ -125,12 +125,12 @@ def _check(stored: Stored, study: Study, source: Path) -> None:
             raise InputError(
                 f"{source}: materials: {shortened(repr(material))} is calibrated and missing; run the study again"
             )
-        value = getattr(stored.materials[material], constant, None)
+        value, found = getattr(stored.materials[material], constant, None), stored.parameters[name]
         # A coefficient of a law is no constant of its own.
-        if value is not None and abs(value - stored.parameters[name]) > 1e-9 * max(abs(value), 1e-300):
+        if value is not None and abs(value - found) > 1e-9 * max(abs(value), 1e-300):
             raise InputError(
-                f"{source}: materials.{material}.{constant} = {value:g}, but parameters has {stored.parameters[name]:g};"
-                " run the study again"
+                f"{source}: materials.{material}.{constant} = {value:g}, but parameters has {found:g}; run the study "
+                "again"
             )
     if unknown := sorted(set(stored.intervals) - set(names)):
         raise InputError(f"{source}: intervals: {shortened(repr(unknown[0]))} is no parameter of the study")

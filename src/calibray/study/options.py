@@ -8,7 +8,6 @@ from math import isfinite
 from typing import Any, Final
 
 from calibray.errors import InputError
-from calibray.optimizers import METHODS
 from calibray.spelling import did_you_mean, shortened
 
 LARGEST: Final = 10**6
@@ -36,6 +35,11 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     Raises:
         InputError: A setting is unknown, of another type, not finite or too large; the message begins with its key.
     """
+    if not options:
+        return
+    # Optimizers take SciPy along; a study without options is read without them.
+    from calibray.optimizers import METHODS
+
     known = (
         {key: entry for key, entry in signature(METHODS[name]).parameters.items() if key not in _GIVEN}
         if name in METHODS

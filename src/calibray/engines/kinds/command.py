@@ -10,11 +10,11 @@ from pydantic import AfterValidator, Field, model_validator
 from calibray.closed import Text
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
-from calibray.paths import Paths
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
     from calibray.engines.command import Command
+    from calibray.paths import Paths
     from calibray.study.setup import Setup
 
 
@@ -58,8 +58,7 @@ class CommandSection(EngineSection):
             )
         return self
 
-    @property
-    def answers_by(self) -> list[str]:
+    def answers_by(self, setup: Setup) -> list[str]:
         """The program and its arguments; its own version cannot be known."""
         return list(self.command)
 

@@ -10,12 +10,12 @@ from pydantic import Field
 
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
-from calibray.paths import Paths, take_links
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
     from calibray.engines.carriers import ReplayCarriers
     from calibray.engines.replay import Replay
+    from calibray.paths import Paths
     from calibray.study.setup import Setup
 
 
@@ -34,8 +34,7 @@ class ReplaySection(EngineSection):
     name: Literal["replay"] = "replay"
     compress_db: Annotated[float, Field(gt=0)] | None = None
 
-    @property
-    def answers_by(self) -> None:
+    def answers_by(self, setup: Setup) -> None:
         """Nothing: what is replayed is kept with the paths."""
         return
 
@@ -78,6 +77,7 @@ def replay(setup: Setup, paths: Paths, compress_db: float | None = None) -> Repl
     from calibray.engines.carriers import CarrierPaths, ReplayCarriers
     from calibray.engines.compression import compress
     from calibray.engines.replay import Replay
+    from calibray.paths import take_links
 
     study, links, parameters = setup.study, setup.links, setup.parameters
     options = study.objective.combining, study.scene.bandwidth

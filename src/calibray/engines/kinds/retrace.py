@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal, final
 import numpy as np
 
 from calibray.engines.section import EngineSection
-from calibray.paths import Paths
 from calibray.progress import Progress
-from calibray.tracing.factory import SIONNA
 
 if TYPE_CHECKING:
     from calibray.engines.retrace import Retrace
+    from calibray.paths import Paths
     from calibray.study.setup import Setup
 
 
@@ -30,10 +29,9 @@ class RetraceSection(EngineSection):
 
     name: Literal["retrace"] = "retrace"
 
-    @property
-    def answers_by(self) -> list[str]:
+    def answers_by(self, setup: Setup) -> list[str]:
         """The versions of the ray tracer."""
-        return list(SIONNA.versions.values())
+        return list(setup.factory.versions.values())
 
     def open(
         self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
