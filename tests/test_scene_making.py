@@ -196,7 +196,7 @@ def test_a_made_scene_is_read_again(tmp_path):
 
 def test_meshes_of_one_scene_share_the_places_of_their_corners(tmp_path):
     make_scene(footprints([L_SHAPE], [10.0]), tmp_path, windows=Windows(0.3), ground=False)
-    parts = [trimesh.load_mesh(path, process=False) for path in (tmp_path / "meshes").iterdir()]
+    parts = [trimesh.load_mesh(path, process=False) for path in (tmp_path / "meshes").glob("*.ply")]
     together = trimesh.util.concatenate(parts)
     assert not together.is_watertight
     together.merge_vertices()
