@@ -19,7 +19,7 @@ from calibray.spelling import did_you_mean, shortened
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class SourceTable:
     """Rows of a table and where they stand in their file.
 
     Attributes:
@@ -39,9 +39,9 @@ class Table:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def select(self, mask: NDArray[np.bool_]) -> Table:
+    def select(self, mask: NDArray[np.bool_]) -> SourceTable:
         """The rows where a mask [rows] is true."""
-        return Table(self.frame.loc[mask].reset_index(drop=True), self.row[mask], self.source)
+        return SourceTable(self.frame.loc[mask].reset_index(drop=True), self.row[mask], self.source)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
         """Evaluate a row filter.
@@ -122,7 +122,7 @@ class Table:
         return f"{self.source}, row {self.row[index]}, column {column!r}"
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path) -> SourceTable:
     """Read a CSV or Parquet file.
 
     Args:
@@ -150,7 +150,7 @@ def read_table(path: str | Path) -> Table:
     return table
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> SourceTable:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             text = file.read()
@@ -160,11 +160,11 @@ def _read_csv(path: Path) -> Table:
         ) from None
     header, lines = _checked_layout(path, text)
     if not header:
-        return Table(pd.DataFrame())
+        return SourceTable(pd.DataFrame())
     frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
     if len(frame) != len(lines):
         raise InputError(f"{path}: {len(lines)} rows stand in it but {len(frame)} are read; check its quotes")
-    return Table(frame, np.array(lines, dtype=np.int64), str(path))
+    return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
 
 
 def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
@@ -195,7 +195,7 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
     return header, lines
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path) -> SourceTable:
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
     except ImportError:
@@ -204,4 +204,4 @@ def _read_parquet(path: Path) -> Table:
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from None
-    return Table(frame.reset_index(drop=True), source=str(path))
+    return SourceTable(frame.reset_index(drop=True), source=str(path))
