@@ -8,6 +8,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_complete
 from threading import Event
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.engines.exchange import Request, Surroundings
 from calibray.engines.program import Outcome, Program
@@ -57,7 +58,7 @@ class Command:
         self._carriers = carriers or {}
         self._failed, self._give_up_after = 0, give_up_after
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, as the program answers.
 
         Args:
@@ -74,7 +75,7 @@ class Command:
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
 
-    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64]) -> Iterator[Answer]:
         """The answers to candidates, each as soon as it is there.
 
         Args:
@@ -128,7 +129,7 @@ class Command:
             lost = np.full(self.num_links, np.inf)
             return Outcome(lost, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
 
-    def _request(self, candidate: np.ndarray) -> Request:
+    def _request(self, candidate: NDArray[np.float64]) -> Request:
         return Request(
             self._surroundings,
             self.parameters.materials(candidate, self.materials),

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.materials import Material
 from calibray.tracing.settings import Antenna
@@ -46,9 +47,9 @@ class Surroundings:
     bandwidth: float | None
     combining: str
     antennas: tuple[Antenna, Antenna]
-    tx: np.ndarray
-    rx: np.ndarray
-    link_frequency: np.ndarray | None = None
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    link_frequency: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
         group.create_group(name.replace("/", "_")).attrs.update({"name": name, **asdict(material)})
 
 
-def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:
+def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.float64]:
     """Read the path loss that a program answered.
 
     Args:
@@ -173,7 +174,7 @@ def read_answer(path: Path, file_format: str, num_links: int) -> np.ndarray:
     return values
 
 
-def _read_json(path: Path) -> np.ndarray:
+def _read_json(path: Path) -> NDArray[np.float64]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -196,7 +197,7 @@ def _number(entry: Any) -> float:
         raise Unusable(f"its response holds a number in {ANSWER} that is too large") from None
 
 
-def _read_hdf5(path: Path) -> np.ndarray:
+def _read_hdf5(path: Path) -> NDArray[np.float64]:
     try:
         with h5py.File(path, "r") as file:
             values = np.asarray(file[ANSWER][()], dtype=float)

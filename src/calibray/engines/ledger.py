@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 
@@ -44,7 +45,7 @@ class Entry:
         failure: What went wrong; empty if nothing did.
     """
 
-    path_loss_db: np.ndarray
+    path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
 
@@ -195,7 +196,7 @@ def open_ledger(folder: str | Path) -> Ledger:
     return Ledger(path)
 
 
-def key(candidate: np.ndarray) -> bytes:
+def key(candidate: NDArray[np.float64]) -> bytes:
     """A candidate [d] as the ledger keeps it: little-endian doubles, zero without a sign."""
     return (np.asarray(candidate, dtype="<f8") + 0.0).tobytes()
 

@@ -13,6 +13,7 @@ from threading import Event
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.engines.exchange import Request, Unusable, read_answer
 
@@ -31,7 +32,7 @@ class Outcome:
         failure: What went wrong in the last attempt; empty if it succeeded.
     """
 
-    path_loss_db: np.ndarray
+    path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
 
@@ -82,7 +83,7 @@ class Program:
         lost = np.full(num_links, np.inf)
         return Outcome(lost, time.perf_counter() - started, (failure or "was stopped") + tries)
 
-    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> np.ndarray:
+    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> NDArray[np.float64]:
         with tempfile.TemporaryDirectory(prefix="calibray-", ignore_cleanup_errors=True) as folder:
             place, ending = Path(folder), "json" if self.file_format == "json" else "h5"
             files = place / f"request.{ending}", place / f"response.{ending}"

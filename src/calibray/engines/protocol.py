@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
@@ -32,7 +33,7 @@ class Engine(Protocol):
         """The scene's materials before calibration."""
         ...
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates [n, d] in the fields' units; [n, L], [dB], +inf without a path."""
         ...
 
@@ -51,7 +52,9 @@ class Differentiable(Engine, Protocol):
         """Interactions that a candidate is evaluated at."""
         ...
 
-    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def path_loss_and_jacobian(
+        self, candidates: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
         ...
 
@@ -68,7 +71,7 @@ class Answer:
     """
 
     index: int
-    path_loss_db: np.ndarray
+    path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
 
@@ -82,12 +85,12 @@ class Answering(Engine, Protocol):
         """Number of links L."""
         ...
 
-    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64]) -> Iterator[Answer]:
         """The answers to candidates [n, d] in the fields' units, in the order in which they arrive."""
         ...
 
 
-def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> np.ndarray:
+def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
     """The path loss of a batch from its answers, in whatever order they arrive.
 
     Args:
@@ -112,7 +115,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> np
     return losses
 
 
-def check_candidates(candidates: np.ndarray, width: int) -> np.ndarray:
+def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:
     """Candidates as an array, refused if they cannot be evaluated.
 
     Args:

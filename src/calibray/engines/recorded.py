@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.engines.ledger import Entry, Ledger, key
 from calibray.engines.protocol import Answer, Answering, check_candidates, gather
@@ -45,7 +46,7 @@ class Recorded:
         """The scene's materials before calibration."""
         return self._engine.materials
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, from the ledger or else from the engine.
 
         Args:
@@ -65,7 +66,7 @@ class Recorded:
             self._ledger.forget_failures(self._problem)
         return gather(answers, (len(values), self._engine.num_links), first)
 
-    def _answers(self, values: np.ndarray) -> Iterator[Answer]:
+    def _answers(self, values: NDArray[np.float64]) -> Iterator[Answer]:
         missing: dict[bytes, list[int]] = {}
         for index, value in enumerate(values):
             entry = self._ledger.find(self._problem, key(value))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.engines.protocol import Answer, check_candidates
@@ -30,7 +31,7 @@ class CarrierTracer:
 
     tracer: Tracer
     links: Measurements
-    index: np.ndarray
+    index: NDArray[np.int64]
 
 
 class Retrace:
@@ -59,7 +60,7 @@ class Retrace:
         self._parts, self._progress = tuple(parts), progress
         self._combining, self._bandwidth = combining, bandwidth
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, each with a trace of its own.
 
         Args:
@@ -74,7 +75,7 @@ class Retrace:
         values = check_candidates(candidates, len(self.parameters))
         return np.stack([answer.path_loss_db for answer in self.answers(values)])
 
-    def answers(self, candidates: np.ndarray) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64]) -> Iterator[Answer]:
         """The answers to candidates, each as soon as it is there.
 
         Args:
@@ -96,7 +97,7 @@ class Retrace:
                 self._progress("running", index + 1, len(candidates))
             yield Answer(index, loss, time.perf_counter() - started)
 
-    def _one(self, part: CarrierTracer, candidate: np.ndarray) -> np.ndarray:
+    def _one(self, part: CarrierTracer, candidate: NDArray[np.float64]) -> NDArray[np.float64]:
         tracer = part.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
         solution = tracer.solve(part.links, materials)

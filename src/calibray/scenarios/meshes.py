@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -18,8 +19,8 @@ class Mesh:
         faces: Vertex indices of every triangle, counter-clockwise seen from outside [F, 3].
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
