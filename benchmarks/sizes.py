@@ -61,7 +61,7 @@ def main() -> None:
                 "study": lambda given=given: Study.from_content(given),
                 "parameters": lambda study=study: study.parameter_set(base),
                 "materials": lambda parameters=parameters: parameters.materials(parameters.start, base),
-                "constants": lambda parameters=parameters: parameters.constants([parameters.start], base),
+                "constants": lambda parameters=parameters: parameters.constants_of([parameters.start], base),
             }
             for step, work in steps.items():
                 rows.setdefault(step, []).append(seconds(work))

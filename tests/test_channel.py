@@ -7,7 +7,7 @@ import pytest
 
 import synthetic
 from calibray.errors import InputError
-from calibray.fields import constants, layout, path_loss, path_powers
+from calibray.fields import layout, material_table, path_loss, path_powers
 from calibray.fields.channel import channel_statistics, delay_profile, power_delay_profile, statistics
 from calibray.materials import FIELDS
 from calibray.paths import Kind, Paths
@@ -77,7 +77,7 @@ def test_derivatives_equal_central_differences(field):
     paths = synthetic.program(
         [(), (Kind.SPECULAR,), (Kind.DIFFUSE,), (Kind.SPECULAR, Kind.DIFFUSE)] * 5, seed=4
     )
-    plan, table = layout(paths), constants(paths)
+    plan, table = layout(paths), material_table(paths)
     azimuth = [jnp.asarray(angle[plan.order, 1]) for angle in (paths.departure, paths.arrival)]
     edges = jnp.asarray(np.quantile(paths.delay, [0, 0.3, 0.7, 1]))
     where = (0, FIELDS.index(field))

@@ -12,7 +12,7 @@ import pytest
 
 import programs
 from calibray.engines import Ledger
-from calibray.engines.ledger import Entry, key
+from calibray.engines.entry import LedgerEntry, key
 from calibray.result import Result
 from calibray.tracing.llvm import PATH_VARIABLE
 from test_cli_run import write_study
@@ -39,7 +39,7 @@ def calibray(tmp_path):
 def test_the_ledger_is_listed(calibray, tmp_path):
     with closing(Ledger(tmp_path / "ledger.sqlite")) as ledger:
         ledger.describe("p", "command", ("walls.thickness",))
-        ledger.commit("p", key(np.array([0.25])), Entry(np.array([80.0, np.inf]), 1.5))
+        ledger.commit("p", key(np.array([0.25])), LedgerEntry(np.array([80.0, np.inf]), 1.5))
     listed = calibray("ledger", tmp_path)
     assert (listed.returncode, listed.stderr) == (0, "")
     assert "0.25" in listed.stdout

@@ -13,7 +13,7 @@ import pytest
 
 import synthetic
 from calibray.engines import Replay
-from calibray.fields import GroupedProgram, constants, layout, program_path_loss
+from calibray.fields import GroupedProgram, layout, material_table, program_path_loss
 from calibray.materials import BOUNDS, FIELDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths
@@ -99,7 +99,7 @@ def test_jacobian_equals_central_differences(paths: Paths, combining: str) -> No
 def test_forward_mode_through_the_pure_function_equals_the_engine(paths: Paths) -> None:
     parameters = all_parameters(paths)
     rows, columns = parameters.indices(list(paths.materials))
-    value, full = _value_and_jacobian(layout(paths).program, jnp.asarray(constants(paths)))
+    value, full = _value_and_jacobian(layout(paths).program, jnp.asarray(material_table(paths)))
     engine = Replay(paths, parameters, dtype=np.float64)
     loss, jacobian = engine.path_loss_and_jacobian(parameters.start[None])
     np.testing.assert_allclose(loss[0], value, rtol=1e-13)
@@ -137,7 +137,7 @@ def test_derivatives_are_finite_at_the_edges_of_physics(paths: Paths, edge: str)
     grazing = paths.cos_incidence.copy()
     grazing[::5], grazing[1::5] = 1.0, 1e-6  # normal and grazing incidence as well
     program = layout(replace(paths, cos_incidence=grazing)).program
-    value, jacobian = _value_and_jacobian(program, jnp.asarray(constants(paths, materials)))
+    value, jacobian = _value_and_jacobian(program, jnp.asarray(material_table(paths, materials)))
     assert np.isfinite(value[0])
     assert np.isfinite(value[1]) if edge != "air" else np.isposinf(value[1])  # air reflects nothing
     assert np.isfinite(jacobian).all()
@@ -147,7 +147,7 @@ def test_derivatives_are_finite_at_the_edges_of_physics(paths: Paths, edge: str)
 def test_derivative_at_zero_is_the_limit_from_above(paths: Paths, field: str) -> None:
     column = FIELDS.index(field)
     materials = {name: replace(material, **{field: 0.0}) for name, material in paths.materials.items()}
-    program, table = layout(paths).program, constants(paths, materials)
+    program, table = layout(paths).program, material_table(paths, materials)
     _, jacobian = _value_and_jacobian(program, jnp.asarray(table))
 
     def loss(value: float) -> np.ndarray:

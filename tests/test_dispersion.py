@@ -60,7 +60,7 @@ def test_entries_and_slopes_follow_the_law_and_leave_other_parameters_alone():
         step = 1e-6 * np.eye(4)[k]
         numeric = (law.entries(points + step, 28e9)[0] - law.entries(points - step, 28e9)[0])[:, k] / 2e-6
         np.testing.assert_allclose(slopes[:, k], numeric, rtol=1e-7)
-    matrix = law.constants(points, BASE, 28e9)
+    matrix = law.constants_of(points, BASE, 28e9)
     np.testing.assert_array_equal(matrix[:, 0, :3], values[:, [0, 3, 1]])
     constants, places = law.at(28e9)
     assert constants.names == ("walls.relative_permittivity", "walls.thickness", "walls.conductivity")

@@ -12,7 +12,7 @@ import pytest
 from calibray.errors import InputError
 from calibray.measurements.filters import evaluate
 from calibray.measurements.grammar import FUNCTIONS, METHODS, TEXT_METHODS
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "study-file.md"
 
@@ -115,7 +115,7 @@ ESCAPES = [
 def test_whatever_else_is_refused_before_it_does_anything(expression, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as caught:
-        Table(FRAME.copy(), source="links.csv").where(expression)
+        SourceTable(FRAME.copy(), source="links.csv").where(expression)
     message = str(caught.value)
     assert message.startswith("links.csv: where = ")
     assert "\n" not in message

@@ -13,7 +13,7 @@ from calibray.materials import (
     ITU_MATERIALS,
     Material,
     complex_relative_permittivity,
-    constants,
+    constants_matrix,
     itu_material,
 )
 
@@ -170,9 +170,9 @@ def test_bounds_are_those_of_sionna():
 
 def test_constants_follow_the_field_order():
     other = replace(PLAIN, scattering_coefficient=0.3, xpd_coefficient=0.2, alpha_r=4, alpha_i=3, lambda_=0.7)
-    matrix = constants({"a": PLAIN, "b": other})
+    matrix = constants_matrix({"a": PLAIN, "b": other})
     np.testing.assert_array_equal(matrix, [[5, 0.1, 0.2, 0, 0, 1, 1, 1], [5, 0.1, 0.2, 0.3, 0.2, 4, 3, 0.7]])
-    assert constants({}).shape == (0, len(FIELDS))
+    assert constants_matrix({}).shape == (0, len(FIELDS))
 
 
 def test_complex_relative_permittivity_in_closed_form():

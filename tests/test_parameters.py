@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibray.errors import InputError
-from calibray.materials import FIELDS, Material, constants
+from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.parameters import Parameter, Parameters, make_parameter, split_name
 
 BASE = {
@@ -51,10 +51,10 @@ def test_a_candidate_changes_its_fields_and_nothing_else():
 @given(st.lists(unit_vectors, min_size=1, max_size=4))
 def test_the_batch_of_constants_equals_the_materials_one_by_one(units):
     candidates = PARAMETERS.from_unit(units)
-    batch = PARAMETERS.constants(candidates, BASE)
+    batch = PARAMETERS.constants_of(candidates, BASE)
     assert batch.shape == (len(units), len(BASE), len(FIELDS))
     for candidate, matrix in zip(candidates, batch, strict=True):
-        np.testing.assert_array_equal(matrix, constants(PARAMETERS.materials(candidate, BASE)))
+        np.testing.assert_array_equal(matrix, constants_matrix(PARAMETERS.materials(candidate, BASE)))
 
 
 def test_indices_point_at_the_cells_that_a_candidate_sets():

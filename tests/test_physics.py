@@ -20,7 +20,7 @@ import synthetic
 from calibray.fields import path_gains, path_loss, slab
 from calibray.fields.diffraction import affine_form, transition
 from calibray.fields.scattering import pattern_value
-from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants
+from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants_matrix
 from calibray.paths import Diffraction, Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -485,7 +485,7 @@ def test_knife_edge_against_itu_r_p526(tmp_path: Path) -> None:
 def test_scattering_patterns_spread_all_scattered_power_over_the_half_space(
     pattern: str, lobes: dict[str, float], incidence: float
 ) -> None:
-    row = constants({"rough": Material(3.0, 0.1, 0.2, 0.5, scattering_pattern=pattern, **lobes)})
+    row = constants_matrix({"rough": Material(3.0, 0.1, 0.2, 0.5, scattering_pattern=pattern, **lobes)})
     assert row.shape == (1, len(FIELDS))
     towards = np.array([np.sin(incidence), 0, -np.cos(incidence)])
     mirrored = towards * [1, 1, -1]

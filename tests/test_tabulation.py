@@ -15,7 +15,7 @@ from calibray.engines import Replay
 from calibray.engines.replay import TABLE_TOLERANCE
 from calibray.fields import layout, tabulation
 from calibray.fields.contributions import contributions
-from calibray.materials import Material, constants
+from calibray.materials import Material, constants_matrix
 from calibray.parameters import Parameter, Parameters
 
 WAVELENGTH = jnp.asarray(speed_of_light / 28e9)
@@ -33,7 +33,7 @@ _nodes, _evaluate = jax.jit(tabulation.nodes), jax.jit(tabulation.evaluate)
 @pytest.mark.parametrize("case", HARD)
 def test_error_of_a_table_is_bounded_by_what_it_says(case: str, mode: int) -> None:
     cosine = np.concatenate([np.linspace(0, 1, 20_011)[1:], np.geomspace(1e-8, 1e-3, 500)])
-    count, table = len(cosine), jnp.asarray(constants({"one": HARD[case]}))
+    count, table = len(cosine), jnp.asarray(constants_matrix({"one": HARD[case]}))
     lookup = tabulation.make_lookup(np.zeros(count, int), np.full(count, mode), cosine, [count], 4096, float)
     tables = _nodes(lookup, table, WAVELENGTH)
     found = tabulation.interpolate(tables, lookup.cell[0], lookup.fraction[0])
@@ -92,7 +92,7 @@ def test_a_table_too_coarse_is_refined(paths, parameters) -> None:
     high = replace(paths, frequency=28e9)
     engine = Replay(high, parameters, dtype=np.float64, tabulate=True)
     coarse = layout(high, np.float64, 256).program
-    table = jnp.asarray(parameters.constants(thick, paths.materials)[0])
+    table = jnp.asarray(parameters.constants_of(thick, paths.materials)[0])
     found = jax.jit(contributions)(coarse, table)
     assert float(tabulation.table_error(found.coefficients, coarse.coefficients)) > TABLE_TOLERANCE
     exact = Replay(high, parameters, dtype=np.float64, tabulate=False)

@@ -138,7 +138,7 @@ def _within_bounds(name: str, value: Any) -> float:
     return number
 
 
-def constants(materials: Mapping[str, Material]) -> NDArray[np.float64]:
+def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
     """The constants of materials as a matrix.
 
     Args:
@@ -148,7 +148,7 @@ def constants(materials: Mapping[str, Material]) -> NDArray[np.float64]:
         The constants [materials, fields], columns in the order of `FIELDS`, in the fields' units.
 
     Example:
-        >>> constants({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
+        >>> constants_matrix({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
         [5.24, 0.14, 0.3]
     """
     rows = [[getattr(material, name) for name in FIELDS] for material in materials.values()]

@@ -13,7 +13,7 @@ from calibray.inference.elimination import DENSE, Elimination
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.objective import Objective, make_objective
 from calibray.measurements import Measurements
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 
 
 def campaign(count: int, groups: int, seed: int = 0) -> Measurements:
@@ -25,7 +25,7 @@ def campaign(count: int, groups: int, seed: int = 0) -> Measurements:
         path_loss_db=np.zeros(count),
         weight=rng.uniform(0.2, 3.0, count),
         group=np.array([f"set {k:05}" for k in rng.integers(0, groups, count)]),
-        table=Table(pd.DataFrame({"trees_m": rng.uniform(0, 30, count)}), source="links.csv"),
+        table=SourceTable(pd.DataFrame({"trees_m": rng.uniform(0, 30, count)}), source="links.csv"),
     )
 
 
@@ -170,7 +170,7 @@ def test_bounds_are_kept_exactly_in_hard_problems(columns):
         tx=np.zeros((60, 3)),
         rx=rng.uniform(20, 400, (60, 3)),
         path_loss_db=np.zeros(60),
-        table=Table(
+        table=SourceTable(
             pd.DataFrame(
                 rng.normal(size=(60, columns)) * 0.05 + rng.normal(size=(60, 1)),
                 columns=[f"c{k}" for k in range(columns)],

@@ -13,7 +13,7 @@ from calibray.errors import InputError
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.objective import Objective, make_objective
 from calibray.measurements import Measurements
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 
 LINKS = 30
 
@@ -27,7 +27,7 @@ def campaign(groups: bool = True) -> Measurements:
         path_loss_db=rng.uniform(80, 120, LINKS),
         weight=rng.uniform(0.2, 3.0, LINKS),
         group=np.array(["a", "b", "c"])[np.arange(LINKS) % 3] if groups else None,
-        table=Table(pd.DataFrame({"clutter_m": rng.uniform(0, 40, LINKS)}), source="links.csv"),
+        table=SourceTable(pd.DataFrame({"clutter_m": rng.uniform(0, 40, LINKS)}), source="links.csv"),
     )
 
 

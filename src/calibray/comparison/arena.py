@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray import engines
 from calibray.calibration.methods import local_searches
@@ -36,9 +37,9 @@ class Arena:
 
     name: str
     fingerprint: str
-    lower: np.ndarray
-    upper: np.ndarray
-    start: np.ndarray | None
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    start: NDArray[np.float64] | None
     starts: int | None
     large: bool
     minimum: float
@@ -100,7 +101,7 @@ def landscape_arena(name: str) -> Arena:
     """
     land: landscapes.Landscape = getattr(landscapes, name)()
 
-    def evaluate(points: np.ndarray, derivatives: bool) -> Evaluation:
+    def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
         value, residuals, jacobian = land.evaluate(points)
         return Evaluation(value, residuals, jacobian if derivatives else None, residuals)
 

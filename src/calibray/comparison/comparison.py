@@ -19,6 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from calibray import optimizers
 from calibray.calibration.search import rounds
@@ -133,7 +134,7 @@ class Comparison:
     optimum: float
     found_by: str
 
-    def excess(self, name: str, calls: int) -> np.ndarray:
+    def excess(self, name: str, calls: int) -> NDArray[np.float64]:
         """Excess of a contender's runs after some RT calls.
 
         A run that ended or failed before stays where it was.
@@ -160,7 +161,7 @@ class Comparison:
         excess = self.excess(name, calls)
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
-    def calls_to(self, name: str, excess_db: float) -> np.ndarray:
+    def calls_to(self, name: str, excess_db: float) -> NDArray[np.float64]:
         """RT calls after which a contender's runs were within some excess.
 
         Args:
@@ -246,7 +247,7 @@ class Comparison:
         return pd.concat(parts, ignore_index=True)
 
 
-def quantile(values: np.ndarray, share: float) -> float:
+def quantile(values: NDArray[np.float64], share: float) -> float:
     """A quantile that may be infinite.
 
     Args:

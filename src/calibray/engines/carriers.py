@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.engines.protocol import check_candidates
 from calibray.engines.replay import Replay
@@ -24,7 +25,7 @@ class CarrierPaths:
     """
 
     paths: Paths
-    links: np.ndarray
+    links: NDArray[np.int64]
 
 
 class ReplayCarriers:
@@ -71,7 +72,7 @@ class ReplayCarriers:
         """Whether some carrier has so many interactions that a candidate costs milliseconds."""
         return any(replay.large for replay in self._replays)
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates.
 
         Args:
@@ -91,7 +92,9 @@ class ReplayCarriers:
         self.calls += len(given)
         return loss
 
-    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def path_loss_and_jacobian(
+        self, candidates: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Path loss of every link, and its derivatives by the parameters.
 
         Args:
@@ -113,5 +116,5 @@ class ReplayCarriers:
         self.calls += len(given)
         return loss, jacobian
 
-    def _carriers(self) -> zip[tuple[Replay, float, np.ndarray]]:
+    def _carriers(self) -> zip[tuple[Replay, float, NDArray[np.int64]]]:
         return zip(self._replays, self._frequencies, self._links, strict=True)

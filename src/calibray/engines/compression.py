@@ -17,6 +17,7 @@ from typing import Final
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import qmc
 
@@ -56,7 +57,7 @@ class Compressed:
     """
 
     paths: Paths
-    error_db: np.ndarray
+    error_db: NDArray[np.float64]
     candidates: int
 
 
@@ -114,7 +115,7 @@ def compress(
     return Compressed(few, error, CHECKED)
 
 
-def _candidates(parameters: Parameters, seed: int) -> list[np.ndarray]:
+def _candidates(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
     """Candidates to fit to, corners of the bounds among them, then those of every check [n, d], in the fields' units.
 
     What is fitted fails first where it extrapolates, so half of the candidates to check at lie on faces of the bounds.
@@ -132,8 +133,8 @@ def _candidates(parameters: Parameters, seed: int) -> list[np.ndarray]:
 
 
 def _whole(
-    paths: Paths, parameters: Parameters, candidates: list[np.ndarray], intervals: int
-) -> tuple[list[np.ndarray], np.ndarray, float]:
+    paths: Paths, parameters: Parameters, candidates: list[NDArray[np.float64]], intervals: int
+) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """What only the whole program tells.
 
     Returns:
@@ -143,19 +144,19 @@ def _whole(
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
     for some in candidates:
-        tables = parameters.constants(some, paths.materials).astype(np.float32)
+        tables = parameters.constants_of(some, paths.materials).astype(np.float32)
         loss, error = path_losses(plan.program, jnp.asarray(tables))
         totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
         errors.append(error)
     strength = np.zeros(paths.num_paths)
     for some, total in zip(candidates[0][:STRENGTH], totals[0], strict=False):
-        table = parameters.constants(some[None], paths.materials)[0].astype(np.float32)
+        table = parameters.constants_of(some[None], paths.materials)[0].astype(np.float32)
         power = np.asarray(path_powers(plan.program, jnp.asarray(table)))
         strength[plan.order] += power / np.where(total > 0, total, np.inf)[paths.link[plan.order]]
     return totals, strength, max(errors)
 
 
-def _pool(paths: Paths, strength: np.ndarray, seed: int) -> np.ndarray:
+def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.int64]:
     """Paths of links with many that may be kept, in their order: the strongest and as many others."""
     random, pool = np.random.default_rng(seed), []
     for some in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
@@ -165,7 +166,7 @@ def _pool(paths: Paths, strength: np.ndarray, seed: int) -> np.ndarray:
     return np.concatenate(pool) if pool else np.zeros(0, dtype=np.int64)
 
 
-def _blocks(links: np.ndarray, size: np.ndarray, candidates: int) -> list[np.ndarray]:
+def _blocks(links: NDArray[np.int64], size: NDArray[np.int64], candidates: int) -> list[NDArray[np.int64]]:
     """Links whose pools' powers fit into memory together."""
     block = np.cumsum(size[links]) * candidates // BLOCK
     return [some for some in np.split(links, np.flatnonzero(np.diff(block)) + 1) if len(some)]
@@ -175,14 +176,14 @@ class _Powers:
     """Powers of some paths at sets of candidates, each computed when it is first asked for."""
 
     def __init__(
-        self, paths: Paths, parameters: Parameters, candidates: list[np.ndarray], intervals: int
+        self, paths: Paths, parameters: Parameters, candidates: list[NDArray[np.float64]], intervals: int
     ) -> None:
         plan = layout(paths, np.float32, intervals, phases=False)
         self._program, self._place = plan.program, np.argsort(plan.order)
-        self._tables = [parameters.constants(some, paths.materials) for some in candidates]
-        self._known: dict[int, np.ndarray] = {}
+        self._tables = [parameters.constants_of(some, paths.materials) for some in candidates]
+        self._known: dict[int, NDArray[np.float64]] = {}
 
-    def at(self, which: int, where: slice) -> np.ndarray:
+    def at(self, which: int, where: slice) -> NDArray[np.float64]:
         """Powers of some of the paths at one set of candidates [n, paths]."""
         if which not in self._known:
             tables = jnp.asarray(self._tables[which].astype(np.float32))
@@ -191,8 +192,8 @@ class _Powers:
 
 
 def _fit_link(
-    powers: _Powers, where: slice, totals: list[np.ndarray], tolerance_db: float
-) -> tuple[np.ndarray, float] | None:
+    powers: _Powers, where: slice, totals: list[NDArray[np.float64]], tolerance_db: float
+) -> tuple[NDArray[np.float64], float] | None:
     """Weights of the paths in a link's pool, and the largest error at fresh candidates; None if it is too large.
 
     Candidates that leave the link no power, as where nothing scatters, are left out: no weight can err there.
@@ -212,7 +213,9 @@ def _fit_link(
     return None
 
 
-def sparse_weights(share: np.ndarray, bound: float, first: np.ndarray | None = None) -> np.ndarray:
+def sparse_weights(
+    share: NDArray[np.float64], bound: float, first: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
 
     Args:

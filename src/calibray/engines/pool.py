@@ -8,7 +8,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from socket import create_connection, gaierror
 from time import monotonic, sleep
-from typing import Final
+from typing import Final, NoReturn
 
 from calibray.errors import InputError
 from calibray.spelling import shortened
@@ -62,7 +62,7 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
         client = Client(scheduler, timeout=PATIENCE)
     # Whatever another program than a scheduler makes of Dask's greeting.
     except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
-        raise _no_scheduler(scheduler, str(error)) from None
+        _refuse(scheduler, str(error))
     with client:
         # A worker that dies gives its calls back to the scheduler, which gives them to others.
         yield client.get_executor(pure=False)
@@ -84,17 +84,17 @@ def _await_scheduler(scheduler: str) -> None:
         try:
             create_connection((host, int(match["port"])), timeout=PATIENCE).close()
         except (gaierror, UnicodeError) as error:
-            raise _no_scheduler(scheduler, str(error)) from None
+            _refuse(scheduler, str(error))
         except OSError as error:
             if monotonic() > end:
-                raise _no_scheduler(scheduler, str(error)) from None
+                _refuse(scheduler, str(error))
             sleep(0.5)
         else:
             return
 
 
-def _no_scheduler(scheduler: str, fault: str) -> InputError:
-    return InputError(
+def _refuse(scheduler: str, fault: str) -> NoReturn:
+    raise InputError(
         f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one, "
         "or correct the address"
-    )
+    ) from None

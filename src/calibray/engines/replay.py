@@ -8,6 +8,7 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
@@ -57,7 +58,7 @@ class Replay:
         self._rows, columns = parameters.indices(list(paths.materials))
         used, self._places = np.unique(columns, return_inverse=True)
         self._columns = columns
-        self._base = jnp.asarray(fields.constants(paths).astype(dtype))
+        self._base = jnp.asarray(fields.material_table(paths).astype(dtype))
         self._fields = tuple(int(column) for column in used)
         self._intervals = FIRST_INTERVALS if (self.large if tabulate is None else tabulate) else None
         self._forced = tabulate is True
@@ -73,7 +74,7 @@ class Replay:
         """Whether there are so many interactions that a candidate costs milliseconds."""
         return self.interactions > TABULATED
 
-    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates.
 
         Args:
@@ -88,7 +89,9 @@ class Replay:
         (loss,) = self._run(self._value, candidates)
         return loss
 
-    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def path_loss_and_jacobian(
+        self, candidates: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Path loss of every link, and its derivatives by the parameters.
 
         Args:
@@ -112,7 +115,7 @@ class Replay:
         )
         return loss, slope[:, :, self._rows, self._places], error
 
-    def _run(self, function: Callable, candidates: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
         parts, start = [], 0
         while start < len(values):
@@ -156,5 +159,7 @@ class Replay:
 
 
 @jax.jit
-def _tables(base: jax.Array, rows: np.ndarray, columns: np.ndarray, values: jax.Array) -> jax.Array:
+def _tables(
+    base: jax.Array, rows: NDArray[np.int64], columns: NDArray[np.int64], values: jax.Array
+) -> jax.Array:
     return jax.vmap(lambda value: base.at[rows, columns].set(value))(values)

@@ -23,7 +23,7 @@ from calibray.fields.evaluation import (  # noqa: E402
     path_powers,
     program_path_loss,
 )
-from calibray.fields.program import GroupedProgram, Layout, constants, layout  # noqa: E402
+from calibray.fields.program import GroupedProgram, Layout, layout, material_table  # noqa: E402
 
 __all__ = [
     "COMBINING",
@@ -31,10 +31,10 @@ __all__ = [
     "Layout",
     "band_quadrature",
     "check_combining",
-    "constants",
     "decibel",
     "layout",
     "link_power",
+    "material_table",
     "path_gains",
     "path_loss",
     "path_losses",

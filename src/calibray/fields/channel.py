@@ -13,6 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.errors import InputError
@@ -60,7 +61,7 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
     """
     plan = fields.layout(paths)
     azimuth = jnp.asarray(paths.departure[plan.order, 1]), jnp.asarray(paths.arrival[plan.order, 1])
-    found = _statistics(plan.program, jnp.asarray(fields.constants(paths, materials)), *azimuth)
+    found = _statistics(plan.program, jnp.asarray(fields.material_table(paths, materials)), *azimuth)
     return jax.tree.map(np.asarray, found)
 
 
@@ -113,8 +114,8 @@ def statistics(
 
 
 def power_delay_profile(
-    paths: Paths, delays: np.ndarray, materials: Mapping[str, Material] | None = None
-) -> np.ndarray:
+    paths: Paths, delays: NDArray[np.float64], materials: Mapping[str, Material] | None = None
+) -> NDArray[np.float64]:
     """Power gain of every link by delay.
 
     Args:
@@ -132,7 +133,7 @@ def power_delay_profile(
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
     program = fields.layout(paths).program
-    power = path_powers(program, jnp.asarray(fields.constants(paths, materials)))
+    power = path_powers(program, jnp.asarray(fields.material_table(paths, materials)))
     return np.asarray(delay_profile(program, power, jnp.asarray(edges)))
 
 

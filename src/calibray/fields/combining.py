@@ -8,6 +8,7 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.fields import slab
@@ -72,7 +73,9 @@ def decibel(power: jax.Array) -> jax.Array:
     return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
 
 
-def band_quadrature(link: np.ndarray, delay: np.ndarray, bandwidth: float | None) -> np.ndarray:
+def band_quadrature(
+    link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None
+) -> NDArray[np.float64]:
     """Gauss-Legendre nodes over a band, enough for the largest spread of delays within a link.
 
     The average of |H|^2 over the band holds oscillations e^{j 2 pi f (tau_i - tau_j)}; a rule with n nodes integrates
@@ -99,7 +102,7 @@ def band_quadrature(link: np.ndarray, delay: np.ndarray, bandwidth: float | None
     return np.stack([nodes * bandwidth / 2, weights / 2])
 
 
-def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> np.ndarray | None:
+def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> NDArray[np.float64] | None:
     """The quadrature that a way of combining needs.
 
     Args:

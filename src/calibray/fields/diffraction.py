@@ -8,13 +8,14 @@ reflection, with four coefficients in place of two.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.special import modfresnelm
 
 from calibray.paths import Diffraction
 
 
-def affine_form(table: Diffraction, row: np.ndarray, frequency: float) -> np.ndarray:
+def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) -> NDArray[np.complex128]:
     """The matrices C_0 .. C_4 of diffractions, in the edge-fixed frames.
 
     Args:
@@ -32,7 +33,7 @@ def affine_form(table: Diffraction, row: np.ndarray, frequency: float) -> np.nda
     size = wavenumber * table.distance[row]  # k L
     difference, total = phi_out - phi_in, phi_out + phi_in
 
-    def term(sign: int, beta: np.ndarray) -> np.ndarray:
+    def term(sign: int, beta: NDArray[np.float64]) -> NDArray[np.complex128]:
         """One of the four terms D_i (Kouyoumjian and Pathak 1974, eq. 25; ITU-R P.526-15 eqs. 66-69)."""
         turns = np.round((beta + sign * np.pi) / (2 * exterior))
         a = 2 * np.cos(exterior * turns - beta / 2) ** 2
@@ -51,7 +52,7 @@ def affine_form(table: Diffraction, row: np.ndarray, frequency: float) -> np.nda
     return form
 
 
-def transition(x: np.ndarray) -> np.ndarray:
+def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Transition function F(x) = 2 j sqrt(x) e^{jx} int_{sqrt x}^inf e^{-j u^2} du (Kouyoumjian and Pathak, eq. 27).
 
     Args:
@@ -65,8 +66,8 @@ def transition(x: np.ndarray) -> np.ndarray:
 
 
 def _cotangent_times_transition(
-    psi: np.ndarray, x: np.ndarray, n: np.ndarray, size: np.ndarray
-) -> np.ndarray:
+    psi: NDArray[np.float64], x: NDArray[np.float64], n: NDArray[np.float64], size: NDArray[np.float64]
+) -> NDArray[np.complex128]:
     """cot(psi) F(x), finite where the cotangent's pole meets F's zero, on shadow and reflection boundaries."""
     sine = np.sin(psi)
     pole = np.abs(sine) < 1e-9
@@ -74,7 +75,7 @@ def _cotangent_times_transition(
     return np.where(pole, limit, np.cos(psi) / np.where(pole, 1.0, sine) * transition(np.maximum(x, 0.0)))
 
 
-def _matrix(rotation: np.ndarray) -> np.ndarray:
+def _matrix(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """(cos, sin) as the matrix that turns a Jones vector's frame [2, 2, n]."""
     cos, sin = rotation.T
     return np.array([[cos, sin], [-sin, cos]])

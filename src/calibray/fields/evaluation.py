@@ -13,19 +13,20 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.fields import slab, tabulation
 from calibray.fields.combining import check_combining, decibel, link_power, path_power
 from calibray.fields.contributions import Contributions, Pieces, contributions, pieces, tangents
-from calibray.fields.program import Formula, GroupedProgram, constants, layout
+from calibray.fields.program import Formula, GroupedProgram, layout, material_table
 from calibray.fields.propagation import path_fields
 from calibray.fields.segments import total
 from calibray.materials import Material
 from calibray.paths import Paths
 
 
-def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) -> np.ndarray:
+def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
     """Path gains for any materials, equal to Sionna RT's `Paths.a` for the same materials.
 
     Args:
@@ -39,7 +40,7 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
         InputError: A material is unknown.
     """
     plan = layout(paths)
-    local = _contributions(plan.program, jnp.asarray(constants(paths, materials)))
+    local = _contributions(plan.program, jnp.asarray(material_table(paths, materials)))
     real, imaginary = _gains(plan.program, local)
     found = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
     found[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
@@ -51,7 +52,7 @@ def path_loss(
     materials: Mapping[str, Material] | None = None,
     combining: str = "power",
     bandwidth: float | None = None,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Path loss of every link for any materials.
 
     Args:
@@ -68,7 +69,7 @@ def path_loss(
         InputError: The combining or a material is unknown, or the bandwidth missing.
     """
     offsets = check_combining(paths, combining, bandwidth)
-    tables = jnp.asarray(constants(paths, materials))[None]
+    tables = jnp.asarray(material_table(paths, materials))[None]
     return np.asarray(path_losses(layout(paths).program, tables, combining, offsets)[0][0])
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
 from calibray.fields import tabulation
 from calibray.fields.diffraction import affine_form
 from calibray.fields.segments import Segments, make_segments
-from calibray.materials import Material
-from calibray.materials import constants as constants_matrix
+from calibray.materials import Material, constants_matrix
 from calibray.paths import Kind, Paths
 
 _LETTER: Final = {Kind.SPECULAR: "c", Kind.REFRACTION: "c", Kind.DIFFUSE: "s", Kind.DIFFRACTION: "d"}
@@ -149,7 +149,7 @@ class Layout:
     """
 
     program: GroupedProgram
-    order: np.ndarray
+    order: NDArray[np.int64]
 
 
 def layout(
@@ -196,7 +196,7 @@ def layout(
     return Layout(program, order)
 
 
-def constants(paths: Paths, materials: Mapping[str, Material] | None = None) -> np.ndarray:
+def material_table(paths: Paths, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
     """The matrix of material constants that evaluation takes.
 
     Args:
@@ -232,7 +232,7 @@ class _Flat:
         self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []
         self.table_row = np.maximum(_row_of(paths.kind, Kind.DIFFUSE), _row_of(paths.kind, Kind.DIFFRACTION))
 
-    def add(self, interaction: np.ndarray, kind: int) -> None:
+    def add(self, interaction: NDArray[np.int64], kind: int) -> None:
         """Append one position's interactions."""
         self._append(interaction, self._paths.cos_incidence[interaction])
         if kind == Kind.DIFFRACTION:
@@ -240,24 +240,24 @@ class _Flat:
         if kind == Kind.DIFFUSE:
             self._scattered.append(interaction)
 
-    def _append(self, interaction: np.ndarray, cosine: np.ndarray) -> None:
+    def _append(self, interaction: NDArray[np.int64], cosine: NDArray[np.float64]) -> None:
         self._interactions.append(interaction)
         self._cosines.append(cosine)
 
-    def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
+    def coefficients(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Interaction and cosine of every coefficient [J]."""
         return _joined(self._interactions, np.int64), _joined(self._cosines, float)
 
-    def scattered(self) -> np.ndarray:
+    def scattered(self) -> NDArray[np.int64]:
         """Interaction of every diffuse row [D]."""
         return _joined(self._scattered, np.int64)
 
 
-def _joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+def _joined(parts: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
 
 
-def _row_of(kind: np.ndarray, which: Kind) -> np.ndarray:
+def _row_of(kind: NDArray[np.integer], which: Kind) -> NDArray[np.int64]:
     chosen = kind == which
     return np.where(chosen, np.cumsum(chosen) - 1, -1)
 
@@ -270,8 +270,8 @@ def _positions(groups: tuple[Group, ...]) -> list[int]:
 
 def _coefficients(
     paths: Paths,
-    interaction: np.ndarray,
-    cosine: np.ndarray,
+    interaction: NDArray[np.int64],
+    cosine: NDArray[np.float64],
     sizes: list[int],
     dtype: type,
     intervals: int | None,
@@ -289,7 +289,9 @@ def _coefficients(
     )
 
 
-def _diffuse(paths: Paths, interaction: np.ndarray, row: np.ndarray, dtype: type) -> tuple[jax.Array, ...]:
+def _diffuse(
+    paths: Paths, interaction: NDArray[np.int64], row: NDArray[np.int64], dtype: type
+) -> tuple[jax.Array, ...]:
     table = paths.diffuse
     lobes = slice(
         None if any(one.scattering_pattern != "lambertian" for one in paths.materials.values()) else 0
@@ -305,7 +307,7 @@ def _diffuse(paths: Paths, interaction: np.ndarray, row: np.ndarray, dtype: type
     return jnp.asarray(index), *(jnp.asarray(column.astype(dtype)) for column in columns)
 
 
-def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type) -> Group:
+def _group(paths: Paths, index: NDArray[np.int64], depth: int, flat: _Flat, dtype: type) -> Group:
     at = paths.first[index] + np.arange(depth)[:, None]  # interactions [k, n]
     kinds = [int(kind) for kind in paths.kind[at[:, 0]]] if depth else []
     turn, wedge = [], []
@@ -331,10 +333,10 @@ def _group(paths: Paths, index: np.ndarray, depth: int, flat: _Flat, dtype: type
     )
 
 
-def _parts_needed(field: np.ndarray) -> int:
+def _parts_needed(field: NDArray[np.complex128]) -> int:
     """1 where every field is real, as those of linearly polarized antennas mostly are, else 2."""
     return 2 if field.imag.any() else 1
 
 
-def _parts(value: np.ndarray, dtype: type) -> jax.Array:
+def _parts(value: NDArray[np.complex128], dtype: type) -> jax.Array:
     return jnp.asarray(np.stack([value.real, value.imag]).astype(dtype))

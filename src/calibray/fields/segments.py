@@ -14,6 +14,7 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 BLOCK: Final = 32
 
@@ -36,7 +37,7 @@ class Segments:
     count: int
 
 
-def make_segments(segment: np.ndarray, count: int) -> Segments:
+def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
     """Put numbers in order for summation.
 
     Args:

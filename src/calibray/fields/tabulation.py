@@ -20,6 +20,7 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.fields import slab
 from calibray.materials import FIELDS
@@ -74,9 +75,9 @@ class Nodes:
 
 
 def make_lookup(
-    material: np.ndarray,
-    mode: np.ndarray,
-    cosine: np.ndarray,
+    material: NDArray[np.integer],
+    mode: NDArray[np.integer],
+    cosine: NDArray[np.float64],
     sizes: Sequence[int],
     intervals: int,
     dtype: type,

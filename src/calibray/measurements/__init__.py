@@ -1,7 +1,7 @@
 """Measured links: positions, path losses, weights and groups, read from tables and checked at the boundary.
 
 Positions are metres in the scene's frame. Positions on the globe will enter beside `reading`: what projects
-them needs a `Table` and ends in the same `Measurements`.
+them needs a `SourceTable` and ends in the same `Measurements`.
 """
 
 from calibray.measurements.links import FREQUENCIES, Measurements

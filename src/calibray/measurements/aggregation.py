@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 
 Sense = Literal["power", "loss"]
 """Whether more decibels are more power (received power, path gain, RSRP), or less (path loss)."""
@@ -88,7 +88,7 @@ def by_time(rows: pd.DataFrame, seconds: float, time: str) -> NDArray[np.int64]:
         >>> by_time(pd.DataFrame({"t": [10.0, 10.9, 11.2]}), 1.0, "t")
         array([0, 0, 1])
     """
-    table = Table(rows, source="samples")
+    table = SourceTable(rows, source="samples")
     if pd.api.types.is_numeric_dtype(table.column(time)):
         elapsed = table.numbers(time)
     else:
@@ -136,7 +136,7 @@ def averaged(
         >>> averaged(rows, "power", np.array([0, 0]), "power").round(3).to_dict("records")
         [{'rx_x': 0.5, 'rx_y': 0.0, 'power': -82.596, 'std_db': 7.071, 'count': 2}]
     """
-    table = Table(rows, source="samples")
+    table = SourceTable(rows, source="samples")
     if not len(rows) or np.shape(label) != (len(rows),):
         raise InputError(
             f"samples: {np.shape(label)} labels for {len(rows)} rows; give one for each, at least one"
@@ -159,7 +159,7 @@ def averaged(
 
 
 def _columns(rows: pd.DataFrame, place: Sequence[str]) -> NDArray[np.float64]:
-    table = Table(rows, source="samples")
+    table = SourceTable(rows, source="samples")
     return np.stack([table.numbers(name) for name in place], axis=1)
 
 

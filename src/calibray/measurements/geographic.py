@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 
 Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """Height of the ground [m] over x and y [m], as `Terrain.heights` gives it."""
@@ -56,7 +56,7 @@ def with_scene_positions(
         >>> with_scene_positions(rows, "rx", frame, "lon", "lat", 1.5)[["rx_x", "rx_y", "rx_z"]].to_numpy()
         array([[0. , 0. , 1.5]])
     """
-    table = Table(rows, source="log")
+    table = SourceTable(rows, source="log")
     east, north, up = (
         table.numbers(part) if isinstance(part, str) else np.full(len(rows), float(part))
         for part in (longitude, latitude, height)
@@ -142,7 +142,7 @@ def joined_by_time(
     Raises:
         InputError: There is no such column, a time cannot be read, or no row has a position.
     """
-    column = Table(log, source="log").column(time)
+    column = SourceTable(log, source="log").column(time)
     try:
         if pd.api.types.is_numeric_dtype(column):
             when = pd.to_datetime(column, utc=True, unit="s")

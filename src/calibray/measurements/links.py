@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.summary import summary
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 from calibray.spelling import shortened
 from calibray.tables import glance
 from calibray.tables.glance import named
@@ -57,7 +57,7 @@ class Measurements:
     weight: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
     group: NDArray[np.str_] | None = None
     frequency: NDArray[np.float64] | None = None
-    table: Table = field(default=None)  # type: ignore[assignment]
+    table: SourceTable = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         count = np.shape(self.path_loss_db)[:1][0] if np.ndim(self.path_loss_db) == 1 else -1
@@ -76,7 +76,7 @@ class Measurements:
         if self.frequency is not None:
             set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
         if self.table is None:
-            set_field(self, "table", Table(pd.DataFrame(index=range(count)), source="links"))
+            set_field(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
             raise InputError(f"table: {len(self.table)} rows, must be {count}, one per link")
         _check_links(self)
@@ -165,7 +165,7 @@ class Measurements:
         """The mask [links] of the links that pass a filter over the source table's columns.
 
         Raises:
-            InputError: The filter is not valid (see `Table.where`).
+            InputError: The filter is not valid (see `SourceTable.where`).
         """
         return self.table.where(expression)
 

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 from calibray.spelling import did_you_mean
 
 SUBCARRIERS: Final = 12  # of one resource block (3GPP TS 36.211 section 6.2.3, TS 38.211 section 4.4.4.1)
@@ -47,7 +47,7 @@ def long_table(
         1  0.0        AP 2 -61.0
         2  5.0        AP 1 -52.0
     """
-    table = Table(wide, source="wide table")
+    table = SourceTable(wide, source="wide table")
     if len(set(columns.values())) != len(columns):
         raise InputError(
             f"columns = {dict(columns)}: two columns have one transmitter; name each differently"
@@ -89,8 +89,8 @@ def with_transmitters(
     Raises:
         InputError: A table lacks the column, a transmitter stands twice, or one of a link is not known.
     """
-    of_link = Table(links, source="links").labels(name)
-    known = Table(transmitters, source="transmitters").labels(name)
+    of_link = SourceTable(links, source="links").labels(name)
+    known = SourceTable(transmitters, source="transmitters").labels(name)
     if len(set(known)) != len(known):
         raise InputError(f"transmitters: one of {', '.join(known[:5])} stands twice; remove one")
     if lost := sorted(set(of_link.tolist()) - set(known.tolist())):
@@ -170,11 +170,11 @@ def marked_censored(
     """
     if not np.isfinite([floor, margin_db]).all():
         raise InputError(f"floor = {floor!r}, margin_db = {margin_db!r}: must be finite numbers")
-    column = Table(rows, source="links").column(value)
+    column = SourceTable(rows, source="links").column(value)
     present = column.notna().to_numpy()
     numbers = np.full(len(rows), np.nan)
     if present.any():
-        numbers[present] = Table(rows.loc[present], source="links").numbers(value)
+        numbers[present] = SourceTable(rows.loc[present], source="links").numbers(value)
     limit = floor + margin_db
     censored = ~(numbers > limit)
     return rows.assign(**{value: np.where(censored, limit, numbers), mark: censored})

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.links import Measurements
-from calibray.measurements.tables import Table, read_table
+from calibray.measurements.tables import SourceTable, read_table
 from calibray.spelling import did_you_mean, shortened
 
 Quantity = Literal["path_loss", "path_gain", "received_power"]
@@ -104,7 +104,7 @@ def links_from_frame(
     Raises:
         InputError: A column is missing, or a position is not finite.
     """
-    return _unmeasured(Table(frame.reset_index(drop=True), source="links"), group, frequency)
+    return _unmeasured(SourceTable(frame.reset_index(drop=True), source="links"), group, frequency)
 
 
 def read_links(path: str | Path, group: str | None = None, frequency: str | None = None) -> Measurements:
@@ -124,7 +124,7 @@ def read_links(path: str | Path, group: str | None = None, frequency: str | None
     return _unmeasured(read_table(path), group, frequency)
 
 
-def _unmeasured(table: Table, group: str | None, frequency: str | None) -> Measurements:
+def _unmeasured(table: SourceTable, group: str | None, frequency: str | None) -> Measurements:
     if len(table) == 0:
         raise InputError(f"{table.source}: holds no rows; give at least one link")
     return Measurements(
@@ -137,7 +137,7 @@ def _unmeasured(table: Table, group: str | None, frequency: str | None) -> Measu
     )
 
 
-def _positions(table: Table, name: str, coordinates: Coordinates) -> NDArray[np.float64]:
+def _positions(table: SourceTable, name: str, coordinates: Coordinates) -> NDArray[np.float64]:
     """Positions [rows, 3] [m] from three numbers or columns."""
     if isinstance(coordinates, str) or len(coordinates) != 3:
         raise InputError(f"{name} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
@@ -160,7 +160,7 @@ def _positions(table: Table, name: str, coordinates: Coordinates) -> NDArray[np.
 
 
 def _path_loss_db(
-    table: Table, value: str, quantity: str, tx_power_dbm: str | float | None
+    table: SourceTable, value: str, quantity: str, tx_power_dbm: str | float | None
 ) -> NDArray[np.float64]:
     """Path losses [rows] [dB] from the measured column, refused where no radio link can have them."""
     if quantity not in get_args(Quantity):
@@ -189,7 +189,7 @@ def _path_loss_db(
     return loss
 
 
-def _weights(table: Table, weight: str | None, std: str | float | None) -> NDArray[np.float64] | None:
+def _weights(table: SourceTable, weight: str | None, std: str | float | None) -> NDArray[np.float64] | None:
     """Relative weights [rows], from weights or from standard deviations."""
     if weight is not None and std is not None:
         raise InputError(f"weight = {weight!r} and std = {std!r}: give one of them")
@@ -206,7 +206,7 @@ def _weights(table: Table, weight: str | None, std: str | float | None) -> NDArr
     return values if std is None else 1 / values**2
 
 
-def _number_or_column(table: Table, source: str | float | None) -> NDArray[np.float64]:
+def _number_or_column(table: SourceTable, source: str | float | None) -> NDArray[np.float64]:
     if isinstance(source, str):
         return table.numbers(source)
     if isinstance(source, bool) or not np.isfinite(source):  # type: ignore[arg-type]

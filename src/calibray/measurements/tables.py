@@ -22,7 +22,7 @@ from calibray.spelling import did_you_mean, shortened
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class SourceTable:
     """Rows of a table and where they stand in their file.
 
     Attributes:
@@ -42,9 +42,9 @@ class Table:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def select(self, mask: NDArray[np.bool_]) -> Table:
+    def select(self, mask: NDArray[np.bool_]) -> SourceTable:
         """The rows where a mask [rows] is true."""
-        return Table(self.frame.loc[mask].reset_index(drop=True), self.row[mask], self.source)
+        return SourceTable(self.frame.loc[mask].reset_index(drop=True), self.row[mask], self.source)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
         """Evaluate a row filter.
@@ -125,7 +125,7 @@ class Table:
         return f"{self.source}, row {self.row[index]}, column {column!r}"
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path) -> SourceTable:
     """Read a CSV, Parquet or Excel file.
 
     Args:
@@ -158,7 +158,7 @@ def read_table(path: str | Path) -> Table:
     return table
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> SourceTable:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             text = file.read()
@@ -168,11 +168,11 @@ def _read_csv(path: Path) -> Table:
         ) from None
     header, lines = _checked_layout(path, text)
     if not header:
-        return Table(pd.DataFrame())
+        return SourceTable(pd.DataFrame())
     frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
     if len(frame) != len(lines):
         raise InputError(f"{path}: {len(lines)} rows stand in it but {len(frame)} are read; check its quotes")
-    return Table(frame, np.array(lines, dtype=np.int64), str(path))
+    return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
 
 
 def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
@@ -203,7 +203,7 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
     return header, lines
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path) -> SourceTable:
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
     except ImportError:
@@ -212,10 +212,10 @@ def _read_parquet(path: Path) -> Table:
         ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from None
-    return Table(frame.reset_index(drop=True), source=str(path))
+    return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 
-def _read_excel(path: Path) -> Table:
+def _read_excel(path: Path) -> SourceTable:
     openpyxl = library("openpyxl", "excel")
     try:
         frame = pd.read_excel(path, engine="openpyxl")
@@ -235,4 +235,4 @@ def _read_excel(path: Path) -> Table:
     frame.columns = named
     rows = np.arange(2, len(frame) + 2)
     filled = frame.notna().any(axis=1).to_numpy()
-    return Table(frame.loc[filled].reset_index(drop=True), rows[filled], str(path))
+    return SourceTable(frame.loc[filled].reset_index(drop=True), rows[filled], str(path))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.materials import FIELDS, ItuLaw, Material, constants
+from calibray.materials import FIELDS, ItuLaw, Material, constants_matrix
 from calibray.parameters.laws import LAWS, PARAMETER_BOUNDS, check_law, power, steady_law
 from calibray.parameters.parameter import Parameter, check_material
 
@@ -267,7 +267,7 @@ class Parameters:
         columns = np.array([FIELDS.index(parameter.field) for parameter in self.items], dtype=np.int64)
         return rows, columns
 
-    def constants(
+    def constants_of(
         self, candidates: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
     ) -> NDArray[np.float64]:
         """The constants of the materials that candidates describe, at one carrier.
@@ -286,7 +286,7 @@ class Parameters:
         carrier = self.frequency if frequency is None else frequency
         (values, _), (acting, places) = self.entries(candidates, carrier), self.at(carrier)
         rows, columns = (index[places] for index in acting.indices(list(base)))
-        matrix = constants(base)
+        matrix = constants_matrix(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
         batch[..., rows, columns] = values
         return batch

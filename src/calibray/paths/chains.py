@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
@@ -35,17 +36,17 @@ class Chains:
         edge_lengths: Lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
     """
 
-    source: np.ndarray
-    target: np.ndarray
-    vertex: np.ndarray
-    normal: np.ndarray
-    kind: np.ndarray
-    material: np.ndarray
-    probability: np.ndarray
+    source: NDArray[np.float64]
+    target: NDArray[np.float64]
+    vertex: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    kind: NDArray[np.integer]
+    material: NDArray[np.integer]
+    probability: NDArray[np.float64]
     samples: int = 1
-    edge: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    normal_n: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    edge_lengths: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    edge: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    normal_n: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    edge_lengths: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True)
@@ -68,17 +69,17 @@ class Geometry:
         diffraction: Table of diffractions.
     """
 
-    delay: np.ndarray
-    spreading: np.ndarray
-    departure_direction: np.ndarray
-    arrival_direction: np.ndarray
-    departure_rotation: np.ndarray
-    arrival_rotation: np.ndarray
-    first: np.ndarray
-    kind: np.ndarray
-    material: np.ndarray
-    cos_incidence: np.ndarray
-    rotation: np.ndarray
+    delay: NDArray[np.float64]
+    spreading: NDArray[np.float64]
+    departure_direction: NDArray[np.float64]
+    arrival_direction: NDArray[np.float64]
+    departure_rotation: NDArray[np.float64]
+    arrival_rotation: NDArray[np.float64]
+    first: NDArray[np.int64]
+    kind: NDArray[np.integer]
+    material: NDArray[np.integer]
+    cos_incidence: NDArray[np.float64]
+    rotation: NDArray[np.float64]
     diffuse: Diffuse
     diffraction: Diffraction
 
@@ -107,7 +108,7 @@ def compile_chains(chains: Chains) -> Geometry:
     out_of = np.tile([1.0, 0.0], (count, 1))
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
-    tables: dict[int, list[tuple[np.ndarray, ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
+    tables: dict[int, list[tuple[NDArray[np.float64], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # Length already travelled when the present ray tube began.
     tube_start = np.zeros(count)
@@ -181,7 +182,7 @@ def compile_chains(chains: Chains) -> Geometry:
     )
 
 
-def spherical_basis(direction: np.ndarray, pole_reference: bool = True) -> np.ndarray:
+def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True) -> NDArray[np.float64]:
     """Basis vector theta of directions of travel, the first axis of the basis (theta, phi).
 
     Args:
@@ -208,7 +209,7 @@ def spherical_basis(direction: np.ndarray, pole_reference: bool = True) -> np.nd
     return np.where(near[..., None], _unit(np.where(near[..., None], fallback, reference)), theta)
 
 
-def transverse_electric(direction: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """First axis of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
 
     At normal incidence any transverse vector serves: there the transverse electric and magnetic coefficients describe
@@ -228,7 +229,9 @@ def transverse_electric(direction: np.ndarray, normal: np.ndarray) -> np.ndarray
     return _unit(np.where(degenerate[..., None], fallback, cross))
 
 
-def rotate(direction: np.ndarray, current: np.ndarray, target: np.ndarray) -> np.ndarray:
+def rotate(
+    direction: NDArray[np.float64], current: NDArray[np.float64], target: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """(cos, sin) of the rotation of a Jones vector's frame about its direction of travel.
 
     The vector (a, b) becomes (cos a + sin b, -sin a + cos b).
@@ -244,7 +247,7 @@ def rotate(direction: np.ndarray, current: np.ndarray, target: np.ndarray) -> np
     return np.stack([_dot(current, target), _dot(direction, np.cross(current, target))], axis=-1)
 
 
-def zenith_azimuth(direction: np.ndarray) -> np.ndarray:
+def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zenith and azimuth angles of unit vectors.
 
     Args:
@@ -258,8 +261,11 @@ def zenith_azimuth(direction: np.ndarray) -> np.ndarray:
 
 
 def _diffuse(
-    incident: np.ndarray, leaving: np.ndarray, normal: np.ndarray, frame: np.ndarray
-) -> tuple[np.ndarray, ...]:
+    incident: NDArray[np.float64],
+    leaving: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    frame: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], ...]:
     mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
     return (
         rotate(incident, frame, spherical_basis(incident, pole_reference=False)),
@@ -270,14 +276,14 @@ def _diffuse(
 
 
 def _wedge(
-    incident: np.ndarray,
-    leaving: np.ndarray,
-    normal_0: np.ndarray,
-    normal_n: np.ndarray,
-    edge: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-) -> tuple[np.ndarray, ...]:
+    incident: NDArray[np.float64],
+    leaving: NDArray[np.float64],
+    normal_0: NDArray[np.float64],
+    normal_n: NDArray[np.float64],
+    edge: NDArray[np.float64],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], ...]:
     """Constants of a wedge diffraction as Sionna RT has them (Kouyoumjian and Pathak 1974; ITU-R P.526-15, 4.5)."""
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
     cos_edge = np.abs(_dot(incident, edge))
@@ -305,19 +311,23 @@ def _wedge(
     )
 
 
-def _azimuth(away: np.ndarray, tangent: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _azimuth(
+    away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Angle of a direction pointing away from the edge, counted from the 0-face [0, 2 pi)."""
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
 
 
-def _compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """(cos, sin) of two rotations, one after the other."""
     (cos_1, sin_1), (cos_2, sin_2) = first.T, second.T
     return np.stack([cos_1 * cos_2 - sin_1 * sin_2, sin_1 * cos_2 + cos_1 * sin_2], axis=-1)
 
 
-def _in_path_order(parts: list[tuple[np.ndarray, ...]], empty: Diffuse | Diffraction) -> list[np.ndarray]:
+def _in_path_order(
+    parts: list[tuple[NDArray[np.float64], ...]], empty: Diffuse | Diffraction
+) -> list[NDArray[np.float64]]:
     """Columns of a table gathered step by step, put into path order (the order of the flat interactions)."""
     if not parts:
         return list(vars(empty).values())
@@ -331,21 +341,21 @@ def _in_path_order(parts: list[tuple[np.ndarray, ...]], empty: Diffuse | Diffrac
     return columns
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sum(a * b, axis=-1)
 
 
-def _sign(value: np.ndarray) -> np.ndarray:
+def _sign(value: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(value >= 0, 1.0, -1.0)
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def _reject(vector: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def _reject(vector: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector - _dot(vector, axis)[:, None] * axis
 
 
-def _inverse(probability: np.ndarray) -> np.ndarray:
+def _inverse(probability: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(probability > 0, 1 / np.where(probability > 0, probability, 1.0), 0.0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 class Kind(IntEnum):
@@ -30,11 +31,11 @@ class Diffuse:
         cos_backward: Cosine between the scattered direction and the way back to the source [D].
     """
 
-    rotation: np.ndarray
-    solid_angle: np.ndarray
-    cos_scattered: np.ndarray
-    cos_specular: np.ndarray
-    cos_backward: np.ndarray
+    rotation: NDArray[np.float64]
+    solid_angle: NDArray[np.float64]
+    cos_scattered: NDArray[np.float64]
+    cos_specular: NDArray[np.float64]
+    cos_backward: NDArray[np.float64]
 
     @classmethod
     def empty(cls) -> Diffuse:
@@ -59,13 +60,13 @@ class Diffraction:
             of the faces: in 0, out 0, in n, out n [W, 4, 2].
     """
 
-    cos_incidence_n: np.ndarray
-    exterior_angle: np.ndarray
-    azimuth_in: np.ndarray
-    azimuth_out: np.ndarray
-    sin_edge: np.ndarray
-    distance: np.ndarray
-    rotations: np.ndarray
+    cos_incidence_n: NDArray[np.float64]
+    exterior_angle: NDArray[np.float64]
+    azimuth_in: NDArray[np.float64]
+    azimuth_out: NDArray[np.float64]
+    sin_edge: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    rotations: NDArray[np.float64]
 
     @classmethod
     def empty(cls) -> Diffraction:

@@ -12,10 +12,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.files import exists
@@ -59,20 +60,20 @@ class Paths:
 
     frequency: float
     materials: dict[str, Material]
-    tx_position: np.ndarray
-    rx_position: np.ndarray
-    link: np.ndarray
-    delay: np.ndarray
-    spreading: np.ndarray
-    departure: np.ndarray
-    arrival: np.ndarray
-    tx_field: np.ndarray
-    rx_field: np.ndarray
-    first: np.ndarray
-    kind: np.ndarray
-    material: np.ndarray
-    cos_incidence: np.ndarray
-    rotation: np.ndarray
+    tx_position: NDArray[np.float64]
+    rx_position: NDArray[np.float64]
+    link: NDArray[np.integer]
+    delay: NDArray[np.float64]
+    spreading: NDArray[np.float64]
+    departure: NDArray[np.float64]
+    arrival: NDArray[np.float64]
+    tx_field: NDArray[np.complex128]
+    rx_field: NDArray[np.complex128]
+    first: NDArray[np.int64]
+    kind: NDArray[np.integer]
+    material: NDArray[np.integer]
+    cos_incidence: NDArray[np.float64]
+    rotation: NDArray[np.float64]
     diffuse: Diffuse = field(default_factory=Diffuse.empty)
     diffraction: Diffraction = field(default_factory=Diffraction.empty)
     settings: Mapping[str, object] = field(default_factory=dict)
@@ -99,7 +100,7 @@ class Paths:
         return len(self.tx_position)
 
     @property
-    def links_without_path(self) -> np.ndarray:
+    def links_without_path(self) -> NDArray[np.int64]:
         """Indices of the links to which no path leads [links]."""
         return np.flatnonzero(np.bincount(self.link, minlength=self.num_links) == 0)
 
@@ -207,7 +208,7 @@ def concatenate(parts: list[Paths]) -> Paths:
     return take(joined, np.argsort(joined.link, kind="stable"))
 
 
-def take(paths: Paths, index: np.ndarray) -> Paths:
+def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
     """The program with some of its paths, in a given order.
 
     Args:
@@ -231,7 +232,7 @@ def take(paths: Paths, index: np.ndarray) -> Paths:
     )
 
 
-def take_links(paths: Paths, links: np.ndarray) -> Paths:
+def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
     """The program of some links, in a given order; a link may be taken more than once.
 
     Args:
@@ -258,13 +259,13 @@ _PATH_ARRAYS = ("link", "delay", "spreading", "departure", "arrival", "tx_field"
 _INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation")
 
 
-def _ordinal(kind: np.ndarray, which: Kind) -> np.ndarray:
+def _ordinal(kind: NDArray[np.integer], which: Kind) -> NDArray[np.int64]:
     """Row of each interaction of one kind in that kind's table; -1 for the others [I]."""
     chosen = kind == which
     return np.where(chosen, np.cumsum(chosen) - 1, -1)
 
 
-def _rows(table: Table, row: np.ndarray) -> Table:
+def _rows(table: Table, row: NDArray[np.int64]) -> Table:
     row = row[row >= 0]
     return type(table)(*(getattr(table, entry.name)[row] for entry in fields(table)))
 
@@ -290,7 +291,7 @@ def _write(paths: Paths, file: h5py.File) -> None:
             file[name] = _part(paths, name)
 
 
-def _part(paths: Paths, name: str) -> np.ndarray:
+def _part(paths: Paths, name: str) -> NDArray[Any]:
     """The array that a dataset holds; complex ones lie apart, for MATLAB's h5read knows no complex type."""
     group, _, entry = name.partition("/")
     record = getattr(paths, group) if group in _TABLES else paths
@@ -303,8 +304,8 @@ def _part(paths: Paths, name: str) -> np.ndarray:
 def _program(content: Content) -> Paths:
     arrays = content.arrays
     names, patterns = arrays["materials/name"].tolist(), arrays["materials/scattering_pattern"].tolist()
-    own: dict[str, np.ndarray] = {}
-    tables: dict[str, dict[str, np.ndarray]] = {group: {} for group in _TABLES}
+    own: dict[str, NDArray[Any]] = {}
+    tables: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in _TABLES}
     for name, values in arrays.items():
         group, _, entry = name.partition("/")
         if entry.endswith("_real"):

@@ -124,9 +124,9 @@ def read(file: h5py.File) -> Content:
         isinstance(frequency, str | bool | np.bool_)
         or not FREQUENCIES[0] <= float(frequency) <= FREQUENCIES[1]
     ):
-        raise _damaged(
-            f"frequency_hz = {frequency!r}, must lie in {FREQUENCIES[0]:g} to {FREQUENCIES[1]:g} Hz"
-        )
+        damage = f"frequency_hz = {frequency!r}, must lie in {FREQUENCIES[0]:g} to {FREQUENCIES[1]:g} Hz"
+        refusal = _damaged(damage)
+        raise refusal
     arrays = {name: _array(file, name, entry) for name, entry in DATASETS.items()}
     _check_shapes(arrays)
     _check_values(arrays)

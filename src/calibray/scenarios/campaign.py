@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
@@ -58,7 +59,7 @@ def write_model(folder: Path, truth: World) -> None:
     (folder / "truth.json").write_bytes(truth_json(truth).encode("ascii"))
 
 
-def measure(truth: World, seed: int = SEED) -> np.ndarray:
+def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
     """Measure all links in the true world.
 
     Specular paths and paths with a diffuse reflection are traced apart: the former are few and must all be
@@ -89,7 +90,7 @@ def measure(truth: World, seed: int = SEED) -> np.ndarray:
     return np.array(sounded)
 
 
-def links_csv(truth: World, path_loss: np.ndarray) -> str:
+def links_csv(truth: World, path_loss: NDArray[np.float64]) -> str:
     """The measured links as a table.
 
     Args:
@@ -158,7 +159,7 @@ def _table(rows: dict[str, object]) -> str:
     return "{\n" + ",\n".join(f" {json.dumps(key)}: {json.dumps(row)}" for key, row in rows.items()) + "\n}"
 
 
-def _powers(paths: Paths) -> np.ndarray:
+def _powers(paths: Paths) -> NDArray[np.float64]:
     """Link, power gain [1], delay [s] and number of diffuse reflections of every path [4, P]."""
     owner = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
     diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths)

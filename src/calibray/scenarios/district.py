@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.scenes.meshes import Mesh, MeshObject, joined
 
@@ -50,7 +51,7 @@ class Building:
     """
 
     name: str
-    footprint: np.ndarray
+    footprint: NDArray[np.float64]
     height: float
     window_share: float
 
@@ -140,7 +141,7 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
     )
 
 
-def lamp_places() -> np.ndarray:
+def lamp_places() -> NDArray[np.float64]:
     """Where lamp posts stand: along the kerbs of all streets, on alternating sides, none on a crossing.
 
     Returns:
@@ -170,7 +171,7 @@ def lamp_posts() -> Mesh:
     return joined(Mesh(_rings(place + corners, (0.0, LAMP_HEIGHT)), faces) for place in lamp_places())
 
 
-def inside(building: Building, points: np.ndarray) -> np.ndarray:
+def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points of the plan lie within a building.
 
     Args:
@@ -195,7 +196,7 @@ def _edges(lines: Sequence[float], half_width: float, length: float) -> list[flo
     return [-length / 2, *(line + side for line in lines for side in (-half_width, half_width)), length / 2]
 
 
-def _block(bounds: tuple[float, float, float, float], rng: np.random.Generator) -> list[np.ndarray]:
+def _block(bounds: tuple[float, float, float, float], rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """Footprints of the buildings of a block (west, south, east, north), with the block's corners cut off.
 
     The cut corners, as Chinese and Spanish cities have them, are what mirrors waves into the streets that
@@ -233,9 +234,9 @@ def _lots(low: float, high: float, rng: np.random.Generator) -> list[tuple[float
     return [(low, middle - half_gap, True, False), (middle + half_gap, high, False, True)]
 
 
-def _outline(building: Building) -> tuple[np.ndarray, np.ndarray]:
+def _outline(building: Building) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The footprint with the ends of all panels [n, 2], [m], and which panel is a window [n]."""
-    points: list[np.ndarray] = []
+    points: list[NDArray[np.float64]] = []
     is_window: list[bool] = []
     for start, end in pairwise([*building.footprint, building.footprint[0]]):
         bays = max(1, round(float(np.hypot(*(end - start))) / MODULE))
@@ -247,12 +248,12 @@ def _outline(building: Building) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points), np.array(is_window)
 
 
-def _rings(outline: np.ndarray, levels: Sequence[float]) -> np.ndarray:
+def _rings(outline: NDArray[np.float64], levels: Sequence[float]) -> NDArray[np.float64]:
     """The outline repeated at every level [levels * n, 3], [m]."""
     return np.concatenate([np.column_stack([outline, np.full(len(outline), level)]) for level in levels])
 
 
-def _quads(here: np.ndarray, there: np.ndarray, rise: int) -> np.ndarray:
+def _quads(here: NDArray[np.int64], there: NDArray[np.int64], rise: int) -> NDArray[np.int64]:
     """Two triangles for every panel between one ring of vertices and the next above it [n, 2, 3]."""
     first = np.column_stack([here, there, there + rise])
     second = np.column_stack([here, there + rise, here + rise])
@@ -282,6 +283,6 @@ def _by_material(name: str, meshes: dict[str, list[Mesh]]) -> list[MeshObject]:
     ]
 
 
-def _snapped(value: np.ndarray | float) -> np.ndarray:
+def _snapped(value: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """Lengths rounded to 1/64 [m]."""
     return np.round(np.asarray(value) * 64.0) / 64.0

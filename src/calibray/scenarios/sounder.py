@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 
@@ -24,7 +25,10 @@ THRESHOLD: Final = 2.0
 
 
 def sounded_path_loss(
-    power: np.ndarray, delay: np.ndarray, is_diffuse: np.ndarray, rng: np.random.Generator
+    power: NDArray[np.float64],
+    delay: NDArray[np.float64],
+    is_diffuse: NDArray[np.bool_],
+    rng: np.random.Generator,
 ) -> tuple[float, float]:
     """Sound one link.
 

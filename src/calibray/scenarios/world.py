@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.scenarios.district import Building, district, lamp_posts, scene_objects
 from calibray.scenes.meshes import MeshObject
@@ -98,12 +99,12 @@ class World:
     """
 
     buildings: tuple[Building, ...]
-    level: np.ndarray
-    permittivity: np.ndarray
-    tx_recorded: np.ndarray
-    rx_recorded: np.ndarray
-    tx: np.ndarray
-    rx: np.ndarray
+    level: NDArray[np.float64]
+    permittivity: NDArray[np.float64]
+    tx_recorded: NDArray[np.float64]
+    rx_recorded: NDArray[np.float64]
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
 
     def scene_objects(self) -> list[MeshObject]:
         """The objects of the true world: buildings joined by level, and the lamp posts."""
@@ -162,6 +163,6 @@ def world(seed: int = SEED) -> World:
     )
 
 
-def _moved(recorded: np.ndarray, error: np.ndarray) -> np.ndarray:
+def _moved(recorded: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
     """True positions [L, 3], [m], of recorded ones and standard normal errors in the plan [L, 2]."""
     return recorded - np.pad(np.round(POSITION_ERROR * error, 3), [(0, 0), (0, 1)])

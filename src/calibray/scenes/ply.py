@@ -55,7 +55,11 @@ def check_ply(path: Path) -> None:
     tables = (
         _text_tables(path, elements, body) if order == "" else _binary_tables(path, order, elements, body)
     )
-    vertices, faces = tables.get("vertex"), tables.get("face")
+    _check(path, tables.get("vertex"), tables.get("face"))
+
+
+def _check(path: Path, vertices: NDArray[np.void] | None, faces: NDArray[np.void] | None) -> None:
+    """Refuse vertices that are not finite and faces that have no three corners among them."""
     if vertices is None or faces is None or not len(vertices) or not len(faces):
         raise _malformed(path, "has no vertices or no faces")
     if missing := [axis for axis in "xyz" if axis not in _names(vertices.dtype)]:

@@ -19,6 +19,7 @@ from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.paths import SCHEMA_VERSION, Paths
@@ -35,8 +36,8 @@ def trace_digest(
     frequency: float,
     settings: TraceSettings,
     antennas: tuple[Antenna, Antenna],
-    tx: np.ndarray,
-    rx: np.ndarray,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
 ) -> str:
     """What a trace depends on, as a fingerprint.
 

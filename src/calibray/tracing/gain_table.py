@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.tables import Table, read_table
+from calibray.measurements.tables import SourceTable, read_table
 
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
@@ -150,7 +150,7 @@ def read_gain_table(path: str | Path) -> GainTable:
     return found
 
 
-def _in_range(table: Table, name: str) -> NDArray[np.float64]:
+def _in_range(table: SourceTable, name: str) -> NDArray[np.float64]:
     values = table.numbers(name)
     low, high = RANGES[name]
     if (wrong := (values < low) | (values > high)).any():
@@ -163,7 +163,9 @@ def _in_range(table: Table, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _axis(table: Table, name: str, values: NDArray[np.float64]) -> tuple[NDArray[np.int64], float, float]:
+def _axis(
+    table: SourceTable, name: str, values: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], float, float]:
     """Place of every row on an axis of equal steps [rows], and its ends [deg]."""
     found = np.unique(values)
     if len(found) < 2:
@@ -188,7 +190,7 @@ def _axis(table: Table, name: str, values: NDArray[np.float64]) -> tuple[NDArray
 
 
 def _refuse_gaps(
-    table: Table, rows: NDArray[np.int64], columns: NDArray[np.int64], gains: NDArray[np.float64]
+    table: SourceTable, rows: NDArray[np.int64], columns: NDArray[np.int64], gains: NDArray[np.float64]
 ) -> None:
     """Refuse directions that stand twice or not at all."""
     place = rows * gains.shape[1] + columns

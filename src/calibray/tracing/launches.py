@@ -40,8 +40,8 @@ class Launch:
         last: Whether all rays to these receivers are sent out with this launch.
     """
 
-    source: np.ndarray
-    links: np.ndarray
+    source: NDArray[np.float64]
+    links: NDArray[np.int64]
     first: int
     rays: int
     seed: int
@@ -102,7 +102,7 @@ class Plan:
         return self.lanes * LANE_BYTES + self.buffer
 
 
-def plan(tx: np.ndarray, settings: TraceSettings, lanes: int, buffer: int) -> Plan:
+def plan(tx: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:
     """Cut a trace into launches.
 
     Args:
@@ -137,7 +137,7 @@ def _seed(seed: int, piece: int) -> int:
     return seed if piece == 0 else int(np.random.SeedSequence([seed, piece]).generate_state(1)[0])
 
 
-def directions(first: int, rays: int, samples: int) -> np.ndarray:
+def directions(first: int, rays: int, samples: int) -> NDArray[np.float64]:
     """A share of the Fibonacci lattice on the unit square, from which Sionna RT takes the directions of its rays.
 
     Args:
@@ -159,13 +159,13 @@ def directions(first: int, rays: int, samples: int) -> np.ndarray:
 
 
 def repeated(
-    piece: np.ndarray,
-    link: np.ndarray,
-    kind: np.ndarray,
-    shape: np.ndarray,
-    vertex: np.ndarray,
-    drawn: np.ndarray,
-) -> np.ndarray:
+    piece: NDArray[np.int64],
+    link: NDArray[np.int64],
+    kind: NDArray[np.int64],
+    shape: NDArray[np.int64],
+    vertex: NDArray[np.float64],
+    drawn: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
     """Paths that an earlier one of several launches to the same receivers has found already.
 
     A path that is not drawn at random is one and the same whichever ray found it: it meets the same objects in the same

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 
-def points(position: np.ndarray) -> mi.Point3f:
+def points(position: NDArray[np.float64]) -> mi.Point3f:
     """Points for Sionna, whose values no kernel is compiled for.
 
     Args:
@@ -22,7 +25,7 @@ def points(position: np.ndarray) -> mi.Point3f:
     return points
 
 
-def aligned(values: np.ndarray, dtype: type) -> np.ndarray:
+def aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
     """A copy that starts at a multiple of 64 bytes.
 
     Dr.Jit takes over NumPy's memory as it lies and compiles another kernel for another alignment. With an alignment
@@ -55,7 +58,7 @@ def gather(points: mi.Point3f, index: mi.UInt) -> mi.Point3f:
     return dr.gather(mi.Point3f, points, index)
 
 
-def to_complex(value: mi.Complex2f) -> np.ndarray:
+def to_complex(value: mi.Complex2f) -> NDArray[np.complex128]:
     """Complex numbers in double precision.
 
     Args:
@@ -67,7 +70,7 @@ def to_complex(value: mi.Complex2f) -> np.ndarray:
     return np.array(value.real, dtype=float) + 1j * np.array(value.imag, dtype=float)
 
 
-def per_interaction(buffer: PathsBuffer, name: str) -> np.ndarray:
+def per_interaction(buffer: PathsBuffer, name: str) -> NDArray[Any]:
     """A property of a buffer's interactions.
 
     Args:
@@ -81,7 +84,7 @@ def per_interaction(buffer: PathsBuffer, name: str) -> np.ndarray:
     return values.reshape(-1, buffer.depth_dim_size)
 
 
-def vertices_of(buffer: PathsBuffer) -> np.ndarray:
+def vertices_of(buffer: PathsBuffer) -> NDArray[np.float64]:
     """A buffer's interaction points.
 
     Args:

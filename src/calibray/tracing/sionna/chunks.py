@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
@@ -24,7 +25,7 @@ class Chunk:
     buffer: PathsBuffer
     source: mi.Point3f
     target: mi.Point3f
-    link: np.ndarray
+    link: NDArray[np.integer]
 
 
 @contextmanager

@@ -216,7 +216,7 @@ class Tracer:
             target.scattering_pattern = scattering_pattern(material)
         return constants
 
-    def enclosed(self, points: np.ndarray) -> np.ndarray:
+    def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points lie inside closed bodies of the scene, such as buildings.
 
         Rays that rise in several directions cross a closed body's surface an odd number of times; the majority
@@ -246,7 +246,7 @@ class Tracer:
             dr.eval(ray)
         return odd.reshape(len(points), -1).mean(axis=1) > 0.5
 
-    def _trace_launch(self, launch: Launch, targets: np.ndarray, room: int) -> Chunk:
+    def _trace_launch(self, launch: Launch, targets: NDArray[np.float64], room: int) -> Chunk:
         settings, size = self.settings, BUFFER
         # A path a lane, and the direct ones.
         most = (launch.rays * settings.max_depth + 1) * len(targets) + 2
@@ -325,7 +325,7 @@ class Tracer:
             settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
         )
 
-    def _chains(self, chunk: Chunk, tx: np.ndarray, rx: np.ndarray) -> Chains:
+    def _chains(self, chunk: Chunk, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Chains:
         buffer, count = chunk.buffer, len(chunk.link)
         depth = buffer.depth_dim_size
         shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
@@ -361,7 +361,7 @@ class Tracer:
             edge_lengths=wedge[2],
         )
 
-    def field_stage(self, chunk: Chunk) -> np.ndarray:
+    def field_stage(self, chunk: Chunk) -> NDArray[np.complex128]:
         """Sionna's own field stage on stored paths, with the constants given last.
 
         Args:
