@@ -41,7 +41,7 @@ def compare(
     from calibray.comparison.arena import study_arena
     from calibray.comparison.comparison import compare as run_all
     from calibray.comparison.tables import optimum, table
-    from calibray.report.excess import FILES, write
+    from calibray.reporting.excess import FILES, write
     from calibray.tables.text import render
 
     names = [name.strip() for name in methods.split(",") if name.strip()]

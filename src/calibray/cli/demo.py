@@ -28,7 +28,7 @@ def demo(
     from calibray.comparison.experiment import run_demo
     from calibray.comparison.paper import tables
     from calibray.files import check_folder
-    from calibray.report.demo import FIGURES, write
+    from calibray.reporting.demo import FIGURES, write
     from calibray.tables.text import render
 
     check_folder(out)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from calibray.comparison.labels import label
 from calibray.files import write_table
-from calibray.report.figures import COLORS, plain_figure
-from calibray.report.figures import write as write_figure
+from calibray.reporting.figures import COLORS, plain_figure
+from calibray.reporting.figures import write as write_figure
 
 if TYPE_CHECKING:
     from calibray.comparison.comparison import Comparison

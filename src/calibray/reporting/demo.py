@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from calibray.comparison.experiment import METHODS
 from calibray.files import write_text
-from calibray.report import figures
+from calibray.reporting import figures
 
 if TYPE_CHECKING:
     from calibray.comparison.experiment import Demo
