@@ -16,6 +16,7 @@ from calibray.files import check_folder, write_text
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
+from calibray.paths import Paths
 from calibray.progress import Progress
 from calibray.result.tables import summary
 from calibray.scenes import Scene, export_scene, read_scene
@@ -54,13 +55,16 @@ class Result:
         seconds: Time that the method took, tracing not included.
         trace_seconds: Time that tracing and loading took before.
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
-            whether a path leads there, whether it was held out, and its own change on tracing again.
+            whether a path leads there, whether it was held out, and its own change on tracing again; then the positions
+            tx_x to rx_z [m], the group and the carrier [Hz] where links have them, and, where not path loss was
+            measured, the three values as what was. Results of the version before lack what follows the change.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         laws: How calibrated constants follow the frequency: the coefficients itu_a to itu_d of ITU-R P.2040's law, by
             material of which one is a parameter.
         groups_without_path: Groups that have no offset, because no link of theirs to calibrate on has a path.
         enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
+        paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
     """
 
     study: Study
@@ -88,6 +92,7 @@ class Result:
     groups_without_path: tuple[str, ...] = ()
     enclosed: Enclosed | None = None
     scene: Scene | None = None
+    paths: Paths | None = None
 
     @property
     def counts(self) -> dict[str, Any]:
