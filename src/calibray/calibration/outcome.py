@@ -68,6 +68,7 @@ def outcome(
             "held_out": held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
             **_places(links),
+            **({"offset_only_db": offset_only} if fitted else {}),
         }
     )
     table = table.assign(**_as_measured(study, links, table))
