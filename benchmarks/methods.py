@@ -31,8 +31,8 @@ from calibray.comparison.arena import Arena, landscape_arena, study_arena
 from calibray.comparison.comparison import compare
 from calibray.comparison.tables import table
 from calibray.files import write_table, write_text
-from calibray.report import markdown
-from calibray.report.excess import figure
+from calibray.reporting import markdown
+from calibray.reporting.excess import figure
 from calibray.scenarios import demo_study_path
 
 ROOT = Path(__file__).resolve().parents[1]

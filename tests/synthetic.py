@@ -87,6 +87,7 @@ def program(
             rotations=_rotations(random, (wedges, 4)),
         ),
         settings={"samples": 1000, "refraction": True, "scene": "made up"},
+        vertex=random.uniform(-50, 50, (count, 3)).astype(np.float32),
     )
 
 

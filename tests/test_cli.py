@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from calibray import diagnosis
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
-from calibray.report.diagnosis import table
+from calibray.reporting.diagnosis import table
 from calibray.tables.text import render
 
 HEAVY = ("numpy", "scipy", "pandas", "jax", "matplotlib", "pydantic", "h5py", "drjit", "mitsuba", "sionna")

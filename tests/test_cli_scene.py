@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from calibray.cli.app import Commands
 from calibray.cli.scene import scene
-from calibray.report import scenes as report
+from calibray.reporting import scenes as report
 from calibray.scenes import read_scene
 from calibray.scenes.diagnosis import diagnose
 from calibray.scenes.making import read_frame

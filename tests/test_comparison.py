@@ -19,7 +19,7 @@ from calibray.comparison.runs import MethodRun, Runs
 from calibray.comparison.tables import table as shown
 from calibray.errors import InputError
 from calibray.optimizers import GWO, METHODS, SGWOIM, RandomSearch
-from calibray.report.excess import FILES, FLOOR_DB, figure
+from calibray.reporting.excess import FILES, FLOOR_DB, figure
 from calibray.study import Study
 from calibray.tables import markdown
 

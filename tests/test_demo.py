@@ -14,7 +14,7 @@ from calibray.calibration.problem import Problem
 from calibray.cli.app import app
 from calibray.comparison.experiment import METHODS, run_demo
 from calibray.comparison.paper import tables
-from calibray.report.demo import FIGURES, write
+from calibray.reporting.demo import FIGURES, write
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 

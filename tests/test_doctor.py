@@ -10,7 +10,7 @@ import pytest
 
 from calibray import diagnosis
 from calibray.diagnosis import Check, Diagnosis
-from calibray.report.diagnosis import table
+from calibray.reporting.diagnosis import table
 from calibray.tables.text import render
 from calibray.tracing import llvm
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.report import trace as report
+from calibray.reporting import trace as report
 from calibray.tracing import memory
 from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
 from calibray.tracing.settings import TraceSettings

@@ -90,6 +90,20 @@ def datasets(file: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     return found
 
 
+def test_a_file_may_lack_the_points_of_interaction(paths: Paths, tmp_path: Path) -> None:
+    """Files from before they were kept do; what is joined with such a program lacks them too."""
+    without = replace(paths, vertex=None)
+    without.save(tmp_path / "paths.h5")
+    assert_equal(Paths.load(tmp_path / "paths.h5"), without)
+    assert concatenate([paths, without]).vertex is None
+    kept = take(paths, np.arange(paths.num_paths)[::-2])
+    for path, index in enumerate(np.arange(paths.num_paths)[::-2]):
+        np.testing.assert_array_equal(
+            kept.vertex[kept.first[path] : kept.first[path + 1]],
+            paths.vertex[paths.first[index] : paths.first[index + 1]],
+        )
+
+
 def test_file_holds_only_what_matlab_reads_too(paths: Paths, tmp_path: Path) -> None:
     """Numbers without complex or compound types, and text."""
     paths.save(tmp_path / "paths.h5")

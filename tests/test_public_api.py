@@ -15,6 +15,7 @@ SIGNATURES = {
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
     "calibrate": "study, method, seed, out, engine, executor, progress",
+    "report": "result, file, figures, progress",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }

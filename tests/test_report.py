@@ -13,7 +13,7 @@ import pytest
 import shown
 from calibray.comparison import paper as demo
 from calibray.comparison import tables as comparison
-from calibray.report import diagnosis, ledger, trace
+from calibray.reporting import diagnosis, ledger, trace
 from calibray.result import tables as result
 from calibray.tables import Column, Table, html, markdown, numbers
 from calibray.tables.text import render, rows_text
@@ -156,7 +156,7 @@ assert "pandas" not in sys.modules
 for name in ("calibray.result.tables", "calibray.comparison.tables", "calibray.comparison.paper"):
     importlib.import_module(name)
 for name in "diagnosis excess figures ledger trace".split():
-    importlib.import_module(f"calibray.report.{name}")
+    importlib.import_module(f"calibray.reporting.{name}")
 heavy = ("jax", "drjit", "mitsuba", "sionna", "calibray.calibration")
 print([name for name in heavy if name in sys.modules])
 """

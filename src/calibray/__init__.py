@@ -42,6 +42,7 @@ _HOMES = {
     "calibrate": "calibray.calibration.calibrate",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
+    "report": "calibray.reporting.page",
 }
 
 __all__ = sorted(_HOMES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -9,9 +11,14 @@ from numpy.typing import NDArray
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
+from calibray.engines.kinds.replay import ReplaySection
+from calibray.engines.replay import Replay
 from calibray.inference.intervals import Interval, intervals
 from calibray.inference.rivals import log_distance
+from calibray.measurements import Measurements
+from calibray.paths import Paths
 from calibray.result import Result
+from calibray.study import Study
 from calibray.tracing.enclosed import Enclosed
 
 
@@ -60,8 +67,11 @@ def outcome(
             "has_path": reached,
             "held_out": held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
+            **_places(links),
+            **({"offset_only_db": offset_only} if fitted else {}),
         }
     )
+    table = table.assign(**_as_measured(study, links, table))
     return Result(
         study=study,
         parameters=parameters.named(trail.best),
@@ -89,7 +99,41 @@ def outcome(
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,
+        paths=_traced(problem),
     )
+
+
+def _places(links: Measurements) -> dict[str, NDArray[Any]]:
+    """Where the links' ends stand, and what sets them apart: columns of a table of links."""
+    ends = {
+        f"{end}_{axis}": position[:, k]
+        for end, position in (("tx", links.tx), ("rx", links.rx))
+        for k, axis in enumerate("xyz")
+    }
+    group = {} if links.group is None else {"group": links.group}
+    carrier = {} if links.frequency is None else {"frequency": links.frequency}
+    return ends | group | carrier
+
+
+def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
+    """Path gain or received power, with the sign it was measured with; nothing where that is path loss."""
+    quantity, column = study.links.quantity, study.links.value
+    if quantity == "path_loss" or column not in links.frame:
+        return {}
+    # Path gain is 0 dB less path loss, received power the transmitted power less it.
+    start = links.frame[column].to_numpy(float) + links.path_loss_db
+    unit = "dbm" if quantity == "received_power" else "db"
+    return {
+        f"{when}_{quantity}_{unit}": start - table[f"{when}_db"].to_numpy()
+        for when in ("measured", "before", "after")
+    }
+
+
+def _traced(problem: Problem) -> Paths | None:
+    """The paths calibrated on, where they are at hand as they were traced."""
+    section = problem.setup.study.engine
+    whole = isinstance(section, ReplaySection) and section.compress_db is None
+    return problem.engine.paths if whole and isinstance(problem.engine, Replay) else None
 
 
 def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interval]:

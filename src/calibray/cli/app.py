@@ -15,8 +15,10 @@ from typer.core import TyperGroup
 from calibray.cli.compare import compare
 from calibray.cli.demo import demo
 from calibray.cli.doctor import doctor
+from calibray.cli.export import export
 from calibray.cli.ledger import ledger
 from calibray.cli.predict import predict
+from calibray.cli.report import report
 from calibray.cli.run import run
 from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
@@ -74,5 +76,5 @@ def calibray(
     """Calibrate the radio materials of a ray-traced scene from measurements."""
 
 
-for command in (doctor, demo, run, compare, trace, predict, ledger):
+for command in (doctor, demo, run, report, compare, trace, predict, export, ledger):
     app.command()(command)

@@ -43,7 +43,7 @@ def compare(
     from calibray.comparison.comparison import compare as run_all
     from calibray.comparison.tables import optimum, table
     from calibray.files import check_outputs
-    from calibray.report.excess import FILES, write
+    from calibray.reporting.excess import FILES, write
     from calibray.study import Study
     from calibray.tables.text import render
 

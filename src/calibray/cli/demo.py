@@ -29,7 +29,7 @@ def demo(
     from calibray.comparison.experiment import run_demo
     from calibray.comparison.paper import tables
     from calibray.files import check_outputs
-    from calibray.report.demo import FIGURES, write
+    from calibray.reporting.demo import FIGURES, write
     from calibray.tables.text import render
 
     check_outputs(out, ["result.json", *FIGURES], (), overwrite)

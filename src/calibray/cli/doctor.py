@@ -10,7 +10,7 @@ from calibray.cli.console import log
 def doctor() -> None:
     """Tell what is installed, try whether tracing and replay work here, and say what to do if not."""
     from calibray.diagnosis import examine
-    from calibray.report.diagnosis import table
+    from calibray.reporting.diagnosis import table
     from calibray.tables.text import render
 
     with log.status("Trying Dr.Jit, Sionna RT and JAX"):

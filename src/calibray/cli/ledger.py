@@ -31,7 +31,7 @@ def ledger(
 
     from calibray.engines import open_ledger
     from calibray.files import check_table, write_table
-    from calibray.report.ledger import calls
+    from calibray.reporting.ledger import calls
     from calibray.tables.text import render
 
     if out is not None:

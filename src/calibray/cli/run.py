@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibray.cli.console import Overwrite, StudyFile, log
+
+if TYPE_CHECKING:
+    from calibray.result import Result
 
 
 def run(
@@ -34,8 +37,11 @@ def run(
         bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
     ] = False,
     overwrite: Overwrite = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Write the report's figures as well, as SVG and PNG.")
+    ] = False,
 ) -> None:
-    """Calibrate a study's materials, print the result, and write it with the calibrated scene."""
+    """Calibrate a study's materials, print the result, and write it with the calibrated scene and a report."""
     from calibray.calibration import calibrate
     from calibray.cli.progress import progress_bars
     from calibray.engines import open_executor
@@ -52,4 +58,21 @@ def run(
         typer.echo(json.dumps(result.content(), indent=2))
     else:
         typer.echo(render(tables.heading(result), *tables.tables(result)))
-    typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)
+    written = [*FILES, *_reported(result, out, figures)]
+    typer.echo(f"Written to {out}: {', '.join(written)}", err=True)
+
+
+def _reported(result: Result, out: Path, figures: bool) -> list[str]:
+    """Write the report beside a result that is safe by now: what goes wrong here is told, and loses nothing."""
+    from calibray.cli.progress import progress_bars
+
+    try:
+        from calibray.reporting import page
+
+        folder = out / page.FIGURES if figures else None
+        with progress_bars(log) as progress:
+            page.report(result, out / page.FILE, figures=folder, progress=progress)
+    except Exception as error:
+        typer.echo(f"Warning: no report ({error}); try again with: calibray report {out}", err=True)
+        return []
+    return [page.FILE, *([f"{page.FIGURES}/"] if figures else [])]

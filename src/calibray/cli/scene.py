@@ -157,7 +157,7 @@ def plan(
     ] = None,
 ) -> None:
     """Make a scene of a floor plan: one sheet for every wall, door and window."""
-    from calibray.report import scenes as report
+    from calibray.reporting import scenes as report
     from calibray.scenes.plan import read_plan
     from calibray.scenes.rooms import make_plan_scene
     from calibray.tables.text import render
@@ -183,7 +183,7 @@ def _make(
     """Make a scene of footprints, and tell what was made."""
     import numpy as np
 
-    from calibray.report import scenes as report
+    from calibray.reporting import scenes as report
     from calibray.scenes.extrusion import Windows as Division
     from calibray.scenes.making import Palette, make_scene
     from calibray.scenes.terrain import lowered, read_terrain

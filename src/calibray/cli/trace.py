@@ -31,7 +31,7 @@ def trace(
     from calibray.fields import path_loss
     from calibray.files import check_file
     from calibray.progress import staged
-    from calibray.report import trace as report
+    from calibray.reporting import trace as report
     from calibray.study import Study
     from calibray.tables.text import render
     from calibray.tracing import convergence

@@ -22,7 +22,7 @@ from calibray.errors import InputError
 from calibray.files import exists
 from calibray.materials import FIELDS, Material
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
-from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, Content, read
+from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, VERTEX, Content, read
 from calibray.paths.sealing import BLOCK, stamp, verify
 from calibray.paths.summary import as_html, as_text
 from calibray.paths.trial import survive
@@ -56,6 +56,8 @@ class Paths:
         diffuse: Further constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
         settings: How the paths were traced, for the record.
+        vertex: Where the interactions happen [I, 3], [m], in single precision, for drawing; None in files that do not
+            tell. No field depends on it.
     """
 
     frequency: float
@@ -77,6 +79,7 @@ class Paths:
     diffuse: Diffuse = field(default_factory=Diffuse.empty)
     diffraction: Diffraction = field(default_factory=Diffraction.empty)
     settings: Mapping[str, object] = field(default_factory=dict)
+    vertex: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return as_text(self)
@@ -204,6 +207,7 @@ def concatenate(parts: list[Paths]) -> Paths:
         ),
         diffuse=_join([part.diffuse for part in parts]),
         diffraction=_join([part.diffraction for part in parts]),
+        vertex=_vertices([part.vertex for part in parts]),
     )
     return take(joined, np.argsort(joined.link, kind="stable"))
 
@@ -229,6 +233,7 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
         first=first,
         diffuse=_rows(paths.diffuse, _ordinal(paths.kind, Kind.DIFFUSE)[interaction]),
         diffraction=_rows(paths.diffraction, _ordinal(paths.kind, Kind.DIFFRACTION)[interaction]),
+        vertex=None if paths.vertex is None else paths.vertex[interaction],
     )
 
 
@@ -270,6 +275,12 @@ def _rows(table: Table, row: NDArray[np.int64]) -> Table:
     return type(table)(*(getattr(table, entry.name)[row] for entry in fields(table)))
 
 
+def _vertices(parts: list[np.ndarray | None]) -> np.ndarray | None:
+    """The interaction points of several programs; None if one does not tell them."""
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if len(known) == len(parts) else None
+
+
 def _join(tables: list[Table]) -> Table:
     kind = type(tables[0])
     return kind(*(np.concatenate([getattr(table, entry.name) for table in tables]) for entry in fields(kind)))
@@ -289,6 +300,8 @@ def _write(paths: Paths, file: h5py.File) -> None:
     for name in DATASETS:
         if not name.startswith("materials/"):
             file[name] = _part(paths, name)
+    if paths.vertex is not None:
+        file[VERTEX] = paths.vertex
 
 
 def _part(paths: Paths, name: str) -> NDArray[Any]:

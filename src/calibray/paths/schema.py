@@ -101,6 +101,10 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
+VERTEX: Final = "interactions/vertex"
+OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType({VERTEX: Dataset(("I", 3))})
+"""What a file may lack."""
+
 
 def read(file: h5py.File) -> Content:
     """Read a path file and check all of it.
@@ -127,7 +131,8 @@ def read(file: h5py.File) -> Content:
         damage = f"frequency_hz = {frequency!r}, must lie in {FREQUENCIES[0]:g} to {FREQUENCIES[1]:g} Hz"
         refusal = _damaged(damage)
         raise refusal
-    arrays = {name: _array(file, name, entry) for name, entry in DATASETS.items()}
+    present = dict(DATASETS) | {name: entry for name, entry in OPTIONAL.items() if name in file}
+    arrays = {name: _array(file, name, entry) for name, entry in present.items()}
     _check_shapes(arrays)
     _check_values(arrays)
     _check_indices(arrays)
@@ -173,6 +178,10 @@ def _array(file: h5py.File, name: str, entry: Dataset) -> NDArray:
     return item[()]
 
 
+def _entry(name: str) -> Dataset:
+    return DATASETS[name] if name in DATASETS else OPTIONAL[name]
+
+
 def _check_shapes(arrays: Mapping[str, NDArray]) -> None:
     kinds = arrays["interactions/kind"]
     sizes = {
@@ -191,15 +200,16 @@ def _check_shapes(arrays: Mapping[str, NDArray]) -> None:
             raise _damaged(f"{sizes[port]} ports, must be 1 or 2")
     if not sizes["L"]:
         raise _damaged("no links")
-    for name, entry in DATASETS.items():
+    for name in arrays:
+        entry = _entry(name)
         expected = tuple(sizes[size] if isinstance(size, str) else size for size in entry.shape)
         if arrays[name].shape != expected:
             raise _damaged(f"dataset {name} has the shape {arrays[name].shape}, must have {expected}")
 
 
 def _check_values(arrays: Mapping[str, NDArray]) -> None:
-    for name, entry in DATASETS.items():
-        values = arrays[name]
+    for name, values in arrays.items():
+        entry = _entry(name)
         if entry.kind == "O":
             continue
         # A number that is not finite fails the first comparison, an infinite one the second.

@@ -16,6 +16,7 @@ from calibray.files import check_outputs, write_text
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
+from calibray.paths import Paths
 from calibray.progress import Progress
 from calibray.result.rows import COLUMNS, read_rows
 from calibray.result.stored import VERSION, read_stored
@@ -57,7 +58,9 @@ class Result:
         seconds: Time that the method took, tracing not included.
         trace_seconds: Time that tracing and loading took before.
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
-            whether a path leads there, whether it was held out, and its own change on tracing again.
+            whether a path leads there, whether it was held out, and its own change on tracing again; then the positions
+            tx_x to rx_z [m], the group and the carrier [Hz] where links have them, path loss with the offsets alone
+            [dB] where there are any, and, where not path loss was measured, the three values as what was. Results of the version before lack what follows the change.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         laws: How calibrated constants follow the frequency: the coefficients itu_a to itu_d of ITU-R P.2040's law, by
             material of which one is a parameter.
@@ -65,6 +68,7 @@ class Result:
         enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
+        paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
     """
 
     study: Study
@@ -93,6 +97,7 @@ class Result:
     enclosed: Enclosed | None = None
     scene: Scene | None = None
     files: dict[str, str] = field(default_factory=dict)
+    paths: Paths | None = None
 
     @property
     def counts(self) -> dict[str, Any]:

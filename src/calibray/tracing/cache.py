@@ -55,7 +55,7 @@ def trace_digest(
     """
     record = {
         "calibray": version("calibray"),
-        "schema": [SCHEMA_VERSION, "sealed"],
+        "schema": [SCHEMA_VERSION, "sealed", "vertices"],
         "tracer": dict(versions),
         "frequency": frequency,
         "settings": settings.record(),

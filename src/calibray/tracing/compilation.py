@@ -63,5 +63,6 @@ def compile_paths(
         diffuse=program.diffuse,
         diffraction=program.diffraction,
         settings=dict(settings or {}),
+        vertex=chains.vertex[chains.kind != 0].astype(np.float32),
     )
     return paths if (np.diff(paths.link) >= 0).all() else concatenate([paths])

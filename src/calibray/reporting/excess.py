@@ -10,24 +10,14 @@ from matplotlib.figure import Figure
 
 from calibray.comparison.labels import label
 from calibray.files import write_table
-from calibray.report.figures import COLORS, plain_figure
-from calibray.report.figures import write as write_figure
+from calibray.reporting.style import COLORS, PALETTE, plain_figure, styled
+from calibray.reporting.style import write as write_figure
 
 if TYPE_CHECKING:
     from calibray.comparison.comparison import Comparison
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4  # drawn in place of less
-PALETTE: Final = (
-    "#8e6bb0",
-    "#d99a2b",
-    "#3aa6a6",
-    "#8c5a3c",
-    "#d46a9f",
-    "#6f7f2e",
-    "#5c6bc0",
-    "#777777",
-)
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -42,6 +32,7 @@ def write(comparison: Comparison, folder: Path) -> None:
     write_figure(figure(comparison), folder / FILES[2])
 
 
+@styled()
 def figure(comparison: Comparison) -> Figure:
     """Excess over RT calls: the median of each method and the band between its quartiles.
 

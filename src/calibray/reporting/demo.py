@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from calibray.comparison.experiment import METHODS
 from calibray.files import write_text
-from calibray.report import figures
+from calibray.reporting import figures, style
 
 if TYPE_CHECKING:
     from calibray.comparison.experiment import Demo
@@ -31,7 +31,7 @@ def write(demo: Demo, out: Path) -> None:
         figures.path_loss_by_receiver(demo.results),
     )
     for name, figure in zip(FIGURES, drawn, strict=True):
-        figures.write(figure, out / name)
+        style.write(figure, out / name)
     for method, result in demo.results.items():
         result.save(out / method)
     write_text(out / "result.json", json.dumps(demo.content(), indent=2) + "\n")

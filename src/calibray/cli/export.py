@@ -1,0 +1,28 @@
+"""`calibray export`: the calibrated scene and its materials for other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into.", show_default=False)
+    ],
+    copy: Annotated[
+        bool,
+        typer.Option("--copy", help="Copy the meshes too, so that the folder can be given away."),
+    ] = False,
+) -> None:
+    """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as CSV, JSON and for MATLAB."""
+    from calibray.reporting.export import export as write
+    from calibray.result import Result
+
+    names = write(Result.load(folder), out, copy)
+    typer.echo(f"Written to {out}: {', '.join(names)}", err=True)

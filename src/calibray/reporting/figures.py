@@ -1,0 +1,231 @@
+"""Figures of calibrations: the paper's, and what is left of path loss when all is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
+
+from calibray.comparison.labels import label
+from calibray.reporting.style import (
+    BLUE,
+    COLORS,
+    FAINT,
+    INK,
+    LINE,
+    ORANGE,
+    dress,
+    plain_figure,
+    styled,
+)
+from calibray.spelling import shortened
+
+if TYPE_CHECKING:
+    from calibray.reporting.survey import Survey
+    from calibray.result import Result
+
+SYMBOLS: Final = 60
+"""Links up to which every one has its own symbol on a line."""
+
+MANY: Final = 2000
+"""Points beyond which a figure holds them as an image."""
+
+GROUPS: Final = 24
+"""Groups that are shown, those with the most links first."""
+
+
+@styled()
+def cumulative_cost(results: Mapping[str, Result]) -> Figure:
+    """RT calls and time over iterations (the paper's figure of cumulative cost).
+
+    Args:
+        results: Results by method.
+
+    Returns:
+        The figure.
+    """
+    figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, column, y in zip(
+        panels, ("call", "seconds"), ("RT calls so far", "Time so far [s]"), strict=True
+    ):
+        dress(axes, "Iteration" if column == "seconds" else "", y)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        for method, result in results.items():
+            value = result.history.groupby("iteration")[column].max()
+            end = f"{value.iloc[-1]:.4g}"
+            axes.plot(
+                value.index, value, "o-", ms=4, color=COLORS.get(method), label=f"{label(method)}: {end}"
+            )
+            if method == "sgwo-im":
+                calls = result.history.groupby("iteration")["call"].max().diff()
+                lean = calls[calls < calls.iloc[1]]
+                if len(lean):
+                    axes.axvline(
+                        lean.index[0] - 1, color=COLORS[method], ls="--", lw=1, label="surrogate takes over"
+                    )
+        axes.legend(frameon=False)
+    return figure
+
+
+@styled()
+def convergence(results: Mapping[str, Result], optimum_db: float | None = None) -> Figure:
+    """Best RMSE so far over RT calls.
+
+    Args:
+        results: Results by method.
+        optimum_db: RMSE of the global optimum, drawn as a line, [dB]; None where it is not known.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = plain_figure("RT calls", "Best RMSE so far [dB]")
+    for method, result in results.items():
+        history = result.history
+        axes.step(
+            history["call"], history["best_db"], where="post", color=COLORS.get(method),
+            label=f"{label(method)}: {result.rmse_db:.3f} dB",
+        )  # fmt: skip
+    if optimum_db is not None:
+        axes.axhline(optimum_db, color=INK, ls="--", lw=1, label=f"global optimum: {optimum_db:.3f} dB")
+    axes.legend(frameon=False)
+    return figure
+
+
+@styled()
+def path_loss_by_receiver(results: Mapping[str, Result]) -> Figure:
+    """Path loss by receiver: measured, before calibration and after.
+
+    Args:
+        results: Results by method, all of the same links.
+
+    Returns:
+        The figure.
+    """
+    links = next(iter(results.values())).links
+    index = np.arange(1, len(links) + 1)
+    few = len(links) <= SYMBOLS
+    figure, axes = plain_figure("Receiver" if few else "Link", "Path loss [dB]", width=10.0)
+    held_out = links["held_out"].to_numpy(bool)
+    if 0 < held_out.sum() < len(links):
+        for start, end in _runs(held_out):
+            axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0,
+                         label="held out" if start == _runs(held_out)[0][0] else None)  # fmt: skip
+    style: dict[str, Any] = {"marker": "o" if few else ".", "ls": "-" if few else "", "lw": 1.5}
+    drawn = {"rasterized": len(links) > MANY}
+    axes.plot(
+        index,
+        _finite(links["measured_db"]),
+        color=INK,
+        ms=5 if few else 3,
+        label="measured",
+        **style,
+        **drawn,
+    )
+    axes.plot(index, _finite(links["before_db"]), "s--" if few else ".", color=FAINT, ms=4 if few else 2, lw=1,
+              label="before calibration", **drawn)  # fmt: skip
+    for method, result in results.items():
+        axes.plot(index, _finite(result.links["after_db"]), "-" if few else ".", ms=2, color=COLORS.get(method, BLUE),
+                  lw=1.3, label=label(method), **drawn)  # fmt: skip
+    axes.set_xlim(0, len(links) + 1)
+    axes.legend(frameon=False, ncols=2)
+    return figure
+
+
+@styled()
+def residual_over_distance(survey: Survey) -> Figure:
+    """What is left of each link's path loss, over the distance between its ends.
+
+    Args:
+        survey: The links.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = plain_figure("Distance [m]", "Calibrated - measured [dB]")
+    left, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
+    axes.axhline(0, color=INK, lw=0.8)
+    for mask, color, marker, name in (
+        (~held_out, BLUE, "o", "calibrated on"),
+        (held_out, ORANGE, "^", "held out"),
+    ):
+        shown = mask & np.isfinite(left)
+        if shown.any():
+            size = 40 if shown.sum() <= 100 else 16 if shown.sum() <= 1000 else 5
+            axes.scatter(survey.distance[shown], left[shown], s=size, c=color, marker=marker, alpha=0.7, lw=0,
+                         label=f"{name} ({shown.sum():,})", rasterized=len(left) > MANY)  # fmt: skip
+    known = survey.distance[np.isfinite(left)]
+    if len(known) and known.max() > 8 * known.min():
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.legend(frameon=False, loc="best")
+    return figure
+
+
+@styled()
+def residual_by_group(survey: Survey) -> Figure:
+    """What is left of the links' path loss, in each group.
+
+    Args:
+        survey: The links, which have groups.
+
+    Returns:
+        The figure: quartiles as a box, the median as a line, and all but 10 % between the whiskers.
+    """
+    left = survey.residual_db
+    frame = pd.DataFrame({"group": survey.group, "left": left}).dropna()
+    sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
+    names = sorted(sizes.index[:GROUPS])
+    figure, axes = plain_figure("Calibrated - measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", color=LINE)
+    axes.axvline(0, color=INK, lw=0.8)
+    values = [frame.loc[frame["group"] == name, "left"].to_numpy() for name in names]
+    if values:
+        lines = {"color": BLUE, "linewidth": 1.2}
+        axes.boxplot(values, orientation="horizontal", whis=(5, 95), showfliers=False, widths=0.5, boxprops=lines,
+                     whiskerprops=lines, capprops=lines, medianprops={"color": ORANGE, "linewidth": 2})  # fmt: skip
+    labels = [f"{shortened(name, 28)} ({len(value):,})" for name, value in zip(names, values, strict=True)]
+    axes.set_yticks(range(1, len(names) + 1), labels)
+    axes.invert_yaxis()
+    return figure
+
+
+def every(result: Result, links: Survey | None) -> dict[str, Figure]:
+    """The figures of a calibration.
+
+    Args:
+        result: The calibration.
+        links: Where its links stand; None where that is not known.
+
+    Returns:
+        Figures by name.
+    """
+    method = {result.study.method.name: result}
+    figures = {
+        "convergence": convergence(method),
+        "cumulative-cost": cumulative_cost(method),
+        "path-loss": path_loss_by_receiver(method),
+    }
+    if links is not None:
+        figures["residual-over-distance"] = residual_over_distance(links)
+        if links.group is not None:
+            figures["residual-by-group"] = residual_by_group(links)
+    return figures
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and end of every run of links in a mask."""
+    edge = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [(int(start), int(end)) for start, end in edge.reshape(-1, 2)]
+
+
+def _finite(column: pd.Series) -> NDArray[np.float64]:
+    values = column.to_numpy(float)
+    return np.where(np.isfinite(values), values, np.nan)

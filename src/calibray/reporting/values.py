@@ -1,0 +1,92 @@
+"""Calibrated values as the report lists them: each with its interval drawn over its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import log
+from typing import TYPE_CHECKING
+
+from calibray.parameters.laws import PARAMETER_BOUNDS
+
+if TYPE_CHECKING:
+    from calibray.result import Result
+
+MARKS = {"identified": "●", "at bound": "◐", "not identifiable": "○"}
+
+
+@dataclass(frozen=True)
+class Value:
+    """One parameter, as text and as places on a bar over its bounds.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit; empty if it has none.
+        before: Its value before calibration.
+        after: Its calibrated value.
+        interval: Its 95 % interval; empty if it is not known.
+        verdict: How far the data tell it.
+        bounds: Its bounds, lower and upper.
+        scale: "linear" or "log".
+        places: Where on the bar the values before and after stand, and the interval begins and ends, each 0 to 1.
+    """
+
+    name: str
+    unit: str
+    before: str
+    after: str
+    interval: str
+    verdict: str
+    bounds: tuple[str, str]
+    scale: str
+    places: dict[str, float]
+
+    @property
+    def mark(self) -> str:
+        """A symbol of the verdict."""
+        return MARKS.get(self.verdict, "")
+
+
+def values(result: Result) -> list[Value]:
+    """The parameters of a calibration.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        One entry for each, in the study's order.
+    """
+    found = []
+    for name, after in result.parameters.items():
+        entry, interval = result.study.parameters[name], result.intervals.get(name)
+        before, place = result.initial_parameters[name], _scale(*entry.bounds, entry.scale)
+        places = {"before": place(before), "after": place(after)}
+        if interval is not None:
+            places |= {"lower": place(interval.lower), "upper": place(interval.upper)}
+        unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
+        found.append(
+            Value(
+                name,
+                "" if unit == "1" else unit,
+                f"{before:.4g}",
+                f"{after:.4g}",
+                "" if interval is None else f"{interval.lower:.4g} to {interval.upper:.4g}",
+                "not known" if interval is None else interval.verdict,
+                (f"{entry.bounds[0]:.4g}", f"{entry.bounds[1]:.4g}"),
+                entry.scale,
+                places,
+            )
+        )
+    return found
+
+
+def _scale(lower: float, upper: float, scale: str) -> Callable[[float], float]:
+    """Where between its bounds a value stands, 0 to 1."""
+
+    def place(value: float) -> float:
+        value = min(max(value, lower), upper)
+        if scale == "log":
+            return log(value / lower) / log(upper / lower)
+        return (value - lower) / (upper - lower)
+
+    return place
