@@ -18,6 +18,7 @@ from calibray.cli.doctor import doctor
 from calibray.cli.ledger import ledger
 from calibray.cli.predict import predict
 from calibray.cli.run import run
+from calibray.cli.scene import scene
 from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
 
@@ -76,3 +77,4 @@ def calibray(
 
 for command in (doctor, demo, run, compare, trace, predict, ledger):
     app.command()(command)
+app.add_typer(scene)
