@@ -89,6 +89,7 @@ def outcome(
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,
+        prepared=links.prepared,
     )
 
 

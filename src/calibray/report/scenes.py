@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from calibray.errors import InputError
 from calibray.files import check_file, replacing
-
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:

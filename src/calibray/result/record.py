@@ -65,6 +65,7 @@ class Result:
         enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
+        prepared: What was left out, averaged or moved before rows were links, and how many of them.
     """
 
     study: Study
@@ -93,6 +94,7 @@ class Result:
     enclosed: Enclosed | None = None
     scene: Scene | None = None
     files: dict[str, str] = field(default_factory=dict)
+    prepared: dict[str, int] = field(default_factory=dict)
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -176,6 +178,7 @@ class Result:
             "links": self.counts,
             "antennas_indoors": None if self.enclosed is None else self.enclosed.indoors,
             "files": self.files,
+            "prepared": self.prepared,
         }
 
     @classmethod
