@@ -9,6 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from calibray.cli.app import Commands
+from calibray.cli.app import app as calibray
 from calibray.cli.scene import scene
 from calibray.reporting import scenes as report
 from calibray.scenes import read_scene
@@ -109,3 +110,41 @@ def test_a_diagnosis_is_told(tmp_path):
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
     typed("osm", extract, "-o", tmp_path / "out")
     assert "Findings" not in render(*report.diagnosed(diagnose(tmp_path / "out" / "scene.xml")))
+
+
+def doctored(*words: object) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of `calibray doctor`."""
+    result = CliRunner().invoke(calibray, ["doctor", *map(str, words)])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_a_doctor_of_scenes_and_studies(tmp_path):
+    extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes", "height": "12"})])
+    assert CliRunner().invoke(calibray, ["scene", "osm", str(extract), "-o", str(tmp_path)]).exit_code == 0
+    status, out, _ = doctored(tmp_path / "scene.xml")
+    assert status == 0
+    assert "can be used" in out
+    assert "Objects" in out
+    (tmp_path / "links.csv").write_text("x,y,loss\n0,40,80\n30,30,90\n")
+    (tmp_path / "study.toml").write_text(
+        'version = 1\n[scene]\nfile = "scene.xml"\nfrequency = 4e9\n[links]\nfile = "links.csv"\n'
+        'tx = [40.0, 0.0, 10.0]\nrx = ["x", "y", 1.5]\nvalue = "loss"\n'
+        '[parameters]\n"walls.relative_permittivity" = { bounds = [1.5, 12.0] }\n'
+    )
+    picture = tmp_path / "antennas.png"
+    assert doctored(tmp_path / "study.toml", "--plot", picture)[0] == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    status, _, err = doctored(tmp_path / "study.toml", "--plot", tmp_path / "links.csv")
+    assert (status, "cannot draw a .csv file" in err) == (2, True)
+    assert doctored(tmp_path / "scene.xml", "--plot", picture)[0] == 2
+    assert doctored("--plot", picture)[0] == 2
+
+
+def test_a_scene_that_cannot_be_used_fails(tmp_path):
+    """The negative control: a mesh called like a material, which Sionna RT refuses."""
+    extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes", "height": "12"})])
+    CliRunner().invoke(calibray, ["scene", "osm", str(extract), "-o", str(tmp_path)])
+    file = tmp_path / "scene.xml"
+    file.write_text(file.read_text().replace("mesh-all-walls", "mesh-walls"))
+    status, out, _ = doctored(file)
+    assert (status, "cannot be used as it is" in out) == (1, True)

@@ -5,6 +5,7 @@ Usage, in an environment where Calibray is installed: `python tools/command_line
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import typer
@@ -22,12 +23,20 @@ bad input. This page is written by `python tools/command_line.py`.
 def page() -> str:
     """The page's text: every command with its arguments."""
     parts = [HEAD]
-    for name, command in sorted(typer.main.get_command(app).commands.items()):
+    for name, command in commands(typer.main.get_command(app)):
         summary = (command.help or "").strip().split("\n\n")[0].replace("\n", " ")
         rows = [row(parameter) for parameter in command.params if parameter.name != "help"]
         table = ["| argument | meaning |", "|---|---|", *rows, ""] if rows else []
         parts += [f"## `calibray {name}`", "", summary, "", *table]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def commands(group: object, before: str = "") -> Iterator[tuple[str, object]]:
+    """Every command by name, those of a group of commands after it."""
+    for name, command in sorted(group.commands.items()):
+        yield before + name, command
+        if hasattr(command, "commands"):
+            yield from commands(command, f"{before}{name} ")
 
 
 def row(parameter: object) -> str:

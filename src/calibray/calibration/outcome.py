@@ -100,6 +100,7 @@ def outcome(
         scene=setup.scene,
         files=setup.files,
         paths=_traced(problem),
+        prepared=links.prepared,
     )
 
 

@@ -20,6 +20,7 @@ from calibray.cli.ledger import ledger
 from calibray.cli.predict import predict
 from calibray.cli.report import report
 from calibray.cli.run import run
+from calibray.cli.scene import scene
 from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
 
@@ -78,3 +79,4 @@ def calibray(
 
 for command in (doctor, demo, run, report, compare, trace, predict, export, ledger):
     app.command()(command)
+app.add_typer(scene)

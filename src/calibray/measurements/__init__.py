@@ -1,15 +1,15 @@
 """Measured links: positions, path losses, weights and groups, read from tables and checked at the boundary.
 
-Positions are metres in the scene's frame. Positions on the globe will enter beside `reading`: what projects
-them needs a `SourceTable` and ends in the same `Measurements`.
+Positions are metres in the scene's frame once rows are links; `preparation` makes them so.
 """
 
 from calibray.measurements.links import FREQUENCIES, Measurements
+from calibray.measurements.preparation import Averaging, Coordinates, Preparation
 from calibray.measurements.reading import (
     LINK_COLUMNS,
-    Coordinates,
     Quantity,
     links_from_frame,
+    measured_links,
     read_links,
     read_measurements,
 )
@@ -17,10 +17,13 @@ from calibray.measurements.reading import (
 __all__ = [
     "FREQUENCIES",
     "LINK_COLUMNS",
+    "Averaging",
     "Coordinates",
     "Measurements",
+    "Preparation",
     "Quantity",
     "links_from_frame",
+    "measured_links",
     "read_links",
     "read_measurements",
 ]

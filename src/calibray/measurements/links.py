@@ -38,6 +38,7 @@ class Measurements:
         group: Labels [links] of the group each link belongs to, or None.
         frequency: Carrier of each link [links] [Hz], or None where all have the study's.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
+        prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
     Raises:
         InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a
@@ -58,6 +59,7 @@ class Measurements:
     group: NDArray[np.str_] | None = None
     frequency: NDArray[np.float64] | None = None
     table: SourceTable = field(default=None)  # type: ignore[assignment]
+    prepared: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = np.shape(self.path_loss_db)[:1][0] if np.ndim(self.path_loss_db) == 1 else -1
@@ -159,6 +161,7 @@ class Measurements:
             group=None if self.group is None else self.group[chosen],
             frequency=None if self.frequency is None else self.frequency[chosen],
             table=self.table.select(chosen),
+            prepared=self.prepared,
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -13,19 +12,20 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.links import Measurements
+from calibray.measurements.preparation import Coordinates, Preparation, positions, prepare
 from calibray.measurements.tables import SourceTable, read_table
-from calibray.spelling import did_you_mean, shortened
+from calibray.spelling import did_you_mean
 
-Quantity = Literal["path_loss", "path_gain", "received_power"]
-Coordinates = Sequence[float | str]
+Quantity = Literal["path_loss", "path_gain", "received_power", "rsrp"]
 
 PLAUSIBLE_PATH_LOSS_DB: Final = (20.0, 250.0)
 """The range [dB] outside which a path loss is taken for a mistake of sign, unit or column."""
 
+PLAUSIBLE_RSRP_DBM: Final = (-200.0, 30.0)
+"""The range [dBm] outside which a received power is taken for a mistake of sign, unit or column."""
+
 LINK_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 """The columns [m] of a table of links without measured values."""
-
-_DEGREES = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
 
 
 def read_measurements(
@@ -51,7 +51,8 @@ def read_measurements(
         tx: Transmitter position (x, y, z) [m] in the scene's frame, each a number or the name of a column.
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: What they are: "path_loss" [dB], "path_gain" [dB], or "received_power" [dBm].
+        quantity: What they are: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], whose
+            transmitted power is not known (see `measured_links`).
         where: Filter over the columns (see `filters`); rows that do not pass are left out before any check.
         group: Column of group labels.
         weight: Column of relative weights [1], greater than 0.
@@ -67,35 +68,91 @@ def read_measurements(
         InputError: The file or a column is missing or malformed, a value is missing, not a number, or
             implausible, a row is a copy, or no row passes.
     """
-    table = read_table(path)
-    if where is not None:
-        mask = table.where(where)
-        if not mask.any():
-            raise InputError(
-                f"{path}: where = {shortened(where)!r} lets none of {len(table)} rows pass; change the filter"
-            )
-        table = table.select(mask)
+    return measured_links(
+        read_table(path), tx, rx, value, quantity, Preparation(where=where), group, weight, std, tx_power_dbm, frequency
+    )  # fmt: skip
+
+
+def measured_links(
+    table: SourceTable,
+    tx: Coordinates,
+    rx: Coordinates,
+    value: str,
+    quantity: Quantity = "path_loss",
+    steps: Preparation | None = None,
+    group: str | Sequence[str] | None = None,
+    weight: str | None = None,
+    std: str | float | None = None,
+    tx_power_dbm: str | float | None = None,
+    frequency: str | None = None,
+) -> Measurements:
+    """Measured links from a table, prepared first.
+
+    Args:
+        table: The rows.
+        tx: Transmitter position, as `Preparation` says.
+        rx: Receiver position, likewise.
+        value: Column of the measured values.
+        quantity: What they are (see `read_measurements`); "rsrp" [dBm] is a received power whose transmitted power is
+            not known: its "path loss" is less the received power, and an offset must take what was transmitted.
+        steps: What is done to the rows before; nothing if None.
+        group: Column of group labels, or several whose labels are joined.
+        weight: Column of relative weights [1].
+        std: Standard deviation [dB] of the values.
+        tx_power_dbm: Transmitted power [dBm].
+        frequency: Column of carrier frequencies [Hz].
+
+    Returns:
+        The links, with the counts of what was left out, averaged or moved.
+
+    Raises:
+        InputError: What `read_measurements` and `prepare` refuse.
+    """
+    _check_quantity(table, quantity, tx_power_dbm)
+    made = prepare(
+        table, steps or Preparation(), tx, rx, value, "loss" if quantity == "path_loss" else "power"
+    )
+    table = made.table
     measurements = Measurements(
-        tx=_positions(table, "tx", tx),
-        rx=_positions(table, "rx", rx),
+        tx=positions(table, "tx", made.tx),
+        rx=positions(table, "rx", made.rx),
         path_loss_db=_path_loss_db(table, value, quantity, tx_power_dbm),
         weight=_weights(table, weight, std),
-        group=None if group is None else table.labels(group),
+        group=None if group is None else group_labels(table, group),
         frequency=None if frequency is None else table.numbers(frequency),
         table=table,
+        prepared=made.counts,
     )
     _refuse_copies(measurements)
     return measurements
 
 
+def group_labels(table: SourceTable, group: str | Sequence[str]) -> NDArray[np.str_]:
+    """The label of every row's group.
+
+    Args:
+        table: The rows.
+        group: Column of labels, or several whose labels are joined by a blank.
+
+    Returns:
+        The labels [rows].
+
+    Raises:
+        InputError: There is no such column, or a label is missing.
+    """
+    if isinstance(group, str):
+        return table.labels(group)
+    return np.array([" ".join(parts) for parts in zip(*map(table.labels, group), strict=True)], dtype=np.str_)
+
+
 def links_from_frame(
-    frame: pd.DataFrame, group: str | None = None, frequency: str | None = None
+    frame: pd.DataFrame, group: str | Sequence[str] | None = None, frequency: str | None = None
 ) -> Measurements:
     """Links without measured values, to predict at.
 
     Args:
-        frame: Table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
-        group: Column of group labels.
+        frame: SourceTable with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame.
+        group: Column of group labels, or several whose labels are joined.
         frequency: Column of carrier frequencies [Hz]; without that column all links have the study's carrier.
 
     Returns:
@@ -107,7 +164,9 @@ def links_from_frame(
     return _unmeasured(SourceTable(frame.reset_index(drop=True), source="links"), group, frequency)
 
 
-def read_links(path: str | Path, group: str | None = None, frequency: str | None = None) -> Measurements:
+def read_links(
+    path: str | Path, group: str | Sequence[str] | None = None, frequency: str | None = None
+) -> Measurements:
     """Links without measured values from a CSV or Parquet file with the columns of `links_from_frame`.
 
     Args:
@@ -124,56 +183,31 @@ def read_links(path: str | Path, group: str | None = None, frequency: str | None
     return _unmeasured(read_table(path), group, frequency)
 
 
-def _unmeasured(table: SourceTable, group: str | None, frequency: str | None) -> Measurements:
+def _unmeasured(table: SourceTable, group: str | Sequence[str] | None, frequency: str | None) -> Measurements:
     if len(table) == 0:
         raise InputError(f"{table.source}: holds no rows; give at least one link")
     return Measurements(
-        tx=_positions(table, "tx", LINK_COLUMNS[:3]),
-        rx=_positions(table, "rx", LINK_COLUMNS[3:]),
+        tx=positions(table, "tx", LINK_COLUMNS[:3]),
+        rx=positions(table, "rx", LINK_COLUMNS[3:]),
         path_loss_db=np.full(len(table), np.nan),
-        group=None if group is None else table.labels(group),
+        group=None if group is None else group_labels(table, group),
         frequency=table.numbers(frequency) if frequency is not None and frequency in table.frame else None,
         table=table,
     )
-
-
-def _positions(table: SourceTable, name: str, coordinates: Coordinates) -> NDArray[np.float64]:
-    """Positions [rows, 3] [m] from three numbers or columns."""
-    if isinstance(coordinates, str) or len(coordinates) != 3:
-        raise InputError(f"{name} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
-    columns = []
-    for coordinate in coordinates:
-        if isinstance(coordinate, str):
-            if _DEGREES & set(re.split(r"[^a-z]+", coordinate.lower())):
-                raise InputError(
-                    f"{table.source}: column {coordinate!r} of {name} looks like degrees on the globe; "
-                    "give metres in the scene's frame"
-                )
-            columns.append(table.numbers(coordinate))
-        elif isinstance(coordinate, bool) or not np.isfinite(coordinate):
-            raise InputError(
-                f"{name} = {coordinates!r}: {coordinate!r} must be a finite number [m] or a column"
-            )
-        else:
-            columns.append(np.full(len(table), float(coordinate)))
-    return np.stack(columns, axis=1)
 
 
 def _path_loss_db(
     table: SourceTable, value: str, quantity: str, tx_power_dbm: str | float | None
 ) -> NDArray[np.float64]:
     """Path losses [rows] [dB] from the measured column, refused where no radio link can have them."""
-    if quantity not in get_args(Quantity):
-        raise InputError(f"quantity = {quantity!r}: unknown, {did_you_mean(quantity, get_args(Quantity))}")
-    if (quantity == "received_power") != (tx_power_dbm is not None):
-        remedy = "needs tx_power_dbm [dBm]" if tx_power_dbm is None else "takes no tx_power_dbm; leave it out"
-        raise InputError(f"{table.source}: quantity = {quantity!r} {remedy}")
     measured = table.numbers(value)
     match quantity:
         case "path_loss":
             loss, remedy = measured, "say quantity = 'path_gain' or 'received_power' if it is one"
         case "path_gain":
             loss, remedy = -measured, "say quantity = 'path_loss' if it is one"
+        case "rsrp":
+            return _rsrp_loss_db(table, value, measured)
         case _:
             loss, remedy = (
                 _number_or_column(table, tx_power_dbm) - measured,
@@ -187,6 +221,30 @@ def _path_loss_db(
             f"be {lowest:g} to {highest:g} dB ({strange.sum()} of {len(table)} rows); {remedy}"
         )
     return loss
+
+
+def _check_quantity(table: SourceTable, quantity: str, tx_power_dbm: str | float | None) -> None:
+    if quantity not in get_args(Quantity):
+        raise InputError(f"quantity = {quantity!r}: unknown, {did_you_mean(quantity, get_args(Quantity))}")
+    if (quantity == "received_power") != (tx_power_dbm is not None):
+        remedy = (
+            "needs tx_power_dbm [dBm]; where it is not known, say quantity = 'rsrp' and give an [offset]"
+            if tx_power_dbm is None
+            else "takes no tx_power_dbm; leave it out"
+        )
+        raise InputError(f"{table.source}: quantity = {quantity!r} {remedy}")
+
+
+def _rsrp_loss_db(table: SourceTable, value: str, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Less the received power [dB]; the offset adds what was transmitted."""
+    lowest, highest = PLAUSIBLE_RSRP_DBM
+    if (strange := (measured < lowest) | (measured > highest)).any():
+        first = int(np.flatnonzero(strange)[0])
+        raise InputError(
+            f"{table.place(first, value)}: {measured[first]:g} dBm, must be {lowest:g} to {highest:g} dBm "
+            f"({strange.sum()} of {len(table)} rows); check the sign and the unit"
+        )
+    return -measured
 
 
 def _weights(table: SourceTable, weight: str | None, std: str | float | None) -> NDArray[np.float64] | None:

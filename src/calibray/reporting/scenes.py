@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibray.errors import InputError
+from calibray.files import check_file, replacing
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
@@ -109,3 +115,37 @@ def objects(found: SceneDiagnosis) -> Table:
         for item in found.objects
     )  # fmt: skip
     return Table("Objects", columns, tuple(rows))
+
+
+PICTURES: Final = (".png", ".svg", ".pdf")
+
+
+def save_positions(
+    file: Path,
+    source: str | Path,
+    tx: ArrayLike,
+    rx: ArrayLike,
+    inputs: Iterable[Path] = (),
+    overwrite: bool = False,
+) -> None:
+    """Draw antennas over a scene seen from above, into a file.
+
+    Args:
+        file: The picture, .png, .svg or .pdf.
+        source: Path of a Mitsuba XML file, or `sionna:NAME`.
+        tx: Transmitters [n, 3], [m].
+        rx: Receivers [m, 3], [m].
+        inputs: Files that are never replaced.
+        overwrite: Replace a file that Calibray did not write.
+
+    Raises:
+        InputError: The file has another ending, or must not be replaced; or the scene cannot be read.
+    """
+    from calibray.scenes.drawing import draw_positions
+
+    if file.suffix.lower() not in PICTURES:
+        raise InputError(f"{file}: cannot draw a {file.suffix or 'nameless'} file; use {', '.join(PICTURES)}")
+    check_file(file, inputs, overwrite)
+    figure = draw_positions(source, np.unique(tx, axis=0), rx)
+    with replacing(file) as partial:
+        figure.savefig(partial, format=file.suffix[1:].lower(), dpi=150)

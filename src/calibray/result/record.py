@@ -69,6 +69,7 @@ class Result:
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
         paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
+        prepared: What was left out, averaged or moved before rows were links, and how many of them.
     """
 
     study: Study
@@ -98,6 +99,7 @@ class Result:
     scene: Scene | None = None
     files: dict[str, str] = field(default_factory=dict)
     paths: Paths | None = None
+    prepared: dict[str, int] = field(default_factory=dict)
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -181,6 +183,7 @@ class Result:
             "links": self.counts,
             "antennas_indoors": None if self.enclosed is None else self.enclosed.indoors,
             "files": self.files,
+            "prepared": self.prepared,
         }
 
     @classmethod

@@ -69,6 +69,7 @@ class Stored(Section):
     links: Counts | None = None
     antennas_indoors: bool | None = None
     files: dict[str, Digest] = Field(default_factory=dict)
+    prepared: dict[str, Count] = Field(default_factory=dict)
 
 
 def read_stored(source: Path) -> tuple[Stored, Study]:

@@ -68,6 +68,7 @@ def links(result: Result) -> Table:
     censored = result.study.objective.no_path == "censor"
     verdict = f"counted as lost at {result.study.objective.ceiling_db:g} dB" if censored else "left out"
     rows = [
+        *((what, str(number), "") for what, number in result.prepared.items()),
         ("calibrated on", str(count["calibrated_on"]), ""),
         ("held out", str(count["held_out"]), ""),
         *suspects(count["rows_without_path"], f", {verdict}", result.enclosed),

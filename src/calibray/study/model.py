@@ -20,12 +20,14 @@ from calibray.engines.kinds import DEFAULT, KINDS, AnyEngine
 from calibray.errors import InputError
 from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
-from calibray.measurements import Measurements, read_measurements
+from calibray.measurements import Measurements, measured_links
+from calibray.measurements.tables import read_table
 from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
 from calibray.spelling import shortened
 from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
+from calibray.study.preparing import AS_THEY_ARE, preparation
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -104,6 +106,10 @@ class Study(Section):
     def _consistent(self) -> Self:
         if self.objective.combining == "band" and self.scene.bandwidth is None:
             raise InputError("objective.combining = 'band' needs scene.bandwidth [Hz]")
+        if self.links.quantity == "rsrp" and self.offset is None:
+            raise InputError(
+                "links.quantity = 'rsrp' needs [offset]: what was transmitted is not known, and the offset takes it"
+            )
         frequency = self.scene.frequency
         for name, material in self.materials.items():
             if material.itu is not None:
@@ -208,6 +214,12 @@ class Study(Section):
         return self._resolve("links.file", self.links.file)
 
     @property
+    def transmitters_path(self) -> Path | None:
+        """The table of transmitters, if there is one."""
+        file = self.links.transmitters
+        return None if file is None else self._resolve("links.transmitters", file)
+
+    @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
         """The transmit and the receive antenna, their files of gains resolved."""
         ends = ((end, getattr(self.antennas, end)) for end in ("tx", "rx"))
@@ -235,10 +247,14 @@ class Study(Section):
             All links of the study, those held out included.
 
         Raises:
-            InputError: What `read_measurements` refuses.
+            InputError: What `measured_links` refuses, or nothing tells where the scene lies on the globe.
         """
-        links = self.links.model_dump(exclude={"file"})
-        return read_measurements(self.links_path, group=self.offset.per if self.offset else None, **links)
+        return measured_links(
+            read_table(self.links_path),
+            steps=preparation(self),
+            group=self.offset.per if self.offset else None,
+            **self.links.model_dump(include=AS_THEY_ARE),
+        )
 
     def held_out(self, measurements: Measurements) -> NDArray[np.bool_]:
         """Which links are held out; none without ``[holdout]``.
@@ -346,7 +362,8 @@ class Study(Section):
         """The files that the study names, and its own; those of a bundled scene are left out."""
         antennas = [Path(each.gain_file) for each in self.antenna_pair if each.gain_file is not None]
         scene = [] if self.scene.file.startswith(BUNDLED) else [Path(self.scene_source)]
-        return (self._path, self.links_path, *scene, *antennas)
+        transmitters = [] if self.transmitters_path is None else [self.transmitters_path]
+        return (self._path, self.links_path, *transmitters, *scene, *antennas)
 
     def _resolve(self, key: str, file: str) -> Path:
         try:
@@ -355,10 +372,12 @@ class Study(Section):
             raise InputError(f"{self._path}: {key} = {file!r}: {error}") from None
 
     def _check_files(self) -> None:
-        files = [
+        files: list[tuple[str, str, str | Path | None]] = [
             ("scene.file", self.scene.file, self.scene_source),
             ("links.file", self.links.file, self.links_path),
         ]
+        if self.links.transmitters is not None:
+            files.append(("links.transmitters", self.links.transmitters, self.transmitters_path))
         for end, antenna in zip(("tx", "rx"), self.antenna_pair, strict=True):
             if antenna.gain_file is not None:
                 written = getattr(self.antennas, end).pattern

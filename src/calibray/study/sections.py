@@ -19,6 +19,8 @@ _Antenna = checked(Antenna, config=CLOSED, frozen=True)
 TraceSection = checked(TraceSettings, config=CLOSED, frozen=True)
 
 Coordinate = float | str
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
 
 
 class SceneSection(Section):
@@ -28,11 +30,15 @@ class SceneSection(Section):
         file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
         frequency: Carrier frequency [Hz].
         bandwidth: Bandwidth [Hz], for combining over the band.
+        origin: Longitude and latitude [deg] of the scene's origin, for positions on the globe.
+        crs: Projection of the scene's x and y, for instance "EPSG:32632"; local about the origin if absent.
     """
 
     file: Text
     frequency: float
     bandwidth: Annotated[float, Field(gt=0)] | None = None
+    origin: tuple[Longitude, Latitude] | None = None
+    crs: Text | None = None
 
     @field_validator("frequency")
     @classmethod
@@ -83,20 +89,50 @@ class MaterialSection(Section):
         return self
 
 
-class LinksSection(Section):
-    """``[links]``: the table of measured links, with the arguments of `read_measurements`.
+class AverageSection(Section):
+    """``[links.average]``: many samples about one place to one link, in linear power.
 
     Attributes:
-        file: CSV or Parquet file, relative to the study file's folder.
-        tx: Transmitter position (x, y, z) [m], each a number or a column.
+        by: "cell" of a square grid, stretch of "distance" along the rows' order, or window of "time".
+        size: Its width or length [m], or duration [s].
+        time: Column of times, for "time" only.
+    """
+
+    by: Literal["cell", "distance", "time"]
+    size: Annotated[float, Field(gt=0)]
+    time: Text | None = None
+
+    @model_validator(mode="after")
+    def _timed(self) -> Self:
+        if (self.by == "time") != (self.time is not None):
+            remedy = "needs time, the column of times" if self.by == "time" else "takes no time; leave it out"
+            raise InputError(f"links.average: by = {self.by!r} {remedy}")
+        return self
+
+
+class LinksSection(Section):
+    """``[links]``: the table of measured links, and how its rows become links.
+
+    Attributes:
+        file: CSV, Parquet or Excel file, relative to the study file's folder.
+        tx: Transmitter position (x, y, z) [m], each a number or a column; longitude, latitude [deg] and height [m]
+            where positions are "geographic".
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB] or "received_power" [dBm].
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power whose
+            transmitted power is not known.
+        position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
+        wide: Name of the transmitter by column, of a table with one column a transmitter.
+        transmitters: Table with a row for every transmitter, relative to the study file's folder.
+        transmitter: Column, of both tables, that says which transmitter it is.
+        noise_floor_dbm: Received powers at or below it, and missing ones, were not heard [dBm].
+        inside: What becomes of receivers on what buildings cover: "keep", "drop", or "move" to the nearest street.
+        average: How samples are averaged.
     """
 
     file: Text
@@ -104,11 +140,27 @@ class LinksSection(Section):
     rx: tuple[Coordinate, Coordinate, Coordinate]
     value: Text
     quantity: Quantity = "path_loss"
+    position: Literal["scene", "geographic"] = "scene"
     where: Text | None = None
     weight: Text | None = None
     std: Coordinate | None = None
     tx_power_dbm: Coordinate | None = None
     frequency: Text | None = None
+    wide: dict[str, Text] = Field(default_factory=dict)
+    transmitters: Text | None = None
+    transmitter: Text = "transmitter"
+    noise_floor_dbm: float | None = None
+    inside: Literal["keep", "drop", "move"] = "keep"
+    average: AverageSection | None = None
+
+    @model_validator(mode="after")
+    def _power_above_its_floor(self) -> Self:
+        if self.noise_floor_dbm is not None and self.quantity not in ("received_power", "rsrp"):
+            raise InputError(
+                f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: is a received "
+                "power; filter losses by links.where"
+            )
+        return self
 
 
 class AntennasSection(Section):
@@ -169,11 +221,11 @@ class OffsetSection(Section):
     """``[offset]``: a nuisance term, one offset [dB] for all links or one per group.
 
     Attributes:
-        per: Column of group labels; one offset for all links if absent.
+        per: Column of group labels, or several whose labels are joined; one offset for all links if absent.
         bounds: Lower and upper bound [dB]; unbounded if absent.
     """
 
-    per: Text | None = None
+    per: Text | tuple[Text, ...] | None = None
     bounds: tuple[float, float] | None = None
 
     @field_validator("bounds")

@@ -27,7 +27,9 @@ def summary(plan: Study) -> tuple[Table, ...]:
         ("combining", plan.objective.combining),
     ]
     if plan.offset is not None:
-        rows.append(("offset", f"per {plan.offset.per}" if plan.offset.per else "one for all links"))
+        per = plan.offset.per
+        names = per if isinstance(per, str) else " and ".join(per or ())
+        rows.append(("offset", f"per {names}" if names else "one for all links"))
     if plan.holdout is not None:
         rows.append(("held out", plan.holdout.where))
     rows.append(("method", f"{plan.method.name}, seed {plan.method.seed}"))
