@@ -11,7 +11,7 @@ import pytest
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements.preparation import Averaging, Preparation, prepare
-from calibray.measurements.tables import Table
+from calibray.measurements.tables import SourceTable
 from calibray.scenes.footprints import Footprints
 from calibray.scenes.making import make_scene
 from calibray.study import Study
@@ -127,7 +127,7 @@ def test_averages_stay_within_transmitter_and_group(folder):
 def test_samples_below_the_floor_bound_an_average_or_leave_it_out():
     """Of ten samples one is not heard: what it may add is between nothing and the floor."""
     strong, weak = [-80.0] * 9, [-118.0] * 5
-    table = Table(
+    table = SourceTable(
         pd.DataFrame(
             {"x": [0.0] * 10 + [50.0] * 10, "p": [*strong, np.nan, *weak, *[np.nan] * 5], "y": 0.0, "z": 1.5}
         )
@@ -146,7 +146,7 @@ def test_samples_below_the_floor_bound_an_average_or_leave_it_out():
 
 
 def test_a_wide_table_keeps_its_lines():
-    wide = Table(
+    wide = SourceTable(
         pd.DataFrame({"x": [1.0, 2.0], "y": 0.0, "ap1": [-40.0, -50.0], "ap2": [np.nan, -60.0]}),
         np.array([2, 3]),
         "rss.csv",
