@@ -12,7 +12,7 @@ CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 Text = Annotated[str, Field(min_length=1)]
 
 
-class Section(BaseModel):
+class Section(BaseModel, frozen=True):
     """A table of a file: closed, and never changed."""
 
-    model_config = ConfigDict(**CLOSED, frozen=True)
+    model_config = CLOSED

@@ -138,11 +138,11 @@ def _traced(problem: Problem) -> Paths | None:
 
 def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interval]:
     """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
-    if not problem.differentiable:
-        return {}
     parameters, objective = problem.parameters, problem.objective
     point = parameters.to_search(best)
     told = problem.evaluate(point[None], derivatives=True)
+    if told.jacobian is None:
+        return {}
     nuisances = int(objective.determined.sum())
     found = intervals(point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, nuisances)
     lower, upper = (

@@ -108,6 +108,6 @@ def landscape_arena(name: str) -> Arena:
     known = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)
     digest = hashlib.sha256(name.encode())
-    for part in (land.lower, land.upper, *evaluate(middle[None], True)[:3]):
+    for part in (land.lower, land.upper, *land.evaluate(middle[None])):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
     return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)

@@ -129,6 +129,17 @@ class GroupedProgram:
         return self.by_link.count
 
     @property
+    def phases(self) -> tuple[jax.Array, jax.Array]:
+        """Link [P] and delay [P], [s] of every path, in the order of the groups.
+
+        Raises:
+            InputError: The program was laid out without them.
+        """
+        if self.link is None or self.delay is None:
+            raise InputError("the program was laid out for sums of powers only; lay it out with phases=True")
+        return self.link, self.delay
+
+    @property
     def positions(self) -> list[int]:
         """How many coefficients stand at each position of each group, in order."""
         return _positions(self.groups)

@@ -68,7 +68,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
         The searches; one whose evaluation failed has infinite cost.
     """
     r, j = evaluated
-    failed = ~np.isfinite(r).all(axis=1)
+    failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
     links = r.shape[1]
     curvature = np.einsum("smi,smj->sij", j, j) / links
@@ -146,7 +146,8 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
         new, old = getattr(trial, name), getattr(starts, name)
         return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    return Starts(*(chosen(name) for name in ("unit", "cost", "gradient", "curvature")), damping, growth)
+    unit, cost, gradient, curvature = (chosen(name) for name in ("unit", "cost", "gradient", "curvature"))
+    return Starts(unit, cost, gradient, curvature, damping, growth)
 
 
 def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
@@ -162,7 +163,7 @@ def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
     unit = np.concatenate([settled.unit, starts.unit])
     rank = np.lexsort((np.arange(len(unit)), np.concatenate([settled.cost, starts.cost]))).argsort()
     near = cdist(starts.unit, unit) < MERGE_DISTANCE
-    return (near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1)
+    return np.asarray((near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1))
 
 
 def descend(

@@ -111,7 +111,7 @@ class Kriging:
 
     def _distance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         rates = np.exp(self.hyper[: self.points.shape[1]])
-        return cdist(x * rates, self.points * rates)
+        return np.asarray(cdist(x * rates, self.points * rates), dtype=np.float64)
 
 
 def fit(
@@ -239,10 +239,10 @@ def solve(points: NDArray[np.float64], residuals: NDArray[np.float64], hyper: ND
     trend = _trend(points)
     size = count + trend.shape[1]
     scaled = points * np.exp(hyper[:dimension])
-    kernel = matern(cdist(scaled, scaled)) + np.exp(hyper[-1]) * np.eye(count)
+    kernel = matern(np.asarray(cdist(scaled, scaled), dtype=np.float64)) + np.exp(hyper[-1]) * np.eye(count)
     bordered = np.zeros((size, size))
     bordered[:count, :count], bordered[:count, count:], bordered[count:, :count] = kernel, trend, trend.T
-    inverse = np.linalg.inv(bordered)
+    inverse = np.asarray(np.linalg.inv(bordered), dtype=np.float64)
     contrasts = _contrasts(trend)
     lower = np.linalg.cholesky(contrasts.T @ kernel @ contrasts)
     root = solve_triangular(lower, contrasts.T @ residuals, lower=True) / np.sqrt(len(lower))

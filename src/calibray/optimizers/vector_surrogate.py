@@ -28,7 +28,7 @@ evaluation enters the model with the residuals of the worst successful one.
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +133,8 @@ class VectorSurrogate(Optimizer):
         if self._model is None:
             return None
         y, predicted = (root_mean_square(r) for r in (self._model.residuals, self._model.left_out()))
-        return float(spearmanr(y, predicted).statistic)
+        correlation: Any = spearmanr(y, predicted)
+        return float(correlation.statistic)
 
     def _search(self, archive: Archive) -> Search:
         d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
@@ -145,14 +146,14 @@ class VectorSurrogate(Optimizer):
             count = min(self.batch, left)
             told = archive.all()
             unit, good = self._to_unit(told.x), np.isfinite(told.y)
-            points, residuals = merged(unit, archive.imputed(told).residuals)
+            points, residuals = merged(unit, archive.imputed(told).errors)
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
             if spanned < d or len(points) < d + 2 or good.sum() < 2:  # nothing to model yet
                 chosen = self._rng.random((count, d))
             else:
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(told.y, kind="stable")]
-                best = float(root_mean_square(archive.leading.residuals)[0])
+                best = float(root_mean_square(archive.leading.errors)[0])
                 chosen, gain = self._choose(self._model, best_first, best, turn, count)
                 quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
             yield self._from_unit(chosen)

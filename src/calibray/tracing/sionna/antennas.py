@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +25,9 @@ def patterns_of(antenna: Antenna) -> list:
         One function per port.
     """
     if antenna.gain_file is None:
-        return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
+        # Sionna does not say what it registers.
+        make: Any = antenna_pattern_registry.get(antenna.pattern)
+        return make(polarization=antenna.polarization).patterns
     pattern = tabulated(read_gain_table(antenna.gain_file))
     return PolarizedAntennaPattern(v_pattern=pattern, polarization=antenna.polarization).patterns
 

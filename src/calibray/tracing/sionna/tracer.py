@@ -40,7 +40,7 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
-from calibray.tracing.sionna.loading import load, scattering_pattern, shape_materials
+from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.stored import Trace
 
 LANES: Final = 20_000_000
@@ -237,7 +237,7 @@ class Tracer:
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(rise, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
         for _ in range(64):
-            hit = self._scene.mi_scene.ray_intersect(ray, mi.Bool(active))
+            hit = mitsuba_scene(self._scene).ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
             if not active.any():
                 break
@@ -254,7 +254,7 @@ class Tracer:
         while True:
             with share_of_rays(launch, settings.samples):
                 buffer = self._candidates(
-                    mi_scene=self._scene.mi_scene,
+                    mi_scene=mitsuba_scene(self._scene),
                     src_positions=src,
                     tgt_positions=tgt,
                     samples_per_src=launch.rays,
@@ -283,7 +283,7 @@ class Tracer:
         buffer.detach_geometry()
         if buffer.buffer_size:
             buffer = self._images(
-                scene=self._scene.mi_scene,
+                scene=mitsuba_scene(self._scene),
                 paths=buffer,
                 src_positions=src,
                 tgt_positions=tgt,
