@@ -12,7 +12,7 @@ CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 Text = Annotated[str, Field(min_length=1)]
 
 
-class Section(BaseModel, frozen=True):
+class Section(BaseModel):
     """A table of a file: closed, and never changed."""
 
-    model_config = CLOSED
+    model_config = CLOSED | ConfigDict(frozen=True)

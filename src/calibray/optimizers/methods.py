@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from inspect import signature
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,5 +108,5 @@ def make(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, known)}"
         )
     # The constructors differ in their settings, which were looked up above.
-    construct: Callable[..., Optimizer] = kind
+    construct = cast(Callable[..., Optimizer], kind)
     return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **given})

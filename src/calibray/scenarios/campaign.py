@@ -160,5 +160,5 @@ def _table(rows: dict[str, object]) -> str:
 def _powers(paths: Paths) -> NDArray[np.float64]:
     """Link, power gain [1], delay [s] and number of diffuse reflections of every path [4, P]."""
     owner = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
-    diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths)
+    diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths).astype(np.float64)
     return np.stack([paths.link.astype(np.float64), np.abs(path_gains(paths)) ** 2, paths.delay, diffuse])

@@ -45,8 +45,8 @@ def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 def _check(place: str, field: FieldInfo, value: Any) -> None:
     # Put together at run time, which no checker of types can follow.
-    annotation: Any = Annotated.__class_getitem__((field.annotation, Field(), *field.metadata))
-    checker = TypeAdapter[Any](annotation, config=CLOSED)
+    annotated: Any = Annotated
+    checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:
         checker.validate_json(json.dumps(value, default=str))
     except ValidationError as error:

@@ -94,7 +94,7 @@ def words(fault: Mapping[str, Any]) -> str:
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
-    return _WORDS.get(fault["type"], fault["msg"]).format(**context)
+    return str(_WORDS.get(fault["type"]) or fault["msg"]).format(**context)
 
 
 def dotted(path: Sequence[str | int]) -> str:

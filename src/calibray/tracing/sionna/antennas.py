@@ -1,5 +1,8 @@
 """Antenna patterns as functions for Sionna's own field stage."""
 
+# Mitsuba makes its types when its variant is chosen: its stubs know them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
-from typing import Final
+from typing import Any, Final
 
 import drjit as dr
 import mitsuba as mi
@@ -339,7 +339,9 @@ class Tracer:
                 found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
                 normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
             if self.settings.diffraction:
-                wedges, ends = buffer.diffracting_wedges, (gather(chunk.source, buffer.source_indices),
+                # Not typed by Sionna but for None, which stands where nothing diffracts.
+                wedges: Any = buffer.diffracting_wedges
+                ends = (gather(chunk.source, buffer.source_indices),
                                                            gather(chunk.target, buffer.target_indices))  # fmt: skip
                 after, before = self._fields._diffraction_compute_s_s_prime(buffer, *ends)
                 wedge = (
@@ -375,7 +377,7 @@ class Tracer:
         buffer = chunk.buffer
         valid = mi.Bool(buffer.valid)
         count = dr.width(chunk.target)
-        found = self._fields(
+        found: Any = self._fields(
             wavelength=self._scene.wavelength,
             paths=buffer,
             samples_per_src=self.settings.samples,
