@@ -59,7 +59,7 @@ def calibrate(
     plan, setup = (given.study, given) if isinstance(given, Setup) else (given, None)
     check_method(plan.method.name)
     if out is not None:
-        check_outputs(out, FILES, (setup.study if setup else study).files(), overwrite)
+        check_outputs(out, FILES, plan.files(), overwrite)
     started = time.perf_counter()
     looked_for = setup is not None
     setup = setup or Setup.open(plan, tracer)

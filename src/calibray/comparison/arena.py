@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,8 @@ def study_arena(path: str | Path) -> Arena:
             "paths: set engine.name to 'replay'"
         )
     setup = Setup.open(study.replace(engine="replay"))
-    engine = engines.make(setup)
+    # A replay gives derivatives.
+    engine = cast(engines.Differentiable, engines.make(setup))
     problem = Problem.of(setup, engine)
     objective, parameters, links = problem.objective, problem.parameters, setup.links
     lower, upper = parameters.search_bounds
