@@ -237,7 +237,7 @@ def material_table(paths: Paths, materials: Mapping[str, Material] | None = None
 
 
 class _Flat:
-    """Collects, position by position, which interactions the flat arrays hold; a diffraction twice, face after face."""
+    """Which interactions the flat arrays hold, collected position by position; a diffraction twice, face after face."""
 
     def __init__(self, paths: Paths) -> None:
         self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []

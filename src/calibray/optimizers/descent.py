@@ -18,8 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-INITIAL_DAMPING = 1e-3  # of the largest diagonal element of H
-MERGE_DISTANCE = 1e-3  # of the unit cube, below which two starts are taken to approach the same minimum
+INITIAL_DAMPING = 1e-3
+"""Of the largest diagonal element of H."""
+
+MERGE_DISTANCE = 1e-3
+"""Of the unit cube, below which two starts are taken to approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite has failed."""

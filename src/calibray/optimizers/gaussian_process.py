@@ -26,14 +26,17 @@ from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
-CANDIDATES = 300  # drawn over the box, and as many around the best points
-REFINEMENTS = (
-    0.1,
-    0.01,
-    0.001,
-)  # of the unit cube: how far around the most promising candidate more are drawn
-SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
-OFTEN = 40  # evaluations up to which the scales are learned anew every time; beyond, every tenth
+CANDIDATES = 300
+"""Drawn over the box, and as many around the best points."""
+
+REFINEMENTS = (0.1, 0.01, 0.001)
+"""Of the unit cube: how far around the most promising candidate more are drawn."""
+
+SEPARATION = 1e-4
+"""Of the unit cube, below which a point is taken for one already evaluated."""
+
+OFTEN = 40
+"""Evaluations up to which the scales are learned anew every time; beyond, every tenth."""
 
 
 @final

@@ -21,15 +21,18 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-NUGGET = 1e-8  # of the prior variance: keeps the matrix regular, below any engine's precision
-LENGTH = (
-    0.3  # of the unit cube: median of the prior of a length scale; its logarithm has standard deviation 1
-)
-LOG_RATE_BOUNDS = (-3.0, 5.0)  # length scales from 20 down to 0.007
-NOISE_PRIOR = (
-    np.log(1e-4),
-    3.0,
-)  # mean and standard deviation of the logarithm of the nugget where it is learned
+NUGGET = 1e-8
+"""Of the prior variance: keeps the matrix regular, below any engine's precision."""
+
+LENGTH = 0.3
+"""Of the unit cube: median of the prior of a length scale; its logarithm has standard deviation 1."""
+
+LOG_RATE_BOUNDS = (-3.0, 5.0)
+"""Length scales from 20 down to 0.007."""
+
+NOISE_PRIOR = (np.log(1e-4), 3.0)
+"""Mean and standard deviation of the logarithm of the nugget where it is learned."""
+
 NOISE_BOUNDS = (np.log(NUGGET), 0.0)
 
 

@@ -25,7 +25,8 @@ from calibray.optimizers.sampling import design
 from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
-CATCH_UP = 100.0  # predicted decreases that a search may lie behind the best one before it is given up
+CATCH_UP = 100.0
+"""Predicted decreases that a search may lie behind the best one before it is given up."""
 
 
 @final

@@ -46,14 +46,29 @@ from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
-CANDIDATES = 600  # drawn over the box, and as many around the best points
-DRAWS = 256  # of the residuals, for the expected improvement
-OFTEN = 80  # points up to which input scales are learned anew at every step
-REFIT = 1.1  # growth of the number of points after which they are beyond
-SEARCHES = 16  # local searches on the model
-SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
-UNCERTAIN = 1e-3  # of the prior variance: where a predicted minimum counts as another basin
-PATIENCE = 4  # batches in a row that promise too little before the search stops
+CANDIDATES = 600
+"""Drawn over the box, and as many around the best points."""
+
+DRAWS = 256
+"""Of the residuals, for the expected improvement."""
+
+OFTEN = 80
+"""Points up to which input scales are learned anew at every step."""
+
+REFIT = 1.1
+"""Growth of the number of points after which they are beyond."""
+
+SEARCHES = 16
+"""Local searches on the model."""
+
+SEPARATION = 1e-4
+"""Of the unit cube, below which a point is taken for one already evaluated."""
+
+UNCERTAIN = 1e-3
+"""Of the prior variance: where a predicted minimum counts as another basin."""
+
+PATIENCE = 4
+"""Batches in a row that promise too little before the search stops."""
 
 
 @final
