@@ -1,4 +1,4 @@
-"""Holds out one block of the map after another, calibrates on the rest, and prints how each is predicted.
+"""Hold out one block of the map after another, calibrate on the rest, and print how each is predicted.
 
 Usage: `python examples/cross_validation.py examples/nist_boulder.toml`
 

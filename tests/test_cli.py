@@ -20,7 +20,7 @@ HEAVY = ("numpy", "scipy", "pandas", "jax", "matplotlib", "pydantic", "h5py", "d
 
 
 def calibray(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs the installed command."""
+    """Run the installed command."""
     code = "import sys; sys.argv[0] = 'calibray'; from calibray.cli import main; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False

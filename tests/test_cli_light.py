@@ -20,7 +20,7 @@ from test_cli_run import write_study
 
 @pytest.fixture
 def calibray(tmp_path):
-    """Runs a command in a process of its own, for which a text file stands in for libLLVM."""
+    """Run a command in a process of its own, for which a text file stands in for libLLVM."""
     (tmp_path / "libLLVM.so.19.1").write_text("no library\n")
     environment = {
         **os.environ,

@@ -29,7 +29,7 @@ LOST_ROW = planted.INSIDE + 2  # the header is row 1
 
 
 def calibray(*arguments: object):
-    """Runs a command in this process."""
+    """Run a command in this process."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 

@@ -1,4 +1,4 @@
-"""Checks that what the documentation points to is there: linked files, headings, make targets, commands.
+"""Check that what the documentation points to is there: linked files, headings, make targets, commands.
 
 Usage: `python tools/check_docs.py`, which lists what is missing and then exits with 1.
 """
@@ -24,7 +24,7 @@ _COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([
 
 
 def missing_links(document: Path, text: str) -> Iterator[str]:
-    """Finds links to files or headings that do not exist.
+    """Find links to files or headings that do not exist.
 
     Args:
         document: The Markdown file.
@@ -56,7 +56,7 @@ def anchors(text: str) -> set[str]:
 
 
 def missing_commands(text: str, known: dict[str, set[str]]) -> Iterator[str]:
-    """Finds commands that do not exist, in blocks of code and in inline code.
+    """Find commands that do not exist, in blocks of code and in inline code.
 
     Args:
         text: The Markdown text.

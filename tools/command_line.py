@@ -1,4 +1,4 @@
-"""Writes docs/command-line.md from the commands themselves.
+"""Write docs/command-line.md from the commands themselves.
 
 Usage, in an environment where Calibray is installed: `python tools/command_line.py`
 """

@@ -1,4 +1,4 @@
-"""Writes requirements.lock: the installed versions of all packages that Calibray needs.
+"""Write requirements.lock: the installed versions of all packages that Calibray needs.
 
 Usage, in an environment where Calibray and its extras are installed and tested: `python tools/lock.py`
 """
@@ -15,7 +15,7 @@ LOCK = Path(__file__).resolve().parents[1] / "requirements.lock"
 
 
 def needed(package: str, extras: frozenset[str], found: dict[str, str]) -> dict[str, str]:
-    """Follows the requirements of a package.
+    """Follow the requirements of a package.
 
     Args:
         package: Name of an installed package.

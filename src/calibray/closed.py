@@ -15,4 +15,4 @@ Text = Annotated[str, Field(min_length=1)]
 class Section(BaseModel):
     """A table of a file: closed, and never changed."""
 
-    model_config = ConfigDict(**CLOSED, frozen=True)
+    model_config = CLOSED | ConfigDict(frozen=True)

@@ -55,14 +55,14 @@ def calibrate(
         InputError: Something in the study, the method or the folder cannot be used.
         EngineError: The engine failed.
     """
-    study = study.replace(method=method, seed=seed)
-    setup = study if isinstance(study, Setup) else None
-    check_method((setup.study if setup else study).method.name)
+    given = study.replace(method=method, seed=seed)
+    plan, setup = (given.study, given) if isinstance(given, Setup) else (given, None)
+    check_method(plan.method.name)
     if out is not None:
-        check_outputs(out, FILES, (setup.study if setup else study).files(), overwrite)
+        check_outputs(out, FILES, plan.files(), overwrite)
     started = time.perf_counter()
     looked_for = setup is not None
-    setup = setup or Setup.open(study, tracer)
+    setup = setup or Setup.open(plan, tracer)
     if engine is None:
         check_fit(setup)
         ledger = None if out is None else Path(out) / LEDGER_FILE

@@ -52,10 +52,11 @@ def outcome(
     offset_only, after = objective.model(np.stack([before, best]))
     rival = log_distance(links, objective.measured, objective.weight, study.scene.frequency)
 
-    def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float | None:
-        if not mask.any():
-            return None
+    def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
         return float(np.sqrt(np.average((model - objective.measured)[mask] ** 2, weights=links.weight[mask])))
+
+    def held_out_rmse(model: NDArray[np.float64]) -> float | None:
+        return rmse(model, judged) if judged.any() else None
 
     table = pd.DataFrame(
         {
@@ -83,11 +84,11 @@ def outcome(
         rmse_db=trail.best_rmse_db,
         initial_rmse_db=rmse(objective.capped(before), counted),
         offset_only_rmse_db=rmse(offset_only, counted) if fitted else None,
-        holdout_rmse_db=rmse(after, judged),
-        initial_holdout_rmse_db=rmse(objective.capped(before), judged),
-        offset_only_holdout_rmse_db=rmse(offset_only, judged) if fitted else None,
+        holdout_rmse_db=held_out_rmse(after),
+        initial_holdout_rmse_db=held_out_rmse(objective.capped(before)),
+        offset_only_holdout_rmse_db=held_out_rmse(offset_only) if fitted else None,
         log_distance_rmse_db=rmse(rival, counted),
-        log_distance_holdout_rmse_db=rmse(rival, judged),
+        log_distance_holdout_rmse_db=held_out_rmse(rival),
         retrace_gap_db=largest(gap, counted),
         rt_calls=trail.rt_calls,
         ledger_hits=trail.ledger_hits,
@@ -144,6 +145,8 @@ def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interva
     parameters, objective = problem.parameters, problem.objective
     point = parameters.to_search(best)
     told = problem.evaluate(point[None], derivatives=True)
+    if told.jacobian is None:
+        return {}
     nuisances = int(objective.determined.sum())
     found = intervals(point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, nuisances)
     lower, upper = (

@@ -102,9 +102,9 @@ class Problem:
         """
         parameters, objective = self.parameters, self.objective
         candidates = parameters.from_search(points)
-        jacobian = None
-        if derivatives:
-            modelled, slope = self.observable.derivatives(self.engine, candidates)
+        jacobian, with_slopes = None, self.observable.derivatives
+        if derivatives and with_slopes is not None and isinstance(self.engine, Differentiable):
+            modelled, slope = with_slopes(self.engine, candidates)
             jacobian = objective.jacobian(modelled, slope * parameters.search_slope(candidates)[:, None, :])
         else:
             modelled = self.observable.modelled(self.engine, candidates)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,8 @@ def study_arena(path: str | Path) -> Arena:
             "paths: set engine.name to 'replay'"
         )
     setup = Setup.open(study.replace(engine="replay"))
-    engine = engines.make(setup)
+    # A replay gives derivatives.
+    engine = cast(engines.Differentiable, engines.make(setup))
     problem = Problem.of(setup, engine)
     objective, parameters, links = problem.objective, problem.parameters, setup.links
     lower, upper = parameters.search_bounds
@@ -108,6 +110,6 @@ def landscape_arena(name: str) -> Arena:
     known = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)
     digest = hashlib.sha256(name.encode())
-    for part in (land.lower, land.upper, *evaluate(middle[None], True)[:3]):
+    for part in (land.lower, land.upper, *land.evaluate(middle[None])):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
     return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)

@@ -320,10 +320,11 @@ def compare(
     best = store.find(OPTIMUM, 0, 0)
     if best is None:
         best = store.add(_optimum(arena))
-    runs = {
-        contender.name: tuple(store.find(*_key(contender, seed)) for seed in range(seeds))
+    found = {
+        contender.name: (store.find(*_key(contender, seed)) for seed in range(seeds))
         for contender in contenders
     }
+    runs = {name: tuple(run for run in each if run is not None) for name, each in found.items()}
     return Comparison(arena.name, contenders, runs, *_lowest(arena.minimum, best, runs))
 
 

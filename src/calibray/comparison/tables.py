@@ -33,7 +33,8 @@ def table(comparison: Comparison) -> Table:
     Returns:
         One row per method; median excesses, and with the RT calls to an excess how many runs of all came there.
     """
-    rows = tuple(_cells(row) for row in comparison.table().to_dict("records"))
+    records = comparison.table().to_dict("records")
+    rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
     return Table("", COLUMNS, rows)
 
 

@@ -28,21 +28,44 @@ from calibray.paths import Paths, take
 from calibray.progress import Progress
 
 TOLERANCE_DB: Final = 0.01
-FEW: Final = 64  # paths of a link that are not worth compressing
-FITTED: Final = 0.1  # share of the tolerance that the fit itself may use up
-TRAINING: Final = (
-    16  # candidates per parameter, and as many more, beside the corners, on which the first fit rests
-)
-CORNERS: Final = 5  # parameters of which all corners are fitted to; further ones lie in the middle
-CHECKED: Final = 48  # fresh candidates of every check
-PASSED: Final = 0.5  # share of the tolerance that a check must stay within
-ROUNDS: Final = 6  # fits of a link before it keeps all its paths
-STRENGTH: Final = 16  # candidates by which the strongest paths are told
-POOL: Final = 2000  # strongest paths of a link that are candidates to be kept, and as many others
-BLOCK: Final = 400_000_000  # powers, paths times candidates, held at once
-FIRST_INTERVALS: Final = 4096  # of a table of coefficients
+"""Largest error of a link's path loss [dB] unless told otherwise."""
+
+FEW: Final = 64
+"""Paths of a link that are not worth compressing."""
+
+FITTED: Final = 0.1
+"""Share of the tolerance that the fit itself may use up."""
+
+TRAINING: Final = 16
+"""Candidates per parameter, and as many more, beside the corners, on which the first fit rests."""
+
+CORNERS: Final = 5
+"""Parameters of which all corners are fitted to; further ones lie in the middle."""
+
+CHECKED: Final = 48
+"""Fresh candidates of every check."""
+
+PASSED: Final = 0.5
+"""Share of the tolerance that a check must stay within."""
+
+ROUNDS: Final = 6
+"""Fits of a link before it keeps all its paths."""
+
+STRENGTH: Final = 16
+"""Candidates by which the strongest paths are told."""
+
+POOL: Final = 2000
+"""Strongest paths of a link that are candidates to be kept, and as many others."""
+
+BLOCK: Final = 400_000_000
+"""Powers, paths times candidates, held at once."""
+
+FIRST_INTERVALS: Final = 4096
 LAST_INTERVALS: Final = 65536
-TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
+"""Intervals of a table of coefficients, at first and at most."""
+
+TABLE_TOLERANCE: Final = 1e-4
+"""Largest error of a tabulated coefficient."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +109,18 @@ def compress(
     if not (np.isfinite(tolerance_db) and tolerance_db > 0):
         raise InputError(f"tolerance_db = {tolerance_db}: must be a positive number of dB")
     candidates = _candidates(parameters, seed)
-    intervals, coarse = FIRST_INTERVALS, np.inf
-    while coarse > TABLE_TOLERANCE and intervals <= LAST_INTERVALS:
-        totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
+    intervals = FIRST_INTERVALS
+    totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
+    while coarse > TABLE_TOLERANCE and intervals < LAST_INTERVALS:
         intervals *= 2
+        totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
     pool = _pool(paths, strength, seed)
     weight, error = np.ones(paths.num_paths), np.zeros(paths.num_links)
     links = np.unique(paths.link[pool])
     ends = np.searchsorted(paths.link[pool], np.arange(paths.num_links + 1))
     for block in _blocks(links, np.diff(ends), sum(len(some) for some in candidates)):
         start, stop = ends[block[0]], ends[block[-1] + 1]
-        powers = _Powers(take(paths, pool[start:stop]), parameters, candidates, intervals // 2)
+        powers = _Powers(take(paths, pool[start:stop]), parameters, candidates, intervals)
         for link in block:
             where = slice(ends[link] - start, ends[link + 1] - start)
             fitted = _fit_link(powers, where, [total[:, link] for total in totals], tolerance_db)
@@ -166,7 +190,9 @@ def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.
     return np.concatenate(pool) if pool else np.zeros(0, dtype=np.int64)
 
 
-def _blocks(links: NDArray[np.int64], size: NDArray[np.int64], candidates: int) -> list[NDArray[np.int64]]:
+def _blocks(
+    links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
+) -> list[NDArray[np.integer]]:
     """Links whose pools' powers fit into memory together."""
     block = np.cumsum(size[links]) * candidates // BLOCK
     return [some for some in np.split(links, np.flatnonzero(np.diff(block)) + 1) if len(some)]
@@ -214,7 +240,7 @@ def _fit_link(
 
 
 def sparse_weights(
-    share: NDArray[np.float64], bound: float, first: NDArray[np.float64] | None = None
+    share: NDArray[np.float64], bound: float, first: NDArray[np.int64] | None = None
 ) -> NDArray[np.float64]:
     """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
 
@@ -228,7 +254,8 @@ def sparse_weights(
     """
     size = np.linalg.norm(share, axis=0)
     unit = share / np.where(size > 0, size, 1.0)
-    chosen, one = np.zeros(0, dtype=int) if first is None else first, np.ones(len(share))
+    chosen: NDArray[np.int64] = np.zeros(0, dtype=np.int64) if first is None else first
+    one = np.ones(len(share))
     weight = np.zeros(len(chosen))
     for _ in range(share.shape[1]):
         if len(chosen):

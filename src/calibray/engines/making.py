@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from calibray.engines.fingerprint import fingerprint
 from calibray.engines.kinds import KINDS
 from calibray.engines.ledger import Ledger
-from calibray.engines.protocol import Engine
+from calibray.engines.protocol import Answering, Engine
 from calibray.engines.recorded import Recorded
 from calibray.errors import InputError
 from calibray.paths import Paths
@@ -61,4 +61,5 @@ def make(
     engine = section.open(setup, paths, progress, executor)
     if ledger is None or not section.dear:
         return engine
-    return Recorded(engine, Ledger(ledger), fingerprint(setup), name, progress)
+    # Kinds whose calls are dear answer one by one.
+    return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(setup), name, progress)

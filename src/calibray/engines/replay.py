@@ -12,16 +12,28 @@ from numpy.typing import NDArray
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
+from calibray.fields.tabulation import Lookup
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
-BLOCK_INTERACTIONS: Final = 2_000_000  # interactions x candidates evaluated at once, which bounds the memory
-TABULATED: Final = 50_000  # interactions beyond which coefficients come from tables
-FIRST_INTERVALS: Final = 2048  # of a table of coefficients
+BLOCK_INTERACTIONS: Final = 2_000_000
+"""Interactions times candidates evaluated at once, which bounds the memory."""
+
+TABULATED: Final = 50_000
+"""Interactions beyond which coefficients come from tables."""
+
+FIRST_INTERVALS: Final = 2048
 LAST_INTERVALS: Final = 65536
-NODE_COST: Final = 4  # interactions looked up in the time of evaluating a node, with its share of the check
-TABLE_TOLERANCE: Final = 1e-4  # largest error of a tabulated coefficient
-BLOCK_SIZES: Final = (1, 8, 30)  # candidates a call, each size compiled once; the paper has thirty wolves
+"""Intervals of a table of coefficients, at first and at most."""
+
+NODE_COST: Final = 4
+"""Interactions looked up in the time of evaluating a node, with its share of the check."""
+
+TABLE_TOLERANCE: Final = 1e-4
+"""Largest error of a tabulated coefficient."""
+
+BLOCK_SIZES: Final = (1, 8, 30)
+"""Candidates a call, each size compiled once; the paper has thirty wolves."""
 
 
 class Replay:
@@ -136,17 +148,17 @@ class Replay:
 
     def _refine(self) -> None:
         """Make the tables of coefficients finer, for these candidates and all that follow."""
-        self._intervals = 2 * self._intervals if self._intervals < LAST_INTERVALS else None
+        finer = 2 * (self._intervals or LAST_INTERVALS)
+        self._intervals = finer if finer <= LAST_INTERVALS else None
         self._program = self._laid_out()
 
     def _laid_out(self) -> fields.GroupedProgram:
         phases = self._combining != "power"
         program = fields.layout(self.paths, self._dtype, self._intervals, phases).program
-        if self._intervals is None or self._forced:
+        if self._forced or not isinstance(places := program.coefficients, Lookup):
             return program
-        if (
-            NODE_COST * program.coefficients.num_nodes > self.paths.num_interactions
-        ):  # filling tables would cost more
+        # Filling tables would cost more than evaluating every coefficient by itself.
+        if NODE_COST * places.num_nodes > self.paths.num_interactions:
             self._intervals = None
             return fields.layout(self.paths, self._dtype, None, phases).program
         return program

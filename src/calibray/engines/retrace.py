@@ -107,8 +107,8 @@ class Retrace:
         solution = tracer.solve(part.links, materials)
         gain, link, delay = solution.gain, solution.link, solution.delay
         offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
-        parts = tuple(jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
+        real, imaginary = (jnp.asarray(np.moveaxis(side, 0, -1)) for side in (gain.real, gain.imag))
         power = fields.link_power(
-            parts, link, delay, len(part.links), tracer.frequency, self._combining, offsets
+            (real, imaginary), link, delay, len(part.links), tracer.frequency, self._combining, offsets
         )
         return np.asarray(fields.decibel(power))

@@ -86,7 +86,8 @@ def statistics(
     Returns:
         The statistics.
     """
-    total = partial(jax.ops.segment_sum, segment_ids=program.link, num_segments=program.num_links)
+    link, delay = program.phases
+    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=program.num_links)
     whole = total(power)
     reached = whole > 0
     divisor = jnp.where(reached, whole, 1.0)
@@ -94,9 +95,9 @@ def statistics(
     def mean(value: jax.Array) -> jax.Array:
         return jnp.where(reached, total(power * value) / divisor, jnp.nan)
 
-    mean_delay = mean(program.delay)
-    late = program.delay - jnp.nan_to_num(mean_delay)[program.link]
-    strongest = jax.ops.segment_max(power, program.link, program.num_links)
+    mean_delay = mean(delay)
+    late = delay - jnp.nan_to_num(mean_delay)[link]
+    strongest = jax.ops.segment_max(power, link, program.num_links)
     rest = whole - strongest
     ratio = jnp.where(rest > 0, strongest / jnp.where(rest > 0, rest, 1.0), jnp.inf)
 
@@ -148,9 +149,10 @@ def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -
     Returns:
         Power gains [L, n].
     """
+    link, delay = program.phases
     bins = edges.shape[0] - 1
-    place = jnp.searchsorted(edges, program.delay, side="right") - 1
+    place = jnp.searchsorted(edges, delay, side="right") - 1
     inside = (place >= 0) & (place < bins)
-    target = jnp.where(inside, program.link * bins + place, 0)
+    target = jnp.where(inside, link * bins + place, 0)
     total = jax.ops.segment_sum(jnp.where(inside, power, 0.0), target, program.num_links * bins)
     return total.reshape(program.num_links, bins)

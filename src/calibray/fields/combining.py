@@ -14,6 +14,9 @@ from calibray.errors import InputError
 from calibray.fields import slab
 from calibray.paths import Paths
 
+Offsets = jax.Array | NDArray[np.float64] | None
+"""Frequencies relative to the carrier [Hz] and weights [2, q]; None where the sum is at the carrier alone."""
+
 COMBINING: Final = ("power", "coherent", "band")
 
 
@@ -31,12 +34,12 @@ def path_power(gain: slab.Pair) -> jax.Array:
 
 def link_power(
     gain: slab.Pair,
-    link: jax.Array,
-    delay: jax.Array,
+    link: jax.Array | NDArray[np.integer],
+    delay: jax.Array | NDArray[np.float64],
     num_links: int,
     frequency: jax.Array | float,
     combining: str = "power",
-    offsets: jax.Array | None = None,
+    offsets: Offsets = None,
 ) -> jax.Array:
     """Power gain of every link from its path gains.
 
@@ -59,12 +62,12 @@ def link_power(
     if combining == "power":
         return total(path_power(gain))
     ports = gain[0].shape[1]
-    nodes = jnp.array([[0.0], [1.0]]) if offsets is None else offsets
-    phase = -2 * jnp.pi * delay[:, None] * (frequency + nodes[0])  # [P, q]
+    nodes = jnp.array([[0.0], [1.0]]) if offsets is None else jnp.asarray(offsets)
+    phase = -2 * jnp.pi * jnp.asarray(delay)[:, None] * (frequency + nodes[0])  # [P, q]
     turn = jnp.cos(phase), jnp.sin(phase)
     rotated = slab.multiply((gain[0][..., None], gain[1][..., None]), turn)  # [R, T, P, q]
-    field = tuple(total(jnp.moveaxis(part, 2, 0)) for part in rotated)  # [L, R, T, q]
-    return (slab.power(field) * nodes[1]).sum(axis=(1, 2, 3)) / ports
+    real, imaginary = (total(jnp.moveaxis(part, 2, 0)) for part in rotated)  # [L, R, T, q]
+    return (slab.power((real, imaginary)) * nodes[1]).sum(axis=(1, 2, 3)) / ports
 
 
 def decibel(power: jax.Array) -> jax.Array:

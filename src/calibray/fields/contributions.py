@@ -121,13 +121,14 @@ def pieces(program: GroupedProgram, found: Contributions) -> tuple[Pieces, ...]:
 
 def _coefficients(program: GroupedProgram, found: Contributions) -> Iterator[tuple[slab.Pair, slab.Pair]]:
     """The coefficients of one position after the other."""
-    if isinstance(found.coefficients, tabulation.Nodes):
-        lookup = program.coefficients
-        for cell, fraction in zip(lookup.cell, lookup.fraction, strict=True):
+    source = program.coefficients
+    if isinstance(source, tabulation.Lookup) and isinstance(found.coefficients, tabulation.Nodes):
+        for cell, fraction in zip(source.cell, source.fraction, strict=True):
             yield tabulation.interpolate(found.coefficients, cell, fraction)
-    else:
+    elif not isinstance(found.coefficients, tabulation.Nodes):
+        (te_real, te_imag), (tm_real, tm_imag) = found.coefficients
         at = 0
         for size in program.positions:
             where = slice(at, at + size)
-            yield tuple((real[where], imaginary[where]) for real, imaginary in found.coefficients)
+            yield (te_real[where], te_imag[where]), (tm_real[where], tm_imag[where])
             at += size

@@ -8,7 +8,9 @@ every constant once and writes one number a path.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import partial, reduce
+from operator import add
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.fields import slab, tabulation
-from calibray.fields.combining import check_combining, decibel, link_power, path_power
+from calibray.fields.combining import Offsets, check_combining, decibel, link_power, path_power
 from calibray.fields.contributions import Contributions, Pieces, contributions, pieces, tangents
 from calibray.fields.program import Formula, GroupedProgram, layout, material_table
 from calibray.fields.propagation import path_fields
@@ -74,7 +76,7 @@ def path_loss(
 
 
 def program_path_loss(
-    program: GroupedProgram, table: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+    program: GroupedProgram, table: jax.Array, combining: str = "power", offsets: Offsets = None
 ) -> jax.Array:
     """Path loss of every link of a program, as one pure function.
 
@@ -105,7 +107,7 @@ def path_powers(program: GroupedProgram, table: jax.Array) -> jax.Array:
 
 
 def path_losses(
-    program: GroupedProgram, tables: jax.Array, combining: str = "power", offsets: jax.Array | None = None
+    program: GroupedProgram, tables: jax.Array, combining: str = "power", offsets: Offsets = None
 ) -> tuple[jax.Array, float]:
     """Path loss of every link for a batch of candidates.
 
@@ -137,7 +139,7 @@ def path_losses_and_slopes(
     tables: jax.Array,
     columns: tuple[int, ...],
     combining: str = "power",
-    offsets: jax.Array | None = None,
+    offsets: Offsets = None,
 ) -> tuple[jax.Array, jax.Array, float]:
     """Path loss of every link for a batch of candidates, and its derivatives by the materials' constants.
 
@@ -170,7 +172,7 @@ def _power(
     program: GroupedProgram,
     found: tuple[Pieces, ...],
     combining: str,
-    offsets: jax.Array | None,
+    offsets: Offsets,
     keep: bool = False,
 ) -> jax.Array:
     """Power gain of every link [L]; `keep` holds the field after every interaction, for a reverse pass."""
@@ -178,12 +180,13 @@ def _power(
     gain = path_fields(program, found, held if keep else lambda field: field)
     if combining == "power":
         return total(program.by_link, held(path_power(gain)))
+    link, delay = program.phases
     frequency = speed_of_light / program.wavelength
-    return link_power(gain, program.link, program.delay, program.num_links, frequency, combining, offsets)
+    return link_power(gain, link, delay, program.num_links, frequency, combining, offsets)
 
 
 def _slope(
-    program: GroupedProgram, found: tuple[Pieces, ...], combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: tuple[Pieces, ...], combining: str, offsets: Offsets
 ) -> tuple[jax.Array, tuple[Pieces, ...]]:
     """Power gain of every link, and its derivative by every piece.
 
@@ -223,8 +226,9 @@ def _contract(
     return -10 / np.log(10) * inverse[:, None, None] * by_material
 
 
-def _dot(a: Pieces, b: Pieces) -> jax.Array:
-    return sum(x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+def _dot(a: object, b: object) -> jax.Array:
+    """The sum of the products of two trees' numbers, entry by entry."""
+    return reduce(add, (x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)))
 
 
 _decibel = jax.jit(decibel)
@@ -245,26 +249,26 @@ _decibel_slope = jax.jit(_contract, static_argnums=4)
 
 @jax.jit
 def _table_error(program: GroupedProgram, found: Contributions) -> jax.Array:
-    return tabulation.table_error(found.coefficients, program.coefficients)
+    # Asked for only where coefficients lie in tables.
+    tables = cast(tabulation.Nodes, found.coefficients)
+    return tabulation.table_error(tables, cast(tabulation.Lookup, program.coefficients))
 
 
 @partial(jax.jit, static_argnums=2)
-def _link_power(
-    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
-) -> jax.Array:
+def _link_power(program: GroupedProgram, found: Contributions, combining: str, offsets: Offsets) -> jax.Array:
     return _power(program, pieces(program, found), combining, offsets)
 
 
 @partial(jax.jit, static_argnums=2)
 def _link_powers(
-    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: Contributions, combining: str, offsets: Offsets
 ) -> jax.Array:
     return jax.vmap(lambda one: _power(program, pieces(program, one), combining, offsets))(found)
 
 
 @partial(jax.jit, static_argnums=2)
 def _powers_and_slopes(
-    program: GroupedProgram, found: Contributions, combining: str, offsets: jax.Array | None
+    program: GroupedProgram, found: Contributions, combining: str, offsets: Offsets
 ) -> tuple[jax.Array, tuple[Pieces, ...]]:
     return jax.vmap(lambda one: _slope(program, pieces(program, one), combining, offsets))(found)
 
@@ -273,4 +277,6 @@ def _powers_and_slopes(
 def _decibel_slopes(
     program: GroupedProgram, power: jax.Array, slope: tuple[Pieces, ...], rates: tuple, num_materials: int
 ) -> jax.Array:
-    return jax.vmap(lambda *one: _contract(program, *one, num_materials))(power, slope, rates)
+    return jax.vmap(lambda *one: _contract(program, one[0], one[1], one[2], num_materials))(
+        power, slope, rates
+    )

@@ -129,6 +129,17 @@ class GroupedProgram:
         return self.by_link.count
 
     @property
+    def phases(self) -> tuple[jax.Array, jax.Array]:
+        """Link [P] and delay [P], [s] of every path, in the order of the groups.
+
+        Raises:
+            InputError: The program was laid out without them.
+        """
+        if self.link is None or self.delay is None:
+            raise InputError("the program was laid out for sums of powers only; lay it out with phases=True")
+        return self.link, self.delay
+
+    @property
     def positions(self) -> list[int]:
         """How many coefficients stand at each position of each group, in order."""
         return _positions(self.groups)
@@ -226,7 +237,7 @@ def material_table(paths: Paths, materials: Mapping[str, Material] | None = None
 
 
 class _Flat:
-    """Collects, position by position, which interactions the flat arrays hold; a diffraction twice, face after face."""
+    """Which interactions the flat arrays hold, collected position by position; a diffraction twice, face after face."""
 
     def __init__(self, paths: Paths) -> None:
         self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []

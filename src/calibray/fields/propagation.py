@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,17 @@ from calibray.fields import slab
 from calibray.fields.contributions import Pieces
 from calibray.fields.program import Group, GroupedProgram
 
-Fields = tuple[slab.Pair, slab.Pair]
+
+class Keep(Protocol):
+    """What makes of numbers the same numbers, held for a reverse pass or not."""
+
+    def __call__(self, values: slab.Values, /) -> slab.Values: ...  # noqa: D102
 
 
 def path_fields(
     program: GroupedProgram,
     pieces: tuple[Pieces, ...],
-    keep: Callable[[Fields], Fields] = lambda field: field,
+    keep: Keep = lambda values: values,
 ) -> slab.Pair:
     """Gains of all paths.
 
@@ -38,13 +42,14 @@ def path_fields(
     if not parts:
         empty = jnp.zeros((1, 1, 0), dtype=program.wavelength.dtype)
         return empty, empty
-    return tuple(jnp.concatenate(side, axis=-1) for side in zip(*parts, strict=True))
+    real, imaginary = (jnp.concatenate(side, axis=-1) for side in zip(*parts, strict=True))
+    return real, imaginary
 
 
-def _group_gains(group: Group, pieces: Pieces, keep: Callable[[Fields], Fields]) -> slab.Pair:
+def _group_gains(group: Group, pieces: Pieces, keep: Keep) -> slab.Pair:
     """Gains of one group's paths, (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, real and imaginary part [R, T, n]."""
     te, tm = (_complex(group.tx, component) for component in range(2))  # [T, n]
-    coefficients, diffuse = (iter(part) for part in pieces)
+    coefficients, diffuse = iter(pieces[0]), iter(pieces[1])
     for step, letter in enumerate(group.signature):
         te, tm = _turn(group.rotation[step], te, tm)
         c_te, c_tm = next(coefficients)
@@ -55,7 +60,7 @@ def _group_gains(group: Group, pieces: Pieces, keep: Callable[[Fields], Fields])
         else:
             te, tm = _diffract(te, tm, (c_te, c_tm, *next(coefficients)), group.wedge[step])
         te, tm = keep((te, tm))
-    real = imaginary = 0.0
+    real = imaginary = jnp.zeros((), dtype=te[0].dtype)
     for component, field in enumerate((te, tm)):  # E_rx^H E
         rx_real, rx_imaginary = (part[:, None] for part in _complex(group.rx, component))  # [R, 1, n]
         real = real + rx_real * field[0] + rx_imaginary * field[1]
@@ -85,7 +90,7 @@ def _scatter(
     straight: jax.Array,
     crossed: jax.Array,
     turn: jax.Array,
-    keep: Callable,
+    keep: Keep,
 ) -> tuple[slab.Pair, slab.Pair]:
     """Diffuse reflection: S Gamma sqrt(f_s dOmega) times the XPD rotation (Degli-Esposti et al. 2007)."""
     incident = slab.power(te) + slab.power(tm)

@@ -81,7 +81,8 @@ def coefficients(
             (eta_cosine[0] + root[0], eta_cosine[1] + root[1]),
         ),  # eq. 37b
     )
-    return tuple(_slab(single, phase, across, transmitted) for single in keep(half, wavelength))
+    te, tm = (_slab(single, phase, across, transmitted) for single in keep(half, wavelength))
+    return te, tm
 
 
 def safe_sqrt(value: jax.Array) -> jax.Array:
@@ -130,8 +131,8 @@ def _slab(half: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) 
     if transmitted is False:
         return _divide(reflected, denominator)
     through = multiply((1 - square[0], -square[1]), phase)  # eq. 43b
-    chosen = tuple(jnp.where(transmitted, t, r) for t, r in zip(through, reflected, strict=True))
-    return _divide(chosen, denominator)
+    real, imaginary = (jnp.where(transmitted, t, r) for t, r in zip(through, reflected, strict=True))
+    return _divide((real, imaginary), denominator)
 
 
 def _root(real: jax.Array, loss: jax.Array) -> Pair:

@@ -12,7 +12,7 @@ import operator
 import warnings
 from collections.abc import Callable, Mapping
 from math import inf, isfinite
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import pandas as pd
@@ -151,8 +151,10 @@ class _Interpreter:
 
     def _number(self, node: ast.expr) -> pd.Series | int | float:
         value = self.value(node)
-        dtype = value.dtype if isinstance(value, pd.Series) else np.min_scalar_type(value)
-        if pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype):
+        if isinstance(value, pd.Series):
+            if pd.api.types.is_numeric_dtype(value.dtype) and not pd.api.types.is_bool_dtype(value.dtype):
+                return value
+        elif isinstance(value, int | float) and not isinstance(value, bool):
             return value
         raise InputError(
             f"{self._piece(node)}: must be a number, or a column of numbers, to be calculated with"
@@ -200,13 +202,12 @@ class _Interpreter:
         return [self._literal(item, missing=True) for item in node.elts]
 
     def _literal(self, node: ast.expr, missing: bool = False) -> Any:
-        negative = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub)
-        constant = node.operand if negative else node
+        constant = node.operand if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) else node
         if missing and isinstance(constant, ast.Constant) and constant.value is None:
             return None
         if not isinstance(constant, ast.Constant):
             raise InputError(f"{self._piece(node)}: must be a number, a text, True or False")
-        return self._number(node) * 1 if negative else self._constant(constant)
+        return self._number(node) * 1 if constant is not node else self._constant(constant)
 
     def _arithmetic(self, node: ast.BinOp) -> _Value:
         if (operation := ARITHMETIC.get(type(node.op))) is None:
@@ -229,7 +230,8 @@ class _Interpreter:
             exact = np.asarray(
                 operation(_array(left), _array(right)) if len(result) else [0.0], dtype=np.float64
             )
-            bounds = np.iinfo(f"{result.dtype.kind}{result.dtype.itemsize}")
+            dtype: Any = result.dtype
+            bounds = np.iinfo(f"{dtype.kind}{dtype.itemsize}")
             large = bool(((exact >= float(bounds.max) + 1) | (exact < float(bounds.min))).any())
         if large:
             raise InputError(f"{self._piece(node)}: the result is too large a number; correct it")
@@ -262,7 +264,8 @@ class _Interpreter:
         match name:
             case "between":
                 inclusive = self._choice(given.get("inclusive"))
-                return column.between(self.value(given["left"]), self.value(given["right"]), inclusive)
+                left, right = (self.value(given[end]) for end in ("left", "right"))
+                return column.between(cast(Any, left), cast(Any, right), inclusive)
             case "isin":
                 return column.isin(self._literals(given["values"]))
             case "isna":

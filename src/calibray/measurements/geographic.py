@@ -179,7 +179,8 @@ def joined_by_time(
 
 def _seconds(times: pd.Series) -> NDArray[np.float64]:
     """Seconds since 1970; NaN where there is none."""
-    return ((times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)).to_numpy(dtype=float)
+    since = (times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+    return np.asarray(since.to_numpy(dtype=np.float64))
 
 
 def degree_columns(names: list[str]) -> tuple[str | None, str | None]:

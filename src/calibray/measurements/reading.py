@@ -247,12 +247,12 @@ def _rsrp_loss_db(table: SourceTable, value: str, measured: NDArray[np.float64])
     return -measured
 
 
-def _weights(table: SourceTable, weight: str | None, std: str | float | None) -> NDArray[np.float64] | None:
+def _weights(table: SourceTable, weight: str | None, std: str | float | None) -> NDArray[np.float64]:
     """Relative weights [rows], from weights or from standard deviations."""
     if weight is not None and std is not None:
         raise InputError(f"weight = {weight!r} and std = {std!r}: give one of them")
     if weight is None and std is None:
-        return None
+        return np.ones(len(table))
     name = std if weight is None else weight
     values = _number_or_column(table, name)
     if (wrong := values <= 0).any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +53,30 @@ class Evaluations:
     def __len__(self) -> int:
         return self.y.size
 
+    @property
+    def errors(self) -> NDArray[np.float64]:
+        """The residuals [n, m], where the algorithm uses them.
+
+        Raises:
+            InputError: None were told.
+        """
+        if self.residuals is None:
+            raise InputError(
+                "residuals = None; this optimizer uses them: call tell(x, y, residuals=..., ...)"
+            )
+        return self.residuals
+
+    @property
+    def slopes(self) -> NDArray[np.float64]:
+        """The derivatives of the residuals [n, m, d], where the algorithm uses them.
+
+        Raises:
+            InputError: None were told.
+        """
+        if self.jacobian is None:
+            raise InputError("jacobian = None; this optimizer uses them: call tell(x, y, jacobian=..., ...)")
+        return self.jacobian
+
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
         """Choose evaluations.
 
@@ -62,8 +86,10 @@ class Evaluations:
         Returns:
             The k evaluations, in that order.
         """
-        parts = (self.x, self.y, self.residuals, self.jacobian)
-        return Evaluations(*(None if part is None else part[rows] for part in parts))
+        residuals, jacobian = (
+            None if part is None else part[rows] for part in (self.residuals, self.jacobian)
+        )
+        return Evaluations(self.x[rows], self.y[rows], residuals, jacobian)
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
@@ -76,11 +102,16 @@ class Evaluations:
             All of them.
         """
 
-        def stack(name: str) -> NDArray[np.float64] | None:
-            arrays = [getattr(part, name) for part in parts]
-            return None if arrays[0] is None else np.concatenate(arrays)
+        def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
+            given = [array for array in arrays if array is not None]
+            return np.concatenate(given) if given else None
 
-        return Evaluations(*(stack(name) for name in ("x", "y", "residuals", "jacobian")))
+        return Evaluations(
+            np.concatenate([part.x for part in parts]),
+            np.concatenate([part.y for part in parts]),
+            stack(part.residuals for part in parts),
+            stack(part.jacobian for part in parts),
+        )
 
 
 class Archive:
@@ -173,7 +204,7 @@ class Archive:
         y = np.where(failed, 0.0 if worst is None else every.y[worst], told.y)
         residuals = told.residuals
         if residuals is not None:
-            fill = np.zeros(residuals.shape[1]) if worst is None else every.residuals[worst]
+            fill = np.zeros(residuals.shape[1]) if worst is None else every.errors[worst]
             residuals = np.where(failed[:, None], fill, residuals)
         return Evaluations(told.x, y, residuals)
 
@@ -253,7 +284,7 @@ def check_order(told: Evaluations, archive: Archive) -> None:
     if len(archive):
         told = Evaluations.joined([archive.leading, Evaluations(told.x, told.y, told.residuals)])
     told = told.rows(np.flatnonzero(np.isfinite(told.y)))
-    size = root_mean_square(told.residuals)
+    size = root_mean_square(told.errors)
     order = np.argsort(size, kind="stable")
     value, size = told.y[order], size[order]
     highest = np.maximum.accumulate(value)

@@ -20,7 +20,8 @@ from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
-STEP = 0.3  # of the unit cube, initial standard deviation
+STEP = 0.3
+"""Of the unit cube, initial standard deviation."""
 
 
 @final

@@ -18,8 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-INITIAL_DAMPING = 1e-3  # of the largest diagonal element of H
-MERGE_DISTANCE = 1e-3  # of the unit cube, below which two starts are taken to approach the same minimum
+INITIAL_DAMPING = 1e-3
+"""Of the largest diagonal element of H."""
+
+MERGE_DISTANCE = 1e-3
+"""Of the unit cube, below which two starts are taken to approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite has failed."""
@@ -68,7 +71,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
         The searches; one whose evaluation failed has infinite cost.
     """
     r, j = evaluated
-    failed = ~np.isfinite(r).all(axis=1)
+    failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
     links = r.shape[1]
     curvature = np.einsum("smi,smj->sij", j, j) / links
@@ -146,7 +149,8 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
         new, old = getattr(trial, name), getattr(starts, name)
         return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    return Starts(*(chosen(name) for name in ("unit", "cost", "gradient", "curvature")), damping, growth)
+    unit, cost, gradient, curvature = (chosen(name) for name in ("unit", "cost", "gradient", "curvature"))
+    return Starts(unit, cost, gradient, curvature, damping, growth)
 
 
 def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
@@ -162,7 +166,7 @@ def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
     unit = np.concatenate([settled.unit, starts.unit])
     rank = np.lexsort((np.arange(len(unit)), np.concatenate([settled.cost, starts.cost]))).argsort()
     near = cdist(starts.unit, unit) < MERGE_DISTANCE
-    return (near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1)
+    return np.asarray((near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1))
 
 
 def descend(

@@ -91,7 +91,7 @@ def _minimise(
     d = box.dimension
 
     def residuals(unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        return archive.imputed(evaluate(box.from_unit(unit[None]))).residuals[0]
+        return archive.imputed(evaluate(box.from_unit(unit[None]))).errors[0]
 
     start = box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
     while True:

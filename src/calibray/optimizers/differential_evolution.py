@@ -11,7 +11,7 @@ from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import Bounds, differential_evolution
+from scipy.optimize import differential_evolution
 
 from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
@@ -81,7 +81,7 @@ def _minimise(population: int, archive: Archive, rng: np.random.Generator, evalu
     while True:
         differential_evolution(
             objective,
-            Bounds(box.lower, box.upper),
+            list(zip(box.lower, box.upper, strict=True)),
             popsize=population,
             x0=start,
             tol=0.0,

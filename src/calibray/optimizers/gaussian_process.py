@@ -26,14 +26,17 @@ from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
-CANDIDATES = 300  # drawn over the box, and as many around the best points
-REFINEMENTS = (
-    0.1,
-    0.01,
-    0.001,
-)  # of the unit cube: how far around the most promising candidate more are drawn
-SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
-OFTEN = 40  # evaluations up to which the scales are learned anew every time; beyond, every tenth
+CANDIDATES = 300
+"""Drawn over the box, and as many around the best points."""
+
+REFINEMENTS = (0.1, 0.01, 0.001)
+"""Of the unit cube: how far around the most promising candidate more are drawn."""
+
+SEPARATION = 1e-4
+"""Of the unit cube, below which a point is taken for one already evaluated."""
+
+OFTEN = 40
+"""Evaluations up to which the scales are learned anew every time; beyond, every tenth."""
 
 
 @final
@@ -86,7 +89,8 @@ class GaussianProcess(Optimizer):
         return self._budget
 
     def _search(self, archive: Archive) -> Search:
-        d, left, hyper = self.box.dimension, self._budget, None
+        d, left = self.box.dimension, self._budget
+        hyper: NDArray[np.float64] | None = None
         missing = min(left, max(self.initial - len(archive), 0))
         if missing:
             yield self.box.from_unit(maximin_design(missing, d, self._rng))
@@ -99,8 +103,10 @@ class GaussianProcess(Optimizer):
             if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # nothing to model yet
                 x = self._rng.random(d)
             else:
-                learn = hyper is None or len(points) <= OFTEN or turn % 10 == 0
-                model = fit(points, values, guess=hyper) if learn else solve(points, values, hyper)
+                if hyper is None or len(points) <= OFTEN or turn % 10 == 0:
+                    model = fit(points, values, guess=hyper)
+                else:
+                    model = solve(points, values, hyper)
                 hyper = model.hyper
                 x = self._promising(model, unit[np.argsort(told.y, kind="stable")])
             yield self.box.from_unit(x[None])

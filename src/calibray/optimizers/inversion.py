@@ -26,7 +26,7 @@ Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 
 
 class _AbandonedError(BaseException):
-    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library swallows it."""
+    """What ends a minimiser whose search was dropped; not an `Exception`, so that no library swallows it."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:

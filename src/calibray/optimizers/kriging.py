@@ -21,15 +21,18 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-NUGGET = 1e-8  # of the prior variance: keeps the matrix regular, below any engine's precision
-LENGTH = (
-    0.3  # of the unit cube: median of the prior of a length scale; its logarithm has standard deviation 1
-)
-LOG_RATE_BOUNDS = (-3.0, 5.0)  # length scales from 20 down to 0.007
-NOISE_PRIOR = (
-    np.log(1e-4),
-    3.0,
-)  # mean and standard deviation of the logarithm of the nugget where it is learned
+NUGGET = 1e-8
+"""Of the prior variance: keeps the matrix regular, below any engine's precision."""
+
+LENGTH = 0.3
+"""Of the unit cube: median of the prior of a length scale; its logarithm has standard deviation 1."""
+
+LOG_RATE_BOUNDS = (-3.0, 5.0)
+"""Length scales from 20 down to 0.007."""
+
+NOISE_PRIOR = (np.log(1e-4), 3.0)
+"""Mean and standard deviation of the logarithm of the nugget where it is learned."""
+
 NOISE_BOUNDS = (np.log(NUGGET), 0.0)
 
 
@@ -111,7 +114,7 @@ class Kriging:
 
     def _distance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         rates = np.exp(self.hyper[: self.points.shape[1]])
-        return cdist(x * rates, self.points * rates)
+        return np.asarray(cdist(x * rates, self.points * rates), dtype=np.float64)
 
 
 def fit(
@@ -239,10 +242,10 @@ def solve(points: NDArray[np.float64], residuals: NDArray[np.float64], hyper: ND
     trend = _trend(points)
     size = count + trend.shape[1]
     scaled = points * np.exp(hyper[:dimension])
-    kernel = matern(cdist(scaled, scaled)) + np.exp(hyper[-1]) * np.eye(count)
+    kernel = matern(np.asarray(cdist(scaled, scaled), dtype=np.float64)) + np.exp(hyper[-1]) * np.eye(count)
     bordered = np.zeros((size, size))
     bordered[:count, :count], bordered[:count, count:], bordered[count:, :count] = kernel, trend, trend.T
-    inverse = np.linalg.inv(bordered)
+    inverse = np.asarray(np.linalg.inv(bordered), dtype=np.float64)
     contrasts = _contrasts(trend)
     lower = np.linalg.cholesky(contrasts.T @ kernel @ contrasts)
     root = solve_triangular(lower, contrasts.T @ residuals, lower=True) / np.sqrt(len(lower))

@@ -129,7 +129,7 @@ class District:
         half_space = (weight * self.cosine - root) / (weight * self.cosine + root)
         q = 2.0 * np.pi * self.thickness[self.material] / WAVELENGTH * root
         decay = np.exp(-2j * q)
-        return half_space * (1.0 - decay) / (1.0 - half_space**2 * decay)
+        return np.asarray(half_space * (1.0 - decay) / (1.0 - half_space**2 * decay), dtype=np.complex128)
 
 
 @cache

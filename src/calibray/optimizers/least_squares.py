@@ -25,7 +25,8 @@ from calibray.optimizers.sampling import design
 from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
-CATCH_UP = 100.0  # predicted decreases that a search may lie behind the best one before it is given up
+CATCH_UP = 100.0
+"""Predicted decreases that a search may lie behind the best one before it is given up."""
 
 
 @final
@@ -99,12 +100,14 @@ class LeastSquares(Optimizer):
             while True:
                 told = yield box.from_unit(unit)
                 failed = ~np.isfinite(told.y)[:, None]
-                residuals = np.where(failed, np.inf, told.residuals)
-                unit = descent.send((residuals, told.jacobian * box.width))
+                residuals = np.where(failed, np.inf, told.errors)
+                unit = descent.send((residuals, told.slopes * box.width))
 
 
 def _user_starts(x0: ArrayLike | None, box: Box) -> NDArray[np.float64]:
-    points = np.atleast_2d(np.array(x0 if x0 is not None else np.empty((0, box.dimension)), dtype=float))
+    if x0 is None:
+        return np.empty((0, box.dimension))
+    points = np.atleast_2d(np.array(x0, dtype=float))
     if points.ndim != 2 or points.shape[1] != box.dimension:
         d = box.dimension
         raise InputError(f"x0 has shape {np.shape(x0)}; it must be [{d}] or [k, {d}]: reshape it")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from inspect import signature
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,4 +107,6 @@ def make(
         raise InputError(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, known)}"
         )
-    return kind(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **given})
+    # The constructors differ in their settings, which were looked up above.
+    construct = cast(Callable[..., Optimizer], kind)
+    return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **given})

@@ -11,10 +11,10 @@ process took is handed out again, for that process may be gone; else the next tr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from threading import Lock
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, cast, final
 
 import numpy as np
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
     from optuna.study import Study
     from optuna.trial import FrozenTrial, TrialState
+
+    Numeric = FloatDistribution | IntDistribution
 else:
     optuna = library("optuna", "Optuna")
     BaseSampler = optuna.samplers.BaseSampler
@@ -35,7 +37,8 @@ else:
     IntDistribution = optuna.distributions.IntDistribution
     TrialState = optuna.trial.TrialState
 
-CANDIDATE = "sgwo-im:candidate"  # system attribute of a trial: its candidate in the coordinates of the search
+CANDIDATE = "sgwo-im:candidate"
+"""System attribute of a trial: its candidate in the coordinates of the search."""
 
 
 @final
@@ -130,7 +133,7 @@ class SGWOIMSampler(BaseSampler):
             self._given.add(trial.number)
             study._storage.set_trial_system_attr(trial._trial_id, CANDIDATE, free)
         values = zip(search_space.items(), free, strict=True)
-        return {name: _value(distribution, x) for (name, distribution), x in values}
+        return {name: _value(cast("Numeric", distribution), x) for (name, distribution), x in values}
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
@@ -149,7 +152,7 @@ class SGWOIMSampler(BaseSampler):
         return self._random.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
-        self, study: Study, trial: FrozenTrial, state: TrialState, values: list[float] | None
+        self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
         """Take a trial's answer, and stop the study when the pack has hunted to the end.
 
@@ -162,7 +165,7 @@ class SGWOIMSampler(BaseSampler):
         with self._lock:
             if self._optimizer is None:
                 return
-            self._take(study, trial, state, values)
+            self._take(self._optimizer, study, trial, state, values)
             if self._optimizer.done:
                 with suppress(RuntimeError):  # nothing to stop where trials are asked for one by one
                     study.stop()
@@ -170,16 +173,22 @@ class SGWOIMSampler(BaseSampler):
     def _synchronized(self, study: Study, space: Mapping[str, BaseDistribution]) -> SGWOIM:
         """The optimizer, told every finished trial of the study in order."""
         if self._optimizer is None or self._space != space:
-            bounds = np.array([_bounds(distribution) for distribution in space.values()])
+            bounds = np.array([_bounds(cast("Numeric", distribution)) for distribution in space.values()])
             self._optimizer, self._space, self._told = SGWOIM(*bounds.T, **self._settings), dict(space), set()
         for trial in study.get_trials(deepcopy=False):
             if trial.state.is_finished():
-                self._take(study, trial, trial.state, trial.values)
+                self._take(self._optimizer, study, trial, trial.state, trial.values)
         return self._optimizer
 
-    def _take(self, study: Study, trial: FrozenTrial, state: TrialState, values: list[float] | None) -> None:
+    def _take(
+        self,
+        optimizer: SGWOIM,
+        study: Study,
+        trial: FrozenTrial,
+        state: TrialState,
+        values: Sequence[float] | None,
+    ) -> None:
         """Tell a finished trial, once."""
-        optimizer = self._optimizer
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)
@@ -194,10 +203,13 @@ class SGWOIMSampler(BaseSampler):
         """Where a trial lies that the pack did not propose; empty if it lacks a parameter."""
         if not self._space.keys() <= trial.params.keys():
             return []
-        return [_coordinate(distribution, trial.params[name]) for name, distribution in self._space.items()]
+        return [
+            _coordinate(cast("Numeric", distribution), trial.params[name])
+            for name, distribution in self._space.items()
+        ]
 
 
-def _bounds(distribution: FloatDistribution | IntDistribution) -> tuple[float, float]:
+def _bounds(distribution: Numeric) -> tuple[float, float]:
     """Bounds of the search coordinate; an integer has an interval of its own width to either side."""
     margin = 0.5 if isinstance(distribution, IntDistribution) else 0.0
     return _coordinate(distribution, distribution.low - margin), _coordinate(
@@ -205,11 +217,11 @@ def _bounds(distribution: FloatDistribution | IntDistribution) -> tuple[float, f
     )
 
 
-def _coordinate(distribution: FloatDistribution | IntDistribution, value: float) -> float:
+def _coordinate(distribution: Numeric, value: float) -> float:
     return float(np.log(value)) if distribution.log else float(value)
 
 
-def _value(distribution: FloatDistribution | IntDistribution, coordinate: float) -> float | int:
+def _value(distribution: Numeric, coordinate: float) -> float | int:
     value = float(np.exp(coordinate)) if distribution.log else coordinate
     if distribution.step is not None:
         value = distribution.low + round((value - distribution.low) / distribution.step) * distribution.step

@@ -15,7 +15,7 @@ from calibray.optimizers.session import Session
 
 
 class Optimizer(ABC):
-    """Minimises a value over a box; the caller owns the loop.
+    """What minimises a value over a box; the caller owns the loop.
 
     `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is the whole of it. A final class states
     its settings in its constructor, hands its algorithm to a `Session`, declares the attributes below, and overrides

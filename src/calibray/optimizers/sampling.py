@@ -65,7 +65,7 @@ def _smallest_distance(points: NDArray[np.float64]) -> float:
 
 
 class Sampling(Optimizer):
-    """Evaluates a design and learns nothing; abstract in the kind of design.
+    """A search that evaluates a design and learns nothing; abstract in the kind of design.
 
     Args:
         lower: Lower bounds [d].

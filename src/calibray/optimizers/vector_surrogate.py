@@ -28,7 +28,7 @@ evaluation enters the model with the residuals of the worst successful one.
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,14 +46,29 @@ from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
 
-CANDIDATES = 600  # drawn over the box, and as many around the best points
-DRAWS = 256  # of the residuals, for the expected improvement
-OFTEN = 80  # points up to which input scales are learned anew at every step
-REFIT = 1.1  # growth of the number of points after which they are beyond
-SEARCHES = 16  # local searches on the model
-SEPARATION = 1e-4  # of the unit cube, below which a point is taken for one already evaluated
-UNCERTAIN = 1e-3  # of the prior variance: where a predicted minimum counts as another basin
-PATIENCE = 4  # batches in a row that promise too little before the search stops
+CANDIDATES = 600
+"""Drawn over the box, and as many around the best points."""
+
+DRAWS = 256
+"""Of the residuals, for the expected improvement."""
+
+OFTEN = 80
+"""Points up to which input scales are learned anew at every step."""
+
+REFIT = 1.1
+"""Growth of the number of points after which they are beyond."""
+
+SEARCHES = 16
+"""Local searches on the model."""
+
+SEPARATION = 1e-4
+"""Of the unit cube, below which a point is taken for one already evaluated."""
+
+UNCERTAIN = 1e-3
+"""Of the prior variance: where a predicted minimum counts as another basin."""
+
+PATIENCE = 4
+"""Batches in a row that promise too little before the search stops."""
 
 
 @final
@@ -133,7 +148,8 @@ class VectorSurrogate(Optimizer):
         if self._model is None:
             return None
         y, predicted = (root_mean_square(r) for r in (self._model.residuals, self._model.left_out()))
-        return float(spearmanr(y, predicted).statistic)
+        correlation: Any = spearmanr(y, predicted)
+        return float(correlation.statistic)
 
     def _search(self, archive: Archive) -> Search:
         d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
@@ -145,14 +161,14 @@ class VectorSurrogate(Optimizer):
             count = min(self.batch, left)
             told = archive.all()
             unit, good = self._to_unit(told.x), np.isfinite(told.y)
-            points, residuals = merged(unit, archive.imputed(told).residuals)
+            points, residuals = merged(unit, archive.imputed(told).errors)
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
             if spanned < d or len(points) < d + 2 or good.sum() < 2:  # nothing to model yet
                 chosen = self._rng.random((count, d))
             else:
                 self._model = self._fitted(points, residuals)
                 best_first = unit[np.argsort(told.y, kind="stable")]
-                best = float(root_mean_square(archive.leading.residuals)[0])
+                best = float(root_mean_square(archive.leading.errors)[0])
                 chosen, gain = self._choose(self._model, best_first, best, turn, count)
                 quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
             yield self._from_unit(chosen)

@@ -124,7 +124,7 @@ class Parameters:
         """
         given = self._components(candidates)
         values, slopes = given.copy(), np.ones_like(given)
-        for scale, exponent, fixed in self._laws():
+        for _, scale, exponent, fixed in self._laws():
             found = power(
                 np.asarray(fixed[0]) if scale is None else given[..., scale],
                 np.asarray(fixed[1]) if exponent is None else given[..., exponent],
@@ -174,8 +174,7 @@ class Parameters:
         """
         values = self._components(candidate)
         found: dict[str, dict[str, float]] = {}
-        for scale, exponent, fixed in self._laws():
-            parameter = self.items[exponent if scale is None else scale]
+        for parameter, scale, exponent, fixed in self._laws():
             for name, place, value in zip(LAWS[parameter.constant], (scale, exponent), fixed, strict=True):
                 found.setdefault(parameter.material, {})[name] = float(
                     value if place is None else values[place]
@@ -191,16 +190,19 @@ class Parameters:
         Raises:
             InputError: A law lies outside its constant's bound; the message names the carrier.
         """
-        for scale, exponent, fixed in self._laws():
-            parameter = self.items[exponent if scale is None else scale]
+        for parameter, scale, exponent, fixed in self._laws():
             bounds = [
                 (fixed[k],) if place is None else (self.items[place].lower, self.items[place].upper)
                 for k, place in enumerate((scale, exponent))
             ]
-            check_law(parameter.material, parameter.constant, *bounds, frequencies)
+            check_law(parameter.material, parameter.constant, bounds[0], bounds[1], frequencies)
 
-    def _laws(self) -> Iterator[tuple[int | None, int | None, tuple[float, float]]]:
-        """Places of the coefficient and the exponent of every law, None where fixed, and what they are fixed at."""
+    def _laws(self) -> Iterator[tuple[Parameter, int | None, int | None, tuple[float, float]]]:
+        """Every law, by its first parameter.
+
+        Yields:
+            The parameter, the places of the coefficient and the exponent, None where fixed, and what they are fixed at.
+        """
         done, order = set(), {name: place for place, name in enumerate(self.names)}
         for parameter in self.items:
             constant = parameter.constant
@@ -208,9 +210,10 @@ class Parameters:
                 continue
             done.add((parameter.material, constant))
             names = LAWS[constant]
-            places = [order.get(f"{parameter.material}.{name}") for name in names]
+            scale, exponent = (order.get(f"{parameter.material}.{name}") for name in names)
             law = self.laws.get(parameter.material, _NO_LAW)
-            yield *places, tuple(getattr(law, name[-1]) for name in names)
+            fixed_scale, fixed_exponent = (getattr(law, name[-1]) for name in names)
+            yield parameter, scale, exponent, (fixed_scale, fixed_exponent)
 
     def materials(
         self, candidate: ArrayLike, base: Mapping[str, Material], frequency: float | None = None

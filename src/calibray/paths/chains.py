@@ -10,6 +10,7 @@ place of the traced one after a reflection) are followed, so that path gains agr
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,7 @@ def compile_chains(chains: Chains) -> Geometry:
     out_of = np.tile([1.0, 0.0], (count, 1))
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
-    tables: dict[int, list[tuple[NDArray[np.float64], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
+    tables: dict[int, list[tuple[NDArray[Any], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
     # Length already travelled when the present ray tube began.
     tube_start = np.zeros(count)
@@ -151,8 +152,8 @@ def compile_chains(chains: Chains) -> Geometry:
             spread[some] = 1 / np.sqrt(before * after * (before + after))
             constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[some], edge, before, after)
             tables[Kind.DIFFRACTION].append((some, np.full(len(some), step), *constants))
-            entering[wedge] = _unit(np.cross(k_in, edge))
-            exiting[wedge], onward[wedge] = -_unit(np.cross(k_out, edge)), k_out
+            entering[wedge] = _unit(_cross(k_in, edge))
+            exiting[wedge], onward[wedge] = -_unit(_cross(k_out, edge)), k_out
 
         into = rotate(incident, spherical_basis(incident), entering)
         if step == 0:
@@ -222,7 +223,7 @@ def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float
     Returns:
         Unit vectors [..., 3].
     """
-    cross = np.cross(direction, normal)
+    cross = _cross(direction, normal)
     degenerate = _dot(cross, cross) < 1e-12
     reference = np.where((np.abs(direction[..., 0]) < 0.9)[..., None], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     fallback = reference - _dot(reference, direction)[..., None] * direction
@@ -244,7 +245,7 @@ def rotate(
     Returns:
         Cosine and sine [..., 2].
     """
-    return np.stack([_dot(current, target), _dot(direction, np.cross(current, target))], axis=-1)
+    return np.stack([_dot(current, target), _dot(direction, _cross(current, target))], axis=-1)
 
 
 def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -287,18 +288,18 @@ def _wedge(
     """Constants of a wedge diffraction as Sionna RT has them (Kouyoumjian and Pathak 1974; ITU-R P.526-15, 4.5)."""
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
     cos_edge = np.abs(_dot(incident, edge))
-    tangent = _unit(np.cross(normal_0, edge))
+    tangent = _unit(_cross(normal_0, edge))
     azimuth_in = _azimuth(-_unit(_reject(incident, edge)), tangent, normal_0)
     azimuth_out = _azimuth(_unit(_reject(leaving, edge)), tangent, normal_0)
     sin_edge = np.sqrt(np.maximum(1 - cos_edge**2, 0))
     distance = before * after / (before + after) * sin_edge**2
-    phi_in = _unit(np.cross(incident, edge))
+    phi_in = _unit(_cross(incident, edge))
     turns = []
     for normal in (normal_0, normal_n):
         # Direction of the reflection boundary.
         mirrored = incident - 2 * _dot(incident, normal)[:, None] * normal
         face = transverse_electric(incident, normal)
-        boundary = -_unit(np.cross(mirrored, edge))
+        boundary = -_unit(_cross(mirrored, edge))
         turns += [rotate(incident, phi_in, face), rotate(mirrored, face, boundary)]
     return (
         np.abs(_dot(incident, normal_n)),
@@ -326,7 +327,7 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 
 
 def _in_path_order(
-    parts: list[tuple[NDArray[np.float64], ...]], empty: Diffuse | Diffraction
+    parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
     """Columns of a table gathered step by step, put into path order (the order of the flat interactions)."""
     if not parts:
@@ -343,6 +344,10 @@ def _in_path_order(
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sum(a * b, axis=-1)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.cross(a, b), dtype=np.float64)
 
 
 def _sign(value: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass as checked
@@ -20,8 +20,11 @@ from calibray.study.faults import explain
 VERSION = 1
 """The version of `result.json` that is written and read."""
 
-_Interval: Any = checked(Interval, config=CLOSED, frozen=True)
-_Material: Any = checked(Material, config=CLOSED, frozen=True)
+if TYPE_CHECKING:
+    _Interval, _Material = Interval, Material
+else:
+    _Interval = checked(Interval, config=CLOSED, frozen=True)
+    _Material = checked(Material, config=CLOSED, frozen=True)
 
 Count = Annotated[int, Field(ge=0)]
 Error = Annotated[float, Field(ge=0)]

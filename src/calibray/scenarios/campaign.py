@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,8 @@ from calibray.scenes.meshes import write_scene
 from calibray.tracing.factory import trace
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}
-SPECULAR: Final = {"max_depth": 4, "samples": 500_000}
-DIFFUSE: Final = {"max_depth": 3, "samples": 300_000, "diffuse_reflection": True}
+SPECULAR: Final[dict[str, Any]] = {"max_depth": 4, "samples": 500_000}
+DIFFUSE: Final[dict[str, Any]] = {"max_depth": 3, "samples": 300_000, "diffuse_reflection": True}
 
 MODEL_MATERIALS: Final = {
     "concrete": {"type": "concrete", "thickness": PLANTED["concrete"].thickness},
@@ -72,12 +71,11 @@ def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
     Returns:
         Path loss of every link and standard deviation of its snapshots [L, 2], [dB].
     """
-    links = SimpleNamespace(tx=truth.tx, rx=truth.rx)
     with TemporaryDirectory() as folder:
         scene = write_scene(Path(folder), truth.scene_objects(), truth.materials())
         specular, mixed = (
             _powers(
-                trace(scene, links, frequency=FREQUENCY, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)
+                trace(scene, truth, frequency=FREQUENCY, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)
             )
             for settings in (SPECULAR, DIFFUSE)
         )
@@ -162,5 +160,5 @@ def _table(rows: dict[str, object]) -> str:
 def _powers(paths: Paths) -> NDArray[np.float64]:
     """Link, power gain [1], delay [s] and number of diffuse reflections of every path [4, P]."""
     owner = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
-    diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths)
-    return np.stack([paths.link, np.abs(path_gains(paths)) ** 2, paths.delay, diffuse])
+    diffuse = np.bincount(owner, paths.kind == Kind.DIFFUSE, paths.num_paths).astype(np.float64)
+    return np.stack([paths.link.astype(np.float64), np.abs(path_gains(paths)) ** 2, paths.delay, diffuse])

@@ -183,7 +183,8 @@ def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]
     """
     edge = np.roll(building.footprint, -1, axis=0) - building.footprint
     to_point = np.asarray(points)[:, None, :] - building.footprint
-    return (edge[:, 0] * to_point[..., 1] - edge[:, 1] * to_point[..., 0] >= 0.0).all(axis=1)
+    left_of = edge[:, 0] * to_point[..., 1] - edge[:, 1] * to_point[..., 0] >= 0.0
+    return np.asarray(left_of.all(axis=1))
 
 
 def _between(lines: Sequence[float], length: float) -> list[tuple[float, float]]:

@@ -59,7 +59,9 @@ def sounded_path_loss(
     specular = np.flatnonzero(~is_diffuse)
     specular = specular[np.argsort(delay[specular], kind="stable")]
     phase = rng.uniform(0.0, 2.0 * np.pi, (SNAPSHOTS, len(specular)))
-    np.add.at(field, (slice(None), tap[specular]), np.sqrt(power[specular]) * np.exp(1j * phase))
+    rays = np.sqrt(power[specular]) * np.exp(1j * phase)
+    # Several paths may fall into one tap.
+    np.add.at(field.T, tap[specular], rays.T)
     profile = np.abs(field) ** 2
     occupied = profile.mean(axis=0) > THRESHOLD * noise
     received = profile[:, occupied].sum(axis=1) - noise * occupied.sum()

@@ -99,7 +99,7 @@ class World:
     """
 
     buildings: tuple[Building, ...]
-    level: NDArray[np.float64]
+    level: NDArray[np.int64]
     permittivity: NDArray[np.float64]
     tx_recorded: NDArray[np.float64]
     rx_recorded: NDArray[np.float64]

@@ -74,7 +74,9 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
         raise InputError(f"floor plan {path}: is not a table ({error}); give a CSV file") from None
     for column in (*_ENDS, "type"):
         if column not in frame:
-            raise InputError(f"floor plan {path}: no column {column!r}; {did_you_mean(column, frame)}")
+            raise InputError(
+                f"floor plan {path}: no column {column!r}; {did_you_mean(column, map(str, frame))}"
+            )
     numbers = {name: _numbers(path, frame, name) * unit for name in (*_ENDS, "thickness", "bottom", "height")}
     segments = []
     for index, kind in enumerate(frame["type"]):

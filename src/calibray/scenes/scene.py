@@ -268,14 +268,7 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
         base = itu_material(itu_type, frequency, _floats(bsdf).get("thickness", DEFAULT_THICKNESS))
         return replace(base, **_slab(bsdf))
     if kind == "radio-material":
-        return Material(
-            **{
-                "relative_permittivity": 1.0,
-                "conductivity": 0.0,
-                "thickness": DEFAULT_THICKNESS,
-                **_floats(bsdf),
-            }
-        )
+        return replace(Material(1.0, 0.0, DEFAULT_THICKNESS), **_floats(bsdf))
     raise InputError(
         f"its BSDF of type {kind!r} has no radio constants; give relative_permittivity and conductivity (or itu) "
         f"in [materials], or name it mat-itu_..."
@@ -284,12 +277,11 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
     """The ITU name that Sionna reads from a BSDF: its `type` string, or its own name after `itu_`."""
-    declared = bsdf.find("string[@name='type']") if bsdf is not None else None
-    if declared is not None and (
-        bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-"))
-    ):
+    named = name.startswith(("itu_", "itu-"))
+    declared = None if bsdf is None else bsdf.find("string[@name='type']")
+    if bsdf is not None and declared is not None and (named or bsdf.get("type") == "itu-radio-material"):
         return declared.get("value")
-    return name[4:] if name.startswith(("itu_", "itu-")) else None
+    return name[4:] if named else None
 
 
 def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
@@ -300,8 +292,8 @@ def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
         name, value = element.get("name", ""), element.get("value")
         if name in _MATERIAL_FIELDS:
             try:
-                found[name] = float(value)
-            except (TypeError, ValueError):
+                found[name] = float(value or "")
+            except ValueError:
                 raise InputError(f"{name} = {value!r}: must be {BOUNDS[name]}") from None
     return found
 

@@ -44,7 +44,9 @@ def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
 
 def _check(place: str, field: FieldInfo, value: Any) -> None:
-    checker = TypeAdapter(Annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
+    # Put together at run time, which no checker of types can follow.
+    annotated: Any = Annotated
+    checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:
         checker.validate_json(json.dumps(value, default=str))
     except ValidationError as error:

@@ -91,10 +91,10 @@ def words(fault: Mapping[str, Any]) -> str:
     Returns:
         The message.
     """
-    context = fault.get("ctx", {})
+    context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
-    return _WORDS.get(fault["type"], fault["msg"]).format(**context)
+    return str(_WORDS.get(fault["type"]) or fault["msg"]).format(**context)
 
 
 def dotted(path: Sequence[str | int]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from calibray.closed import Section, Text
-from calibray.engines.kinds import DEFAULT, KINDS, AnyEngine
+from calibray.engines.kinds import AnyEngine, default
 from calibray.errors import InputError
 from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
@@ -88,7 +88,7 @@ class Study(Section):
     holdout: HoldoutSection | None = None
     fidelity: FidelitySection = Field(default_factory=FidelitySection)
     method: MethodSection = Field(default_factory=MethodSection)
-    engine: AnyEngine = Field(default_factory=KINDS[DEFAULT])
+    engine: AnyEngine = Field(default_factory=default)
 
     _path: Path = PrivateAttr(default=Path("study.toml"))
     _other_engines: dict[str, Any] = PrivateAttr(default_factory=dict)

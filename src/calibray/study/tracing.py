@@ -85,7 +85,12 @@ def trace(
             raise InputError(
                 "trace: measurements of a study must be Measurements; read them, or make them of a table"
             )
-        return Setup.open(scene, links=measurements).trace(materials, progress)
+        whole = {name: each for name, each in (materials or {}).items() if isinstance(each, Material)}
+        if partial := sorted(set(materials or {}) - set(whole)):
+            raise InputError(
+                f"trace: materials of a study: {partial[0]!r} is no Material; give all its constants as a Material"
+            )
+        return Setup.open(scene, links=measurements).trace(whole, progress)
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study needs {missing}; give it")

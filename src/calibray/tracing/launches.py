@@ -160,7 +160,7 @@ def directions(first: int, rays: int, samples: int) -> NDArray[np.float64]:
 
 def repeated(
     piece: NDArray[np.int64],
-    link: NDArray[np.int64],
+    link: NDArray[np.integer],
     kind: NDArray[np.int64],
     shape: NDArray[np.int64],
     vertex: NDArray[np.float64],

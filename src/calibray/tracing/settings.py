@@ -123,8 +123,10 @@ class Antenna:
         Raises:
             InputError: The file cannot be used.
         """
-        gain = {} if self.gain_file is None else {"pattern": read_gain_table(self.gain_file).digest()}
-        return asdict(self) | gain
+        record: dict[str, object] = asdict(self)
+        if self.gain_file is not None:
+            record["pattern"] = read_gain_table(self.gain_file).digest()
+        return record
 
 
 def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:

@@ -6,7 +6,7 @@ from functools import reduce
 from importlib import import_module
 from operator import or_
 from pkgutil import iter_modules
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import Field
 
@@ -31,5 +31,14 @@ KINDS: Final = _found()
 DEFAULT: Final = "replay"
 """The kind that a study without ``[engine]`` uses."""
 
-AnyEngine: Any = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
+
+def default() -> EngineSection:
+    """The section of a study without ``[engine]``."""
+    return KINDS[DEFAULT].model_validate({})
+
+
+if TYPE_CHECKING:
+    AnyEngine = EngineSection
+else:
+    AnyEngine = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
 """The section of any kind of engine, told apart by its name."""

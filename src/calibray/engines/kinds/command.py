@@ -43,7 +43,8 @@ class CommandSection(EngineSection):
     dear: ClassVar[bool] = True
     external: ClassVar[bool] = True
 
-    name: Literal["command"] = "command"
+    # Sections are frozen, so that a narrower type is safe.
+    name: Literal["command"] = "command"  # pyright: ignore[reportIncompatibleVariableOverride]
     command: Words = ()
     timeout: Annotated[float, Field(gt=0)] = 3600.0
     retries: Annotated[int, Field(ge=0)] = 2

@@ -31,7 +31,8 @@ class ReplaySection(EngineSection):
     dear: ClassVar[bool] = False
     external: ClassVar[bool] = False
 
-    name: Literal["replay"] = "replay"
+    # Sections are frozen, so that a narrower type is safe.
+    name: Literal["replay"] = "replay"  # pyright: ignore[reportIncompatibleVariableOverride]
     compress_db: Annotated[float, Field(gt=0)] | None = None
 
     def answers_by(self, setup: Setup) -> None:

@@ -27,7 +27,8 @@ class RetraceSection(EngineSection):
     dear: ClassVar[bool] = True
     external: ClassVar[bool] = False
 
-    name: Literal["retrace"] = "retrace"
+    # Sections are frozen, so that a narrower type is safe.
+    name: Literal["retrace"] = "retrace"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def answers_by(self, setup: Setup) -> list[str]:
         """The versions of the ray tracer."""

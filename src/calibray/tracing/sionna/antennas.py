@@ -1,8 +1,12 @@
 """Antenna patterns as functions for Sionna's own field stage."""
 
+# Mitsuba makes its types when its variant is chosen: its stubs know them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +28,9 @@ def patterns_of(antenna: Antenna) -> list:
         One function per port.
     """
     if antenna.gain_file is None:
-        return antenna_pattern_registry.get(antenna.pattern)(polarization=antenna.polarization).patterns
+        # Sionna does not say what it registers.
+        make: Any = antenna_pattern_registry.get(antenna.pattern)
+        return make(polarization=antenna.polarization).patterns
     pattern = tabulated(read_gain_table(antenna.gain_file))
     return PolarizedAntennaPattern(v_pattern=pattern, polarization=antenna.polarization).patterns
 

@@ -1,5 +1,8 @@
 """Arrays between NumPy and Dr.Jit."""
 
+# Mitsuba makes its types when its variant is chosen: its stubs know them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
 from __future__ import annotations
 
 from typing import Any

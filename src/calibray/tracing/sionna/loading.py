@@ -1,6 +1,11 @@
 """Scenes and materials as Sionna RT takes them."""
 
+# Mitsuba makes its types when its variant is chosen: its stubs know them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,6 +45,18 @@ def load(scene: Scene) -> rt.Scene:
         mi.set_file_resolver(resolver)
 
 
+def mitsuba_scene(scene: rt.Scene) -> Any:
+    """The scene that Mitsuba holds; neither Sionna nor Mitsuba says of which type it is.
+
+    Args:
+        scene: Sionna's scene.
+
+    Returns:
+        Mitsuba's.
+    """
+    return scene.mi_scene
+
+
 def shape_materials(scene: rt.Scene) -> dict[int, int]:
     """Materials of the shapes.
 
@@ -53,7 +70,7 @@ def shape_materials(scene: rt.Scene) -> dict[int, int]:
         int(np.array(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))).item()): int(
             shape.bsdf().name.split("-")[-1]
         )
-        for shape in scene.mi_scene.shapes()
+        for shape in mitsuba_scene(scene).shapes()
     }
 
 
@@ -75,4 +92,6 @@ def scattering_pattern(material: Material) -> rt.ScatteringPattern:
             "lambda_": material.lambda_,
         },
     }[material.scattering_pattern]
-    return scattering_pattern_registry.get(material.scattering_pattern)(**constants)
+    # Sionna does not say what it registers.
+    make: Any = scattering_pattern_registry.get(material.scattering_pattern)
+    return make(**constants)

@@ -41,7 +41,7 @@ class Trace:
             [self.tracer.compile(chunk, self.tx, self.rx, self.materials) for chunk in self.chunks]
         )
 
-    def link(self) -> NDArray[np.int64]:
+    def link(self) -> NDArray[np.integer]:
         """Link of every path, non-decreasing [P]."""
         return np.sort(np.concatenate([chunk.link for chunk in self.chunks]), kind="stable")
 

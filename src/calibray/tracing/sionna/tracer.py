@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
-from typing import Final
+from typing import Any, Final
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +40,7 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
-from calibray.tracing.sionna.loading import load, scattering_pattern, shape_materials
+from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.stored import Trace
 
 LANES: Final = 20_000_000
@@ -237,7 +237,7 @@ class Tracer:
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(rise, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
         for _ in range(64):
-            hit = self._scene.mi_scene.ray_intersect(ray, mi.Bool(active))
+            hit = mitsuba_scene(self._scene).ray_intersect(ray, mi.Bool(active))
             active &= np.array(hit.is_valid(), dtype=bool)
             if not active.any():
                 break
@@ -254,7 +254,7 @@ class Tracer:
         while True:
             with share_of_rays(launch, settings.samples):
                 buffer = self._candidates(
-                    mi_scene=self._scene.mi_scene,
+                    mi_scene=mitsuba_scene(self._scene),
                     src_positions=src,
                     tgt_positions=tgt,
                     samples_per_src=launch.rays,
@@ -283,7 +283,7 @@ class Tracer:
         buffer.detach_geometry()
         if buffer.buffer_size:
             buffer = self._images(
-                scene=self._scene.mi_scene,
+                scene=mitsuba_scene(self._scene),
                 paths=buffer,
                 src_positions=src,
                 tgt_positions=tgt,
@@ -339,7 +339,9 @@ class Tracer:
                 found = buffer.get_primitive_props(mi.UInt(step + 1), True, False, active)
                 normal[:, step] = np.array(found, dtype=float).T.reshape(-1, 3)
             if self.settings.diffraction:
-                wedges, ends = buffer.diffracting_wedges, (gather(chunk.source, buffer.source_indices),
+                # Not typed by Sionna but for None, which stands where nothing diffracts.
+                wedges: Any = buffer.diffracting_wedges
+                ends = (gather(chunk.source, buffer.source_indices),
                                                            gather(chunk.target, buffer.target_indices))  # fmt: skip
                 after, before = self._fields._diffraction_compute_s_s_prime(buffer, *ends)
                 wedge = (
@@ -375,7 +377,7 @@ class Tracer:
         buffer = chunk.buffer
         valid = mi.Bool(buffer.valid)
         count = dr.width(chunk.target)
-        found = self._fields(
+        found: Any = self._fields(
             wavelength=self._scene.wavelength,
             paths=buffer,
             samples_per_src=self.settings.samples,
