@@ -284,11 +284,11 @@ def test_bars_stand_where_the_values_are(result):
     assert "lower" not in entry.places
     content = result.study.content()
     name = next(iter(content["parameters"]))
-    content["parameters"][name] = {"bounds": [0.01, 100.0], "scale": "log", "start": 1.0}
+    content["parameters"][name] = {"bounds": [1.0, 100.0], "scale": "log", "start": 10.0}
     logarithmic = replace(
-        result, study=cb.Study.from_content(content), parameters=result.parameters | {name: 10.0},
-        initial_parameters=result.initial_parameters | {name: 1.0},
-        intervals={name: Interval(1.0, 0.1, 1000.0, "identified")},
+        result, study=cb.Study.from_content(content), parameters=result.parameters | {name: 1000**0.5},
+        initial_parameters=result.initial_parameters | {name: 10.0},
+        intervals={name: Interval(1.0, 10**0.5, 1000.0, "identified")},
     )  # fmt: skip
     places = values(logarithmic)[0].places
     assert places == pytest.approx({"before": 0.5, "after": 0.75, "lower": 0.25, "upper": 1.0})
@@ -365,8 +365,6 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     study = Result.load(written).study
     (tmp_path / "links.csv").write_text((study.path.parent / "links.csv").read_text())
     monkeypatch.setenv("CALIBRAY_CACHE", "")
-    monkeypatch.setattr(cb, "calibrate", None)
-    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", None)
     monkeypatch.setattr(reports, "page", None)
 
     def found(study, method, seed, out, **_):
