@@ -17,10 +17,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from made_up_report import made_up
-
 from calibray.reporting import figures
 from calibray.reporting.page import page
+from made_up_report import made_up
 
 LIMIT_MB, LIMIT_S = 15.0, 5.0
 
@@ -69,7 +68,9 @@ def main() -> None:
                 print(f"  opened in {taken[-1]:.2f} s")
     print(f"size below {LIMIT_MB:g} MB: {size < LIMIT_MB}")
     if taken:
-        print(f"opened below {LIMIT_S:g} s: {taken[-1] < LIMIT_S}; {taken[-1] / taken[0]:.1f} times the small one")
+        print(
+            f"opened below {LIMIT_S:g} s: {taken[-1] < LIMIT_S}; {taken[-1] / taken[0]:.1f} times the small one"
+        )
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def _paths(
     vertex = ends[0] + share[:, None] * (ends[1] - ends[0]) + random.normal(0, 15, (count, 3))
     vertex[:, 2] = np.abs(vertex[:, 2])
     length = np.linalg.norm(rx - tx, axis=1)[link] * random.uniform(1, 2, len(link))
-    angle = np.zeros((count, 2)) + [1.0, 0.0]
+    unturned = np.tile([1.0, 0.0], (count, 1))
     return Paths(
         frequency=3.5e9,
         materials=materials,
@@ -116,6 +116,6 @@ def _paths(
         kind=np.full(count, Kind.SPECULAR, dtype=np.uint8),
         material=random.integers(0, 2, count).astype(np.int32),
         cos_incidence=random.uniform(0.2, 0.9, count),
-        rotation=angle,
+        rotation=unturned,
         vertex=vertex.astype(np.float32),
     )

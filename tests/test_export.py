@@ -1,4 +1,4 @@
-"""The export: plain Sionna RT, in a process of its own, gives the reported path loss; the materials are the calibrated."""
+"""The export: plain Sionna RT, in a process of its own, gives the reported path loss; materials are as calibrated."""
 
 from __future__ import annotations
 
@@ -101,11 +101,13 @@ def test_octave_reads_the_materials(tmp_path):
     ran = subprocess.run(
         ["octave-cli", "--norc", "--eval", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert ran.stdout == "it's|a \"b\" % c|nan\\nbanana|2.5,NaN,4,", ran.stderr
+    assert ran.stdout == 'it\'s|a "b" % c|nan\\nbanana|2.5,NaN,4,', ran.stderr
 
 
 def test_meshes_of_one_name_are_kept_apart(tmp_path):
-    scene = read_scene(write_scene(tmp_path, {"a": block((0, 0, 0), (1, 1, 1)), "b": block((2, 2, 0), (3, 3, 1))}), 3e9)
+    scene = read_scene(
+        write_scene(tmp_path, {"a": block((0, 0, 0), (1, 1, 1)), "b": block((2, 2, 0), (3, 3, 1))}), 3e9
+    )
     (tmp_path / "more").mkdir()
     shutil.move(tmp_path / "meshes" / "b.ply", tmp_path / "more" / "a.ply")
     scene = replace(scene, xml=scene.xml.replace("meshes/b.ply", "more/a.ply"))

@@ -6,6 +6,7 @@ Needs Playwright and Debian's `chromium`, or the browser that CALIBRAY_CHROMIUM 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 
 import pytest
@@ -86,7 +87,6 @@ def colors(page) -> int:
     )
 
 
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
 def test_it_opens_without_an_error_or_a_request(opened, file, size, scheme):
@@ -102,8 +102,9 @@ def test_a_click_on_a_link_shows_its_paths(opened):
     page = opened()
     first = page.evaluate("document.documentElement.dataset.link")
     place = page.evaluate(
-        """() => { const circle = [...document.querySelectorAll(".links circle")][5], map = document.getElementById("map");
-        map.scrollIntoView(); const box = circle.getBoundingClientRect();
+        """() => { const circle = [...document.querySelectorAll(".links circle")][5];
+        const map = document.getElementById("map");
+        map.scrollIntoView({ behavior: "instant", block: "center" }); const box = circle.getBoundingClientRect();
         return [box.x + box.width / 2, box.y + box.height / 2]; }"""
     )
     page.mouse.click(*place)
@@ -157,7 +158,7 @@ def test_the_list_chooses_by_keyboard_and_sorts(opened):
     assert page.evaluate("document.documentElement.dataset.link") == "3"
     page.locator("#order").select_option("residual")
     left = [text for text in links.locator("option").all_inner_texts() if "no path" not in text]
-    sizes = [float(text.replace(" dB", "").replace(", held out", "").rpartition("−")[2].rpartition("+")[2]) for text in left]
+    sizes = [float(re.search(r"[+−]([0-9.]+) dB", text)[1]) for text in left]
     assert sizes == sorted(sizes, reverse=True)
 
 

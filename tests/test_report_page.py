@@ -1,4 +1,4 @@
-"""The report: every section is there, nothing is loaded from anywhere, names are text, and it says what the data say."""
+"""The report: every section is there, nothing is loaded, names are text, and it says what the data say."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ class Page(HTMLParser):
         given = dict(attrs)
         if "id" in given:
             self.ids.append(given["id"])
-        self.references += [given[name] for name in ("href", "src", "xlink:href", "action", "data", "srcset") if name in given]
+        self.references += [
+            given[name] for name in ("href", "src", "xlink:href", "action", "data", "srcset") if name in given
+        ]
         self.references += re.findall(r"url\(([^)]*)\)", given.get("style") or "")
         if tag in ("script", "style"):
             self._inside.append(tag)
@@ -268,7 +270,7 @@ def test_the_summary_says_what_the_data_cannot_tell(result):
     known = replace(
         result, intervals={name: Interval(0.1, 2.0, 3.0, verdict) for name, verdict in verdicts.items()}
     )
-    sure, unsure = list(verdicts)[0], list(verdicts)[2]
+    sure, _, unsure = verdicts
     text = said(known, "How sure are the values?")
     assert f"The links tell 1 of 3: {sure}" in text
     assert f"{unsure}: not told by these links" in text
@@ -321,7 +323,9 @@ def test_outlines_run_around_faces_that_share_edges():
 
 
 def test_objects_that_cannot_be_drawn_are_named(tmp_path):
-    file = write_scene(tmp_path, {"house": block((0, 0, 0), (20, 10, 8)), "broken": block((0, 0, 0), (1, 1, 1))})
+    file = write_scene(
+        tmp_path, {"house": block((0, 0, 0), (20, 10, 8)), "broken": block((0, 0, 0), (1, 1, 1))}
+    )
     scene = read_scene(file, 3.5e9)
     (tmp_path / "meshes" / "broken.ply").write_text("ply\nnonsense")
     triangles = read_triangles(scene)
@@ -354,7 +358,9 @@ def test_measured_power_keeps_its_sign_in_the_links(tmp_path, monkeypatch):
     links = cb.calibrate(study, engine=planted.engine()).links
     assert links.measured_received_power_dbm.to_numpy() == pytest.approx(power.power_dbm)
     assert links.after_received_power_dbm.to_numpy() == pytest.approx(30.0 - links.after_db)
-    assert links[["rx_x", "rx_y", "rx_z"]].to_numpy() == pytest.approx(power[["rx_x", "rx_y", "rx_z"]].to_numpy())
+    assert links[["rx_x", "rx_y", "rx_z"]].to_numpy() == pytest.approx(
+        power[["rx_x", "rx_y", "rx_z"]].to_numpy()
+    )
 
 
 def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):

@@ -84,7 +84,9 @@ def export(result: Result, folder: str | Path, copy_meshes: bool = False) -> tup
         for name, text in content.items():
             write_text(target / name, text)
     except OSError as error:
-        raise InputError(f"output folder {target}: cannot be written ({error.strerror}); name another") from None
+        raise InputError(
+            f"output folder {target}: cannot be written ({error.strerror}); name another"
+        ) from None
     return FILES
 
 

@@ -26,8 +26,8 @@ from calibray.reporting.style import (
 from calibray.spelling import shortened
 
 if TYPE_CHECKING:
-    from calibray.result import Result
     from calibray.reporting.survey import Survey
+    from calibray.result import Result
 
 SYMBOLS: Final = 60
 """Links up to which every one has its own symbol on a line."""
@@ -150,7 +150,10 @@ def residual_over_distance(survey: Survey) -> Figure:
     figure, axes = plain_figure("Distance [m]", "Calibrated - measured [dB]")
     left, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     axes.axhline(0, color=INK, lw=0.8)
-    for mask, color, marker, name in ((~held_out, BLUE, "o", "calibrated on"), (held_out, ORANGE, "^", "held out")):
+    for mask, color, marker, name in (
+        (~held_out, BLUE, "o", "calibrated on"),
+        (held_out, ORANGE, "^", "held out"),
+    ):
         shown = mask & np.isfinite(left)
         if shown.any():
             size = 40 if shown.sum() <= 100 else 16 if shown.sum() <= 1000 else 5

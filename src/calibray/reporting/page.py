@@ -214,7 +214,11 @@ def _tiles(result: Result) -> list[tuple[str, str, str]]:
     told = sum(interval.verdict == "identified" for interval in result.intervals.values())
     where = "held out" if judged else "calibrated on"
     tiles = [
-        (f"RMSE, links {where}", f"{after:.2f} dB", f"before {before:.2f} dB, log-distance model {rival:.2f} dB"),
+        (
+            f"RMSE, links {where}",
+            f"{after:.2f} dB",
+            f"before {before:.2f} dB, log-distance model {rival:.2f} dB",
+        ),
         ("Links", f"{len(result.links):,}", f"{result.counts['held_out']:,} of them held out"),
         ("RT calls", f"{result.rt_calls:,}", f"at {hertz(result.study.scene.frequency)}"),
     ]
@@ -226,9 +230,7 @@ def _tiles(result: Result) -> list[tuple[str, str, str]]:
 def _laws(result: Result) -> Table:
     """The coefficients of ITU-R P.2040's law, where they were calibrated."""
     names = ("itu_a", "itu_b", "itu_c", "itu_d")
-    rows = tuple(
-        (material, *(f"{law[name]:.4g}" for name in names)) for material, law in result.laws.items()
-    )
+    rows = tuple((material, *(f"{law[name]:.4g}" for name in names)) for material, law in result.laws.items())
     columns = (Column("Material"), numbers("a"), numbers("b"), numbers("c"), numbers("d"))
     return Table("Over frequency: eps_r = a f^b, sigma = c f^d [S/m], f in GHz (ITU-R P.2040)", columns, rows)
 
@@ -315,7 +317,10 @@ def _data(result: Result, shown: Shown, layout: Plan | None) -> dict[str, Any] |
         "links": {
             "row": links.table["row"].tolist(),
             "group": [] if links.group is None else [index[name] for name in links.group],
-            **{name: _tenths(links.table[f"{name}_db"].to_numpy(float)) for name in ("measured", "before", "after")},
+            **{
+                name: _tenths(links.table[f"{name}_db"].to_numpy(float))
+                for name in ("measured", "before", "after")
+            },
             "held": links.table["held_out"].astype(int).tolist(),
             "color": ramp(left, ramp_limit(left)),
         },

@@ -81,9 +81,7 @@ def _fit(result: Result) -> Sentence:
         f"{result.rmse_db:.2f} dB."
     )
     if result.offset_only_rmse_db is not None:
-        text += (
-            f" The offsets alone, with the materials left as they were, give {result.offset_only_rmse_db:.2f} dB."
-        )
+        text += f" The offsets alone, with the materials left as they were, give {result.offset_only_rmse_db:.2f} dB."
     return Sentence("How well it fits", text)
 
 
@@ -157,10 +155,15 @@ def _sure(result: Result) -> Iterator[Sentence]:
         ]
         more = f" and {len(told) - 6} more" if len(told) > 6 else ""
         yield Sentence(
-            heading, f"The links tell {len(told)} of {len(result.intervals)}: {'; '.join(values)}{more}.", "good"
+            heading,
+            f"The links tell {len(told)} of {len(result.intervals)}: {'; '.join(values)}{more}.",
+            "good",
         )
     for verdict, meaning in (
-        ("at bound", "at an end of their bounds: the best value may lie beyond, or the model lacks something"),
+        (
+            "at bound",
+            "at an end of their bounds: the best value may lie beyond, or the model lacks something",
+        ),
         ("not identifiable", "not told by these links: any value within the interval fits about as well"),
     ):
         if names := _by_verdict(result, verdict):
@@ -200,7 +203,9 @@ def _cautions(result: Result) -> Iterator[Sentence]:
     if result.enclosed is not None and not result.enclosed.indoors:
         for end, rows in (("transmitter", result.enclosed.tx), ("receiver", result.enclosed.rx)):
             if rows:
-                found.append(f"A {end} stands inside a building in {rows_text(list(rows))}: check the positions.")
+                found.append(
+                    f"A {end} stands inside a building in {rows_text(list(rows))}: check the positions."
+                )
     gap, tolerance = result.retrace_gap_db, result.study.fidelity.tolerance_db
     if gap is not None and gap > tolerance:
         found.append(

@@ -14,7 +14,6 @@ from calibray.files import write_text
 from calibray.materials import ITU_MATERIALS, Material
 from calibray.scenes.scene import TRACED, Scene, material_element
 
-
 MESHES: Final = "meshes"
 """The folder that copies of meshes are put into, beside the scene file."""
 

@@ -27,11 +27,15 @@ def load() -> rt.Scene:
     scene.frequency = CALIBRATION["frequency_hz"]
     for name, pattern in CALIBRATION["scattering_patterns"].items():
         # Scene files know the Lambertian pattern alone.
-        scene.radio_materials[name].scattering_pattern = scattering_pattern_registry.get(pattern.pop("name"))(**pattern)
+        scene.radio_materials[name].scattering_pattern = scattering_pattern_registry.get(pattern.pop("name"))(
+            **pattern
+        )
     for end in ("tx", "rx"):
         antenna = CALIBRATION["antennas"][end]
         if antenna["pattern"].lower().endswith(".csv"):
-            sys.exit(f"The {end} antenna's gain was a table ({antenna['pattern']}): register it as a pattern first.")
+            sys.exit(
+                f"The {end} antenna's gain was a table ({antenna['pattern']}): register it as a pattern first."
+            )
         array = rt.PlanarArray(
             num_rows=1, num_cols=1, pattern=antenna["pattern"], polarization=antenna["polarization"]
         )
@@ -53,7 +57,7 @@ def path_loss(scene: rt.Scene, tx: list[float], rx: list[float]) -> float:
 
 
 def received(gain: np.ndarray, delay: np.ndarray) -> float:
-    """Power gain of path gains [receive ports, transmit ports, paths] and delays [s] as the calibration combines them."""
+    """Power gain of path gains [receive ports, transmit ports, paths] with delays [s], as the study combines them."""
     if CALIBRATION["combining"] == "power" or not len(delay):
         return float((np.abs(gain) ** 2).sum() / gain.shape[1])
     offset, weight = np.zeros(1), np.ones(1)
