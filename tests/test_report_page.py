@@ -1,4 +1,4 @@
-"""The report: every section is there, nothing is loaded from anywhere, names are text, and it says what the data say."""
+"""The report: every section is there, nothing is loaded, names are text, and it says what the data say."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ def test_the_summary_says_what_the_data_cannot_tell(result):
     known = replace(
         result, intervals={name: Interval(0.1, 2.0, 3.0, verdict) for name, verdict in verdicts.items()}
     )
-    sure, unsure = list(verdicts)[0], list(verdicts)[2]
+    sure, _, unsure = verdicts
     text = said(known, "How sure are the values?")
     assert f"The links tell 1 of 3: {sure}" in text
     assert f"{unsure}: not told by these links" in text
@@ -286,11 +286,11 @@ def test_bars_stand_where_the_values_are(result):
     assert "lower" not in entry.places
     content = result.study.content()
     name = next(iter(content["parameters"]))
-    content["parameters"][name] = {"bounds": [0.01, 100.0], "scale": "log", "start": 1.0}
+    content["parameters"][name] = {"bounds": [1.0, 100.0], "scale": "log", "start": 10.0}
     logarithmic = replace(
-        result, study=cb.Study.from_content(content), parameters=result.parameters | {name: 10.0},
-        initial_parameters=result.initial_parameters | {name: 1.0},
-        intervals={name: Interval(1.0, 0.1, 1000.0, "identified")},
+        result, study=cb.Study.from_content(content), parameters=result.parameters | {name: 1000**0.5},
+        initial_parameters=result.initial_parameters | {name: 10.0},
+        intervals={name: Interval(1.0, 10**0.5, 1000.0, "identified")},
     )  # fmt: skip
     places = values(logarithmic)[0].places
     assert places == pytest.approx({"before": 0.5, "after": 0.75, "lower": 0.25, "upper": 1.0})
@@ -371,8 +371,6 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     study = Result.load(written).study
     (tmp_path / "links.csv").write_text((study.path.parent / "links.csv").read_text())
     monkeypatch.setenv("CALIBRAY_CACHE", "")
-    monkeypatch.setattr(cb, "calibrate", None)
-    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", None)
     monkeypatch.setattr(reports, "page", None)
 
     def found(study, method, seed, out, **_):

@@ -20,7 +20,7 @@ def export(
         typer.Option("--copy", help="Copy the meshes too, so that the folder can be given away."),
     ] = False,
 ) -> None:
-    """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as CSV, JSON and for MATLAB."""
+    """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.reporting.export import export as write
     from calibray.result import Result
 

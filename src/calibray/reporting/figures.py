@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 SYMBOLS: Final = 60
 """Links up to which every one has its own symbol on a line."""
 
+SHADED: Final = 500
+"""Links up to which they stand in the order of the study's file, those held out shaded."""
+
 MANY: Final = 2000
 """Points beyond which a figure holds them as an image."""
 
@@ -108,30 +111,27 @@ def path_loss_by_receiver(results: Mapping[str, Result]) -> Figure:
         The figure.
     """
     links = next(iter(results.values())).links
-    index = np.arange(1, len(links) + 1)
-    few = len(links) <= SYMBOLS
-    figure, axes = plain_figure("Receiver" if few else "Link", "Path loss [dB]", width=10.0)
+    place, few, many = np.arange(1, len(links) + 1), len(links) <= SYMBOLS, len(links) > SHADED
+    # Of many links a curve can be read only in the order of what was measured.
+    order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else place - 1
+    what = "Receiver" if few else "Link, by measured path loss" if many else "Link"
+    figure, axes = plain_figure(what, "Path loss [dB]", width=10.0)
     held_out = links["held_out"].to_numpy(bool)
-    if 0 < held_out.sum() < len(links):
-        for start, end in _runs(held_out):
-            axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0,
-                         label="held out" if start == _runs(held_out)[0][0] else None)  # fmt: skip
-    style: dict[str, Any] = {"marker": "o" if few else ".", "ls": "-" if few else "", "lw": 1.5}
-    drawn = {"rasterized": len(links) > MANY}
-    axes.plot(
-        index,
-        _finite(links["measured_db"]),
-        color=INK,
-        ms=5 if few else 3,
-        label="measured",
-        **style,
-        **drawn,
-    )
-    axes.plot(index, _finite(links["before_db"]), "s--" if few else ".", color=FAINT, ms=4 if few else 2, lw=1,
-              label="before calibration", **drawn)  # fmt: skip
+    if not many and 0 < held_out.sum() < len(links):
+        for number, (start, end) in enumerate(_runs(held_out)):
+            name = None if number else "held out"
+            axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0, label=name)
+
+    def draw(column: pd.Series, line: str, dots: str, layer: int = 2, **style: Any) -> None:
+        values = column.to_numpy(float)[order]
+        shown = np.where(np.isfinite(values), values, np.nan)
+        axes.plot(place, shown, line if few else dots, rasterized=len(links) > MANY, zorder=layer, **style)
+
+    draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
+    draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
     for method, result in results.items():
-        axes.plot(index, _finite(result.links["after_db"]), "-" if few else ".", ms=2, color=COLORS.get(method, BLUE),
-                  lw=1.3, label=label(method), **drawn)  # fmt: skip
+        style = {"color": COLORS.get(method, BLUE), "label": label(method)}
+        draw(result.links["after_db"], "-", ".", ms=2 if many else 4, lw=1.3, **style)
     axes.set_xlim(0, len(links) + 1)
     axes.legend(frameon=False, ncols=2)
     return figure
@@ -224,8 +224,3 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Start and end of every run of links in a mask."""
     edge = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return [(int(start), int(end)) for start, end in edge.reshape(-1, 2)]
-
-
-def _finite(column: pd.Series) -> NDArray[np.float64]:
-    values = column.to_numpy(float)
-    return np.where(np.isfinite(values), values, np.nan)

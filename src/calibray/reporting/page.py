@@ -54,7 +54,7 @@ ALONE: Final = 400
 CAPTIONS: Final = {
     "convergence": "Best RMSE after so many runs of the ray tracer over all links (RT calls).",
     "cumulative-cost": "RT calls and time spent, over the method's iterations.",
-    "path-loss": "Path loss of every link, in the order of the study's file; shaded where held out.",
+    "path-loss": "Path loss of every link: measured, before calibration and after; shaded where held out.",
     "residual-over-distance": "Calibrated minus measured path loss over the distance between the antennas.",
     "residual-by-group": "The same by group: median, quartiles, and whiskers around 90 % of the links.",
 }

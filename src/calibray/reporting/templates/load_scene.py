@@ -57,7 +57,7 @@ def path_loss(scene: rt.Scene, tx: list[float], rx: list[float]) -> float:
 
 
 def received(gain: np.ndarray, delay: np.ndarray) -> float:
-    """Power gain of path gains [receive ports, transmit ports, paths] and delays [s] as the calibration combines them."""
+    """Power gain of path gains [receive ports, transmit ports, paths] with delays [s], as the study combines them."""
     if CALIBRATION["combining"] == "power" or not len(delay):
         return float((np.abs(gain) ** 2).sum() / gain.shape[1])
     offset, weight = np.zeros(1), np.ones(1)

@@ -154,8 +154,8 @@
     return best;
   };
   map.addEventListener("click", (event) => {
-    const box = map.getBoundingClientRect(), unit = map.viewBox.baseVal.width / box.width;
-    const found = nearest((event.clientX - box.left) * unit, (event.clientY - box.top) * unit, (i) => at(moving, i), 24 * unit);
+    const units = map.getScreenCTM().inverse(), where = new DOMPoint(event.clientX, event.clientY).matrixTransform(units);
+    const found = nearest(where.x, where.y, (i) => at(moving, i), 24 * units.a);
     if (found >= 0) select(found);
   });
 
@@ -224,7 +224,7 @@
          vec2 q = 2.0 * gl_PointCoord - 1.0;
          float r = s < 0.0 ? max(q.y / 0.8, 1.8 * abs(q.x) - q.y) : length(q);
          if (r > 1.0) discard;
-         o = vec4(r > 0.74 ? rim : c.rgb, c.a * fade);
+         o = vec4(r > 0.74 && abs(s) > 6.0 ? rim : c.rgb, c.a * fade);
        }`);
     const mesh = data.solid.mesh;
     const land = mesh && { vertex: buffer(gl.ARRAY_BUFFER, decode(mesh.vertex, Uint16Array)), face: buffer(gl.ELEMENT_ARRAY_BUFFER, decode(mesh.face, Uint32Array)) };
@@ -293,7 +293,7 @@
     // The links' points never change but with the theme.
     let points = null;
     const makePoints = () => {
-      const far = count > 2000 ? 5 : 8, values = [], seen = new Set();
+      const far = count > 2000 ? 3 : 8, values = [], seen = new Set();
       for (let i = 0; i < count; i++) {
         const color = links.color[i] === "none" ? rgb(style("--paper")) : rgb(links.color[i]);
         values.push(moving[3 * i], moving[3 * i + 1], moving[3 * i + 2], ...color, 1, far);
@@ -401,6 +401,8 @@
         upload(Float32Array.from(ring));
         drawDots(m, null, 2, ratio, 1);
       }
+      // For whoever waits for the picture.
+      document.documentElement.dataset.drawn = Number(document.documentElement.dataset.drawn || 0) + 1;
     };
 
     // Hands and keys
