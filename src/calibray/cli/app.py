@@ -16,11 +16,13 @@ from calibray.cli.compare import compare
 from calibray.cli.demo import demo
 from calibray.cli.doctor import doctor
 from calibray.cli.export import export
+from calibray.cli.init import init
 from calibray.cli.ledger import ledger
 from calibray.cli.predict import predict
 from calibray.cli.report import report
 from calibray.cli.run import run
 from calibray.cli.scene import scene
+from calibray.cli.schema import schema
 from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
 
@@ -77,6 +79,6 @@ def calibray(
     """Calibrate the radio materials of a ray-traced scene from measurements."""
 
 
-for command in (doctor, demo, run, report, compare, trace, predict, export, ledger):
+for command in (doctor, demo, init, schema, run, report, compare, trace, predict, export, ledger):
     app.command()(command)
 app.add_typer(scene)

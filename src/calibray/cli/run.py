@@ -43,17 +43,22 @@ def run(
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene and a report."""
     from calibray.calibration import calibrate
+    from calibray.calibration.methods import check_method
     from calibray.cli.progress import progress_bars
+    from calibray.cli.sanity import warn
     from calibray.engines import open_executor
+    from calibray.files import check_outputs
     from calibray.result import FILES, tables
     from calibray.study import Study
     from calibray.tables.text import render
 
-    study = Study.load(study_file).replace(engine=engine)
+    study = Study.load(study_file).replace(method, seed, engine)
+    check_method(study.method.name)
+    check_outputs(out, FILES, study.files(), overwrite)
+    setup = study.opened()
+    warn(study, setup.links)
     with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
-        result = calibrate(
-            study, method, seed, out, executor=executor, progress=progress, overwrite=overwrite
-        )
+        result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
     if as_json:
         typer.echo(json.dumps(result.content(), indent=2))
     else:

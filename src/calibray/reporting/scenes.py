@@ -14,8 +14,9 @@ from calibray.files import check_file, replacing
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
-    from calibray.scenes.diagnosis import SceneDiagnosis
+    from calibray.scenes.diagnosis import Finding, SceneDiagnosis
     from calibray.scenes.making import Made
+    from calibray.study.draft import Draft
 
 LISTED: Final = 12  # names that are told before the rest is only counted
 
@@ -115,6 +116,31 @@ def objects(found: SceneDiagnosis) -> Table:
         for item in found.objects
     )  # fmt: skip
     return Table("Objects", columns, tuple(rows))
+
+
+def assumed(found: Draft) -> Table:
+    """What was assumed of a drafted study.
+
+    Args:
+        found: The draft.
+
+    Returns:
+        One row an assumption, with its reason.
+    """
+    rows = tuple((each.what, each.value, each.reason) for each in found.assumptions)
+    return Table("Assumed", (Column(), Column(), Column("because")), rows)
+
+
+def warned(findings: Sequence[Finding]) -> str:
+    """Suspicions about links, a line each.
+
+    Args:
+        findings: What `calibray.study.sanity.examine` found.
+
+    Returns:
+        The lines; empty if there are none.
+    """
+    return "\n".join(f"Warning: {each.place}: {each.problem}; {each.remedy}" for each in findings)
 
 
 PICTURES: Final = (".png", ".svg", ".pdf")

@@ -1,0 +1,12 @@
+"""`calibray schema`: what a study file may hold, for editors."""
+
+from __future__ import annotations
+
+import typer
+
+
+def schema() -> None:
+    """Print the JSON schema of study files, by which editors complete and check them."""
+    from calibray.study.schema import schema_text
+
+    typer.echo(schema_text(), nl=False)
