@@ -134,6 +134,13 @@ def together(runners: tuple[subprocess.Popen, ...], place: Path, name: str, seed
     return well
 
 
+def release(place: Path) -> None:
+    """Unmount the disks of the studies in a folder."""
+    for folder in place.glob("*/out"):
+        if folder.is_mount():
+            subprocess.run(["umount", str(folder)], check=False, stderr=subprocess.DEVNULL)
+
+
 def main() -> int:
     """Disturb every study, and run two at once; 0 if nothing was lost, repeated or changed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -157,9 +164,7 @@ def main() -> int:
             for name in names
             if STUDIES[name].engine != "replay"
         ]
-        if mounts:
-            for folder in Path(place).glob("*/out"):
-                subprocess.run(["umount", str(folder)], check=False, stderr=subprocess.DEVNULL)
+        release(Path(place))
     print("all well" if all(well) else "NOT WELL")
     return 0 if all(well) else 1
 

@@ -169,7 +169,13 @@ def _read_csv(path: Path) -> SourceTable:
     header, lines = _checked_layout(path, text)
     if not header:
         return SourceTable(pd.DataFrame())
-    frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
+    try:
+        frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
+    except pd.errors.ParserError as error:
+        # Reading from memory fails for one reason only: pandas takes Ctrl-C in the midst of it for a failure.
+        if "source failed" in str(error):
+            raise KeyboardInterrupt from None
+        raise
     if len(frame) != len(lines):
         raise InputError(f"{path}: {len(lines)} rows stand in it but {len(frame)} are read; check its quotes")
     return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
