@@ -55,7 +55,7 @@ def temporary(tmp_path, monkeypatch):
 
 def soon(condition: Callable[[], bool]) -> bool:
     """Whether something becomes true within some seconds."""
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.02)
     return condition()
