@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from calibray.measurements import Measurements as Measurements
     from calibray.measurements import read_measurements as read_measurements
     from calibray.paths import Paths as Paths
+    from calibray.reporting.page import report as report
     from calibray.result import Result as Result
     from calibray.study import Setup as Setup
     from calibray.study import Study as Study

@@ -180,7 +180,7 @@ def joined_by_time(
 def _seconds(times: pd.Series) -> NDArray[np.float64]:
     """Seconds since 1970; NaN where there is none."""
     since = (times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-    return np.asarray(since.to_numpy(dtype=np.float64))
+    return np.asarray(since.to_numpy(), dtype=np.float64)
 
 
 def degree_columns(names: list[str]) -> tuple[str | None, str | None]:

@@ -21,7 +21,8 @@ VERSION = 1
 """The version of `result.json` that is written and read."""
 
 if TYPE_CHECKING:
-    _Interval, _Material = Interval, Material
+    _Interval = Interval
+    _Material = Material
 else:
     _Interval = checked(Interval, config=CLOSED, frozen=True)
     _Material = checked(Material, config=CLOSED, frozen=True)
