@@ -14,12 +14,12 @@ SIGNATURES = {
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
-    "calibrate": "study, method, seed, out, engine, executor, progress",
+    "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite",
     "report": "result, file, figures, progress",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }
-NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Study", "engines", "optimizers"}
+NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Setup", "Study", "engines", "optimizers"}
 
 
 def test_names_are_frozen():

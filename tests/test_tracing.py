@@ -21,6 +21,7 @@ from calibray.scenes import read_scene
 from calibray.tracing.launches import directions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
+from calibray.tracing.sionna.interruption import interruptible
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -338,3 +339,16 @@ def test_nothing_is_written(house: Tracer, tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InputError):
         cb.trace("absent.xml", links([0, 0, 9], [[1, 0, 1]]), frequency=FREQUENCY)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interruption_in_the_midst_of_a_kernel_is_one():
+    def kernel(error):
+        try:
+            raise error
+        except BaseException as cause:
+            raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from cause
+
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        kernel(KeyboardInterrupt())
+    with pytest.raises(RuntimeError, match="while_loop"), interruptible():
+        kernel(ValueError("another"))

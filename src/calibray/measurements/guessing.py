@@ -166,7 +166,7 @@ def measured(table: SourceTable, source: str) -> Value:
     ]
     if not fitting:
         raise InputError(
-            f"{source}: no column looks like path loss, path gain or received power ({', '.join(table.frame)}); "
+            f"{source}: no column looks like path loss, path gain or received power ({', '.join(map(str, table.frame))}); "
             "name it path_loss_db, path_gain_db or rsrp_dbm"
         )
     _, _, quantity, name = fitting[0]
@@ -251,7 +251,9 @@ def own_name(transmitters: pd.DataFrame) -> str:
     for name in transmitters:
         if words(name) & _NAMES and transmitters[name].nunique() == len(transmitters):
             return str(name)
-    raise InputError(f"transmitters: no column names them ({', '.join(transmitters)}); call it 'transmitter'")
+    raise InputError(
+        f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
+    )
 
 
 def devices(frame: pd.DataFrame, most: int = 12) -> list[str]:

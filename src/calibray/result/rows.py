@@ -57,6 +57,8 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
             raise InputError(
                 f"{file}: column {column!r} holds something else than it should; run the study again"
             )
+        if kind == "f":
+            table[column] = table[column].astype(float)
         if column in FINITE and not np.isfinite(table[column]).all():
             raise InputError(
                 f"{file}: column {column!r} holds a value that is not finite; run the study again"

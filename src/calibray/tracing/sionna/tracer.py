@@ -40,6 +40,7 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
+from calibray.tracing.sionna.interruption import interruptible
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.stored import Trace
 
@@ -121,6 +122,7 @@ class Tracer:
         """
         return plan(positions(links)[0], self.settings, LANES, BUFFER)
 
+    @interruptible()
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
@@ -141,6 +143,7 @@ class Tracer:
         """
         return self.find(links, progress, materials).paths()
 
+    @interruptible()
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with Sionna's own field stage.
 
@@ -158,6 +161,7 @@ class Tracer:
         found = self.find(links, None, materials)
         return Solution(found.path_gains(), found.link(), found.delay())
 
+    @interruptible()
     def find(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Trace:
@@ -216,6 +220,7 @@ class Tracer:
             target.scattering_pattern = scattering_pattern(material)
         return constants
 
+    @interruptible()
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points lie inside closed bodies of the scene, such as buildings.
 
