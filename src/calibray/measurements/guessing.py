@@ -166,8 +166,8 @@ def measured(table: SourceTable, source: str) -> Value:
     ]
     if not fitting:
         raise InputError(
-            f"{source}: no column looks like path loss, path gain or received power ({', '.join(map(str, table.frame))}); "
-            "name it path_loss_db, path_gain_db or rsrp_dbm"
+            f"{source}: no column looks like path loss, path gain or received power "
+            f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
         )
     _, _, quantity, name = fitting[0]
     middle = float(np.nanmedian(table.frame[name]))

@@ -15,6 +15,7 @@ def interruptible() -> Iterator[None]:
 
     Raises:
         KeyboardInterrupt: Dr.Jit raised an error because of one.
+        RuntimeError: Dr.Jit raised an error for another reason.
     """
     try:
         yield
