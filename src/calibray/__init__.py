@@ -41,6 +41,7 @@ _HOMES = {
     "Setup": "calibray.study",
     "Result": "calibray.result",
     "calibrate": "calibray.calibration.calibrate",
+    "validate": "calibray.calibration.validate",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
     "report": "calibray.reporting.page",

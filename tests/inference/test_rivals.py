@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from calibray.errors import EngineError
+from calibray.inference.nuisance import Nuisance, make_term
+from calibray.inference.objective import make_objective
 from calibray.inference.rivals import LogDistance, log_distance
 from calibray.measurements import Measurements
 
@@ -40,6 +42,30 @@ def test_over_carriers_the_law_rises_as_in_free_space():
         path_loss_db=loss,
         frequency=frequency,
     )
-    assert log_distance(links, loss, np.ones(20), 3.5e9) == pytest.approx(loss)
+    assert log_distance(links, objective(links), 3.5e9) == pytest.approx(loss)
     one = Measurements(tx=links.tx, rx=links.rx, path_loss_db=loss)
-    assert abs(log_distance(one, loss, np.ones(20), 3.5e9) - loss).max() > 5
+    assert abs(log_distance(one, objective(one), 3.5e9) - loss).max() > 5
+
+
+def objective(links, *terms, calibrated=None):
+    """What a twin with some nuisances would be fitted by."""
+    every = np.ones(len(links), dtype=bool)
+    return make_objective(
+        links, every, every if calibrated is None else calibrated, nuisance=Nuisance(len(links), terms)
+    )
+
+
+def test_it_has_the_nuisances_of_the_twin():
+    distance = np.geomspace(5, 500, 20)
+    labels = np.where(np.arange(20) % 2, "a", "b")
+    loss = 38.5 + 27.0 * np.log10(distance) + 15.0 * (labels == "a")
+    rx = np.stack([distance, 0 * distance, 0 * distance], axis=1)
+    links = Measurements(tx=np.zeros((20, 3)), rx=rx, path_loss_db=loss)
+    bounded = make_term(links, "offset", labels=labels, bounds=(-10, 10))
+    assert log_distance(links, objective(links, bounded), 3.5e9) == pytest.approx(loss)
+    assert abs(log_distance(links, objective(links), 3.5e9) - loss).max() > 5
+    slope = make_term(links, "log_distance", "log_distance", labels=labels)
+    assert log_distance(links, objective(links, bounded, slope), 3.5e9) == pytest.approx(loss)
+    # A group that it was not fitted to has the mean of the others.
+    seen = objective(links, bounded, calibrated=labels == "a")
+    assert log_distance(links, seen, 3.5e9) == pytest.approx(loss + 15.0 * (labels == "b"))

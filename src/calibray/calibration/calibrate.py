@@ -7,11 +7,14 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from calibray import engines
+from calibray.calibration.certainty import certainty
 from calibray.calibration.methods import check_fit, check_method, choose
 from calibray.calibration.outcome import outcome
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
 from calibray.calibration.settle import settle
+from calibray.calibration.validate import check_engine, validated
+from calibray.calibration.weighing import weighed
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.files import check_outputs
@@ -60,6 +63,9 @@ def calibrate(
     check_method(plan.method.name)
     if out is not None:
         check_outputs(out, FILES, plan.files(), overwrite)
+    in_turn = plan.holdout is not None and plan.holdout.where is None
+    if in_turn:
+        check_engine(plan)
     started = time.perf_counter()
     looked_for = setup is not None
     setup = setup or Setup.open(plan, tracer)
@@ -72,9 +78,13 @@ def calibrate(
     # Before anything is calibrated on them; a ready engine may stand where no ray tracer can be loaded.
     enclosed = setup.enclosed if looked_for else None
     traced = time.perf_counter()
+    problem = weighed(problem, progress)
     trail = search(problem, choose(problem), progress)
     problem, trail, gap = settle(problem, trail, progress)
-    result = outcome(problem, trail, gap, enclosed, time.perf_counter() - traced, traced - started)
+    seconds = time.perf_counter() - traced
+    told = certainty(problem, trail, progress)
+    judged = validated(problem, progress=progress) if in_turn else None
+    result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started)
     if out is not None:
         # Asked before the work: what was computed is not lost to a file that came in the meantime.
         result.save(out, overwrite=True)

@@ -2,30 +2,56 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray.calibration.certainty import Certainty
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
-from calibray.inference.intervals import Interval, intervals
+from calibray.inference.comparing import compare
+from calibray.inference.nuisance import OFFSET
 from calibray.inference.rivals import log_distance
+from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.result import Result
 from calibray.study import Study
 from calibray.tracing.enclosed import Enclosed
 
+FEWEST: Final = 8
+"""Links held out that a scale of residuals can be taken from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """Path loss by each model at all links [L], [dB].
+
+    Attributes:
+        before: Before anything was fitted.
+        offset_only: With the nuisances fitted alone.
+        after: Calibrated.
+        rival: Of the log-distance model.
+    """
+
+    before: NDArray[np.float64]
+    offset_only: NDArray[np.float64]
+    after: NDArray[np.float64]
+    rival: NDArray[np.float64]
+
 
 def outcome(
     problem: Problem,
     trail: Trail,
     gap: NDArray[np.float64] | None,
+    certainty: Certainty,
+    validation: Validation | None,
     enclosed: Enclosed | None,
     seconds: float,
     trace_seconds: float,
@@ -36,6 +62,8 @@ def outcome(
         problem: The problem, on the last trace calibrated on.
         trail: Its search.
         gap: Change of every link's path loss on tracing again [L], [dB]; None where nothing was checked.
+        certainty: How far it can be trusted.
+        validation: Held-out errors, where blocks are held out in turn.
         enclosed: Antennas inside closed bodies; None where nothing was looked for.
         seconds: Time that the method took [s].
         trace_seconds: Time that tracing and loading took before [s].
@@ -44,51 +72,46 @@ def outcome(
         The result.
     """
     setup, objective, parameters = problem.setup, problem.objective, problem.parameters
-    study, links, held_out = setup.study, setup.links, setup.held_out
-    before, best, counted = problem.before, trail.best_modelled, objective.weight > 0
-    reached = np.isfinite(before) & np.isfinite(best)
-    judged = held_out & (reached | (objective.ceiling_db is not None))
+    study, links = setup.study, setup.links
+    best, counted = trail.best_modelled, objective.weight > 0
     offsets, fitted = objective.coefficients(best[None]), bool(objective.nuisance.terms)
-    offset_only, after = objective.model(np.stack([before, best]))
-    rival = log_distance(links, objective.measured, objective.weight, study.scene.frequency)
-
-    def rmse(model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
-        return float(np.sqrt(np.average((model - objective.measured)[mask] ** 2, weights=links.weight[mask])))
-
-    def held_out_rmse(model: NDArray[np.float64]) -> float | None:
-        return rmse(model, judged) if judged.any() else None
-
+    offset_only, after = objective.model(np.stack([problem.before, best]))
+    rival = log_distance(links, objective, study.scene.frequency)
+    models = Models(objective.capped(problem.before), offset_only, after, rival)
+    terms = _terms(problem, offsets[0])
     table = pd.DataFrame(
         {
             "row": links.row,
             "measured_db": objective.measured,
-            "before_db": before,
+            "before_db": problem.before,
             "after_db": best + objective.nuisance.contribution(offsets)[0],
             "log_distance_db": rival,
-            "has_path": reached,
-            "held_out": held_out,
+            "has_path": np.isfinite(problem.before) & np.isfinite(best),
+            "held_out": setup.held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
             **_places(links),
             **({"offset_only_db": offset_only} if fitted else {}),
         }
     )
     table = table.assign(**_as_measured(study, links, table))
+    if validation is None:
+        judged = _held_out(problem, trail, models)
+    else:
+        judged = _in_turn(validation, _rmse(problem, models.before, validation.block >= 0), fitted)
+    judgement = judged.pop("judgement")
     return Result(
         study=study,
         parameters=parameters.named(trail.best),
         initial_parameters=parameters.named(parameters.start),
-        intervals=_intervals(problem, trail.best),
+        intervals=certainty.intervals,
         materials=parameters.materials(trail.best, problem.engine.materials),
-        offsets_db={links.group_names[k]: float(offsets[0, k]) for k in np.flatnonzero(objective.determined)},
-        groups_without_path=tuple(links.group_names[k] for k in np.flatnonzero(~objective.determined)),
+        offsets_db={label: value for label, value in terms.get(OFFSET, {}).items() if value is not None},
+        groups_without_path=tuple(label for label, value in terms.get(OFFSET, {}).items() if value is None),
         rmse_db=trail.best_rmse_db,
-        initial_rmse_db=rmse(objective.capped(before), counted),
-        offset_only_rmse_db=rmse(offset_only, counted) if fitted else None,
-        holdout_rmse_db=held_out_rmse(after),
-        initial_holdout_rmse_db=held_out_rmse(objective.capped(before)),
-        offset_only_holdout_rmse_db=held_out_rmse(offset_only) if fitted else None,
-        log_distance_rmse_db=rmse(rival, counted),
-        log_distance_holdout_rmse_db=held_out_rmse(rival),
+        initial_rmse_db=_rmse(problem, models.before, counted),
+        offset_only_rmse_db=_rmse(problem, offset_only, counted) if fitted else None,
+        log_distance_rmse_db=_rmse(problem, rival, counted),
+        **judged,
         retrace_gap_db=largest(gap, counted),
         rt_calls=trail.rt_calls,
         ledger_hits=trail.ledger_hits,
@@ -102,7 +125,88 @@ def outcome(
         files=setup.files,
         paths=_traced(problem),
         prepared=links.prepared,
+        nuisances={
+            name: {label: value for label, value in values.items() if value is not None}
+            for name, values in terms.items()
+            if name != OFFSET
+        },
+        nuisance_centres={term.name: term.centre for term in objective.nuisance.terms if term.centre},
+        draws=certainty.draws,
+        free_offset_db=certainty.free_offset_db,
+        free_offset_error_db=certainty.free_offset_error_db,
+        remarks=(*certainty.remarks, *judgement),
+        profile_calls=certainty.calls,
+        profile_seconds=certainty.seconds,
     )
+
+
+def _rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
+    weight = problem.setup.links.weight[mask]
+    return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
+
+
+def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
+    """Accuracy on the links that a filter holds out, and what follows from it."""
+    objective, links, fitted = problem.objective, problem.setup.links, bool(problem.objective.nuisance.terms)
+    reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
+    judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
+    judgement: tuple[str, ...] = ()
+    errors = (models.after - objective.measured)[judged]
+    if judged.any():
+        rivals = {
+            "materials as before, with the nuisances fitted"
+            if fitted
+            else "materials as before": models.offset_only,
+            "a log-distance model": models.rival,
+        }
+        others = {name: (model - objective.measured)[judged] for name, model in rivals.items()}
+        judgement = (compare(errors, others, links.rx[judged]).sentence,)
+    freedom = objective.num_counted - len(problem.parameters) - int(objective.determined.sum())
+    size, basis = None, "too few links"
+    if len(errors) >= FEWEST:
+        size, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
+    elif freedom >= 1:
+        size = float(trail.best_rmse_db * np.sqrt(objective.num_counted / freedom))
+        basis = f"{objective.num_counted} links calibrated on"
+
+    def rmse(model: NDArray[np.float64]) -> float | None:
+        return _rmse(problem, model, judged) if judged.any() else None
+
+    return {
+        "holdout_rmse_db": rmse(models.after),
+        "initial_holdout_rmse_db": rmse(models.before),
+        "offset_only_holdout_rmse_db": rmse(models.offset_only) if fitted else None,
+        "log_distance_holdout_rmse_db": rmse(models.rival),
+        "residual_db": size,
+        "residual_basis": basis,
+        "judgement": judgement,
+    }
+
+
+def _in_turn(validation: Validation, before_db: float | None, fitted: bool) -> dict[str, Any]:
+    """Accuracy on blocks held out in turn, and what follows from it."""
+    figures = validation.table["rmse_db"]
+    return {
+        "holdout_rmse_db": float(figures[CALIBRATED]),
+        "initial_holdout_rmse_db": before_db,
+        "offset_only_holdout_rmse_db": float(figures[BEFORE]) if fitted else None,
+        "log_distance_holdout_rmse_db": float(figures[LAW]),
+        "residual_db": validation.scale(CALIBRATED),
+        "residual_basis": f"{len(validation.labels)} blocks held out in turn",
+        "judgement": (validation.sentence,),
+    }
+
+
+def _terms(problem: Problem, coefficients: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:
+    """Coefficients by term and group; None where no link tells one."""
+    found, first = {}, 0
+    known = problem.objective.determined
+    for term in problem.objective.nuisance.terms:
+        last = first + len(term.labels)
+        values = zip(term.labels, coefficients[first:last].tolist(), known[first:last], strict=True)
+        found[term.name] = {label: value if determined else None for label, value, determined in values}
+        first = last
+    return found
 
 
 def _places(links: Measurements) -> dict[str, NDArray[Any]]:
@@ -136,25 +240,3 @@ def _traced(problem: Problem) -> Paths | None:
     section = problem.setup.study.engine
     whole = isinstance(section, ReplaySection) and section.compress_db is None
     return problem.engine.paths if whole and isinstance(problem.engine, Replay) else None
-
-
-def _intervals(problem: Problem, best: NDArray[np.float64]) -> dict[str, Interval]:
-    """Intervals by parameter, taken in the search space: of what spans decades, the logarithm is what is uncertain."""
-    if not problem.differentiable:
-        return {}
-    parameters, objective = problem.parameters, problem.objective
-    point = parameters.to_search(best)
-    told = problem.evaluate(point[None], derivatives=True)
-    if told.jacobian is None:
-        return {}
-    nuisances = int(objective.determined.sum())
-    found = intervals(point, told.residuals[0], told.jacobian[0], *parameters.search_bounds, nuisances)
-    lower, upper = (
-        parameters.from_search(np.array(ends))
-        for ends in zip(*((each.lower, each.upper) for each in found), strict=True)
-    )
-    unit = parameters.search_slope(best)
-    return {
-        name: Interval(each.standard_error * float(unit[k]), float(lower[k]), float(upper[k]), each.verdict)
-        for k, (name, each) in enumerate(zip(parameters.names, found, strict=True))
-    }

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from calibray.engines.observable import PATH_LOSS, Observable
 from calibray.engines.protocol import Differentiable, Engine
 from calibray.errors import InputError
-from calibray.inference.nuisance import Nuisance, make_term
+from calibray.inference.nuisance import OFFSET, Nuisance, make_term
 from calibray.inference.objective import Objective, make_objective
 from calibray.measurements import Measurements
-from calibray.parameters import Parameters
+from calibray.parameters import NO_PRIOR, LogNormal, Parameters
 from calibray.study import Setup, Study
 
 
@@ -23,15 +23,28 @@ class Evaluation(NamedTuple):
 
     Attributes:
         value: What is minimized [n].
-        residuals: Weighted residuals [n, counted links].
-        jacobian: Their derivatives by the search coordinates [n, counted links, d], where asked for.
+        residuals: Weighted residuals, and a row for every prior [n, m].
+        jacobian: Their derivatives by the search coordinates [n, m, d], where asked for.
         modelled: What the engine answered [n, L].
+        rmse_db: The RMSE of the links alone (paper eq. 1) [n].
     """
 
     value: NDArray[np.float64]
     residuals: NDArray[np.float64]
     jacobian: NDArray[np.float64] | None
     modelled: NDArray[np.float64]
+    rmse_db: NDArray[np.float64]
+
+    @property
+    def slopes(self) -> NDArray[np.float64]:
+        """The Jacobian, where it was asked for.
+
+        Raises:
+            ValueError: It was not.
+        """
+        if self.jacobian is None:
+            raise ValueError("the Jacobian was not asked for")
+        return self.jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +57,7 @@ class Problem:
         objective: What is minimized.
         before: What the engine answers to the values before calibration [L].
         observable: What is measured and modelled.
+        priors: What is known of the parameters beforehand.
     """
 
     setup: Setup
@@ -51,6 +65,7 @@ class Problem:
     objective: Objective
     before: NDArray[np.float64]
     observable: Observable = PATH_LOSS
+    priors: LogNormal = NO_PRIOR
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
@@ -73,12 +88,18 @@ class Problem:
             links,
             np.isfinite(before),
             ~held_out,
-            nuisance=_nuisance(study, links),
+            nuisance=study_nuisance(study, links),
             ceiling_db=study.objective.ceiling_db,
+            noise_db=_noise(study, links),
         )
         objective = replace(objective, measured=observable.measured(links))
         _check_groups(links, objective, held_out & np.isfinite(before))
-        return cls(setup, engine, objective, before, observable)
+        return cls(setup, engine, objective, before, observable, study.priors)
+
+    @property
+    def weighs_priors(self) -> bool:
+        """Whether the size of the noise matters to the optimum, as it does where anything has a prior."""
+        return bool(len(self.priors)) or bool(np.isfinite(self.objective.nuisance.prior).any())
 
     @property
     def parameters(self) -> Parameters:
@@ -102,20 +123,54 @@ class Problem:
         """
         parameters, objective = self.parameters, self.objective
         candidates = parameters.from_search(points)
-        jacobian, with_slopes = None, self.observable.derivatives
+        jacobian, unit = None, parameters.search_slope(candidates)
+        with_slopes = self.observable.derivatives
         if derivatives and with_slopes is not None and isinstance(self.engine, Differentiable):
             modelled, slope = with_slopes(self.engine, candidates)
-            jacobian = objective.jacobian(modelled, slope * parameters.search_slope(candidates)[:, None, :])
+            jacobian = objective.jacobian(modelled, slope * unit[:, None, :])
         else:
             modelled = self.observable.modelled(self.engine, candidates)
-        return Evaluation(objective.value(modelled), objective.residuals(modelled), jacobian, modelled)
+        residuals = objective.residuals(modelled)
+        rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
+        if len(self.priors):
+            rows = objective.noise_db * self.priors.rows(candidates)
+            residuals = np.concatenate([residuals, rows], axis=1)
+        if len(self.priors) and jacobian is not None:
+            slopes = objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :]
+            jacobian = np.concatenate([jacobian, slopes], axis=1)
+        value = np.sqrt(np.mean(residuals**2, axis=1))
+        return Evaluation(value, residuals, jacobian, modelled, rmse_db)
 
 
-def _nuisance(study: Study, links: Measurements) -> Nuisance:
-    """The study's offset, for all links or for each group, if it has one."""
-    if study.offset is None:
-        return Nuisance(len(links))
-    return Nuisance(len(links), (make_term(links, "offset", labels=links.group, bounds=study.offset.bounds),))
+def study_nuisance(study: Study, links: Measurements) -> Nuisance:
+    """What a study lets shift the path loss: its offset, for all links or each group, and its further terms.
+
+    Args:
+        study: The study.
+        links: All its links.
+
+    Returns:
+        The nuisance.
+
+    Raises:
+        InputError: A term's column or groups cannot be used.
+    """
+    terms = []
+    if (offset := study.offset) is not None:
+        terms.append(
+            make_term(links, OFFSET, labels=links.group, bounds=offset.bounds, prior=offset.prior_db)
+        )
+    for name, term in study.nuisance.items():
+        labels = None if term.per is None else links.table.labels(term.per)
+        terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
+    return Nuisance(len(links), tuple(terms))
+
+
+def _noise(study: Study, links: Measurements) -> float:
+    """Standard deviation of a link's error at the mean weight [dB]: as stated, else 1 until it is estimated."""
+    if study.noise.std_db is not None:
+        return study.noise.std_db
+    return 1.0 if study.links.std is None else float(1.0 / np.sqrt(links.weight.mean()))
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:

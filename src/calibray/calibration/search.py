@@ -48,23 +48,29 @@ class Trail:
 
     Attributes:
         candidates: The candidates in the fields' units, each [d].
-        rmse_db: Their objectives [dB].
+        rmse_db: Their RMSE [dB].
+        best_db: The RMSE of the best until then [dB].
         iteration: The round that each belongs to.
         seconds: When each was known, since the start [s].
         best: The best candidate [d].
         best_modelled: What the engine answered to it [L].
-        best_rmse_db: Its objective [dB].
+        best_rmse_db: Its RMSE [dB].
+        best_value: Its objective, which priors are part of [dB].
+        minima: Where the optimizer's searches ended, the best first, as points of the search space [k, d].
         rt_calls: RT calls that the search spent, now or in an earlier run that left them in the ledger.
         ledger_hits: How many of them the ledger answered.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)
     rmse_db: list[float] = field(default_factory=list)
+    best_db: list[float] = field(default_factory=list)
     iteration: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     best: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     best_modelled: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     best_rmse_db: float = np.inf
+    best_value: float = np.inf
+    minima: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     rt_calls: int = 0
     ledger_hits: int = 0
 
@@ -78,13 +84,14 @@ class Trail:
             now: Time since the start [s].
         """
         self.candidates += list(candidates)
-        self.rmse_db += told.value.tolist()
+        self.rmse_db += told.rmse_db.tolist()
         self.iteration += [iteration] * len(told.value)
         self.seconds += [now] * len(told.value)
-        leader = int(np.argmin(told.value))
-        if told.value[leader] < self.best_rmse_db:
-            self.best, self.best_modelled = candidates[leader], told.modelled[leader]
-            self.best_rmse_db = float(told.value[leader])
+        for row, value in enumerate(told.value.tolist()):
+            if value < self.best_value:
+                self.best, self.best_modelled = candidates[row], told.modelled[row]
+                self.best_value, self.best_rmse_db = value, float(told.rmse_db[row])
+            self.best_db.append(self.best_rmse_db)
 
     def history(self) -> pd.DataFrame:
         """One row per RT call: number, iteration, RMSE, best so far, seconds since the start."""
@@ -93,7 +100,7 @@ class Trail:
                 "call": np.arange(1, len(self.rmse_db) + 1),
                 "iteration": self.iteration,
                 "rmse_db": self.rmse_db,
-                "best_db": np.minimum.accumulate(self.rmse_db),
+                "best_db": self.best_db,
                 "seconds": self.seconds,
             }
         )
@@ -126,6 +133,7 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         raise InputError(
             "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
         )
+    trail.minima = optimizer.minima
     return trail
 
 

@@ -24,6 +24,7 @@ from calibray.cli.run import run
 from calibray.cli.scene import scene
 from calibray.cli.schema import schema
 from calibray.cli.trace import trace
+from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
 
 
@@ -79,6 +80,6 @@ def calibray(
     """Calibrate the radio materials of a ray-traced scene from measurements."""
 
 
-for command in (doctor, demo, init, schema, run, report, compare, trace, predict, export, ledger):
+for command in (doctor, demo, init, schema, run, report, compare, validate, trace, predict, export, ledger):
     app.command()(command)
 app.add_typer(scene)

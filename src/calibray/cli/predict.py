@@ -13,8 +13,8 @@ from calibray.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-PREDICTED: Final = "path_loss_db"
-"""The column that `predict` adds."""
+PREDICTED: Final = ("path_loss_db", "lower_db", "upper_db", "basis")
+"""The columns that `predict` adds, all but the first with --level alone."""
 
 
 def predict(
@@ -34,6 +34,14 @@ def predict(
         Path | None,
         typer.Option(
             "--out", "-o", metavar="FILE", help="CSV or Parquet file to write instead of CSV on stdout."
+        ),
+    ] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="Add the interval that a measurement would lie in with this probability, as 0.9: columns lower_db, "
+            "upper_db and basis.",
         ),
     ] = None,
     anyway: Annotated[
@@ -56,17 +64,20 @@ def predict(
     links = read_links(
         links_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
     )
-    _refuse_column(links_file, links.frame)
+    _refuse_columns(links_file, links.frame, PREDICTED[: 1 if level is None else None])
     if out is not None:
         check_table(out, [links_file, *study.files()], overwrite)
     with progress_bars(log) as progress:
-        path_loss_db = result.predict(links, progress, anyway=anyway)
-    table = links.frame.assign(**{PREDICTED: path_loss_db})
+        if level is None:
+            table = links.frame.assign(**{PREDICTED[0]: result.predict(links, progress, anyway=anyway)})
+        else:
+            found = result.predict_interval(links, level, progress, anyway=anyway)
+            table = links.frame.assign(**{name: found[name].to_numpy() for name in PREDICTED})
     if out is None:
         typer.echo(table.to_csv(index=False), nl=False)
     else:
         write_table(out, table)
-    lost = links.row[np.isinf(path_loss_db)].tolist()
+    lost = links.row[np.isinf(table[PREDICTED[0]].to_numpy())].tolist()
     if lost:
         typer.echo(
             f"Warning: no path leads to {len(lost)} of {len(links)} links, {rows_text(lost)}",
@@ -74,7 +85,8 @@ def predict(
         )
 
 
-def _refuse_column(file: Path, frame: pd.DataFrame) -> None:
-    """Refuse a table that has the column of predictions already."""
-    if PREDICTED in frame:
-        raise InputError(f"{file}: has a column {PREDICTED!r} already; rename or remove it")
+def _refuse_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:
+    """Refuse a table that has a column of predictions already."""
+    for name in columns:
+        if name in frame:
+            raise InputError(f"{file}: has a column {name!r} already; rename or remove it")

@@ -14,6 +14,7 @@ from calibray import engines
 from calibray.calibration.methods import local_searches
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Evaluate
+from calibray.calibration.weighing import weighed
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.optimizers import landscapes
@@ -68,7 +69,7 @@ def study_arena(path: str | Path) -> Arena:
     setup = Setup.open(study.replace(engine="replay"))
     # A replay gives derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
-    problem = Problem.of(setup, engine)
+    problem = weighed(Problem.of(setup, engine))
     objective, parameters, links = problem.objective, problem.parameters, setup.links
     lower, upper = parameters.search_bounds
     digest = hashlib.sha256(fingerprint(setup).encode())
@@ -77,6 +78,7 @@ def study_arena(path: str | Path) -> Arena:
     for part in (lower, upper, objective.measured, objective.weight, *parts):
         digest.update(np.asarray(part, dtype="<f8").tobytes())
     digest.update(repr((nuisance.columns, objective.ceiling_db, objective.noise_db)).encode())
+    digest.update(repr(problem.priors).encode() if len(problem.priors) else b"")
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = parameters.to_search(parameters.start)
     return Arena(
@@ -105,7 +107,7 @@ def landscape_arena(name: str) -> Arena:
 
     def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
         value, residuals, jacobian = land.evaluate(points)
-        return Evaluation(value, residuals, jacobian if derivatives else None, residuals)
+        return Evaluation(value, residuals, jacobian if derivatives else None, residuals, value)
 
     known = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)

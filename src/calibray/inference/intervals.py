@@ -17,15 +17,19 @@ class Interval:
 
     Attributes:
         standard_error: From the residuals' scatter and the derivatives at the optimum, in the parameter's unit.
-        lower: Lower end of the 95 % interval, within the bounds.
-        upper: Upper end.
-        verdict: "identified", "at bound" or "not identifiable".
+        lower: Lower end of the 95 % interval, within the bounds; of the lowest piece where there are several.
+        upper: Upper end, of the highest piece.
+        verdict: "identified", "weakly identified", "ambiguous", "at bound" or "not identifiable".
+        pieces: Lower and upper end of every piece, ascending, where the interval was taken from a profile.
+        reason: Why the verdict is what it is, in words.
     """
 
     standard_error: float
     lower: float
     upper: float
     verdict: str
+    pieces: tuple[tuple[float, float], ...] = ()
+    reason: str = ""
 
 
 def intervals(

@@ -24,6 +24,12 @@ from calibray.measurements import Measurements
 CONSTANT: Final = "constant"
 LOG_DISTANCE: Final = "log_distance"
 
+OFFSET: Final = "offset"
+"""Name of the term that `[offset]` makes."""
+
+UNKNOWN_DB: Final = 10.0
+"""Spread of groups of which only one is known [dB per unit of the column]."""
+
 UNBOUNDED: Final = (-np.inf, np.inf)
 
 
@@ -229,6 +235,31 @@ class Nuisance:
             The sum of its columns times the coefficients [n, L], [dB].
         """
         return (self.design @ coefficients.T).T
+
+    def filled(
+        self, coefficients: NDArray[np.float64], counted: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients with those of groups never seen filled in: the mean of the others of their term.
+
+        Args:
+            coefficients: Coefficients fitted to some links [n, q].
+            counted: Which links these are [L].
+
+        Returns:
+            All coefficients [n, q], and the standard deviation of each: the spread of the groups where none of a
+            group's links was seen, else 0 [q].
+        """
+        seen = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
+        found, spread, first = coefficients.copy(), np.zeros(len(seen)), 0
+        for term in self.terms:
+            here = np.arange(first, first := first + len(term.labels))
+            known, unknown = here[seen[here]], here[~seen[here]]
+            if len(known) and len(unknown):
+                found[:, unknown] = coefficients[:, known].mean(axis=1, keepdims=True)
+                # A further one lies around a mean that is uncertain itself.
+                size = np.std(coefficients[0, known], ddof=1) if len(known) > 1 else UNKNOWN_DB
+                spread[unknown] = size * np.sqrt(1 + 1 / len(known))
+        return found, spread
 
     def _each(self, values: list[float]) -> NDArray[np.float64]:
         return np.repeat(np.array(values, dtype=np.float64), [len(term.labels) for term in self.terms])

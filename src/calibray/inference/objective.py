@@ -156,6 +156,11 @@ class Objective:
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
 
+    @property
+    def num_counted(self) -> int:
+        """Number of links that count; the rows of the residuals after them belong to priors."""
+        return len(self._scale)
+
     def capped(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss as it could have been measured: at most the ceiling, if there is one [dB]."""
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)

@@ -1,17 +1,20 @@
-"""Path loss at links that were never measured, with the calibrated scene and offsets."""
+"""Path loss at links that were never measured, with the calibrated scene and nuisances, and how sure it is."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from calibray import fields
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
+from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB
 from calibray.measurements import Measurements, links_from_frame
 from calibray.progress import Progress
 from calibray.study import Setup
@@ -44,29 +47,157 @@ def predict(
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
             scene or an antenna changed since the calibration.
     """
-    study = result.study
-    if not isinstance(links, Measurements):
-        per = study.offset.per if study.offset else None
-        links = links_from_frame(links, group=per, frequency=study.links.frequency)
-    offset = _offset(result, links)
-    setup = Setup.open(study, links=links)
+    links = _links(result, links)
+    shift = _shift(result, links, {}).value[0]
+    setup = Setup.open(result.study, links=links)
     if not anyway:
         _check_files(result, setup)
     paths = setup.trace(result.materials, progress)
+    study = result.study
     if links.frequency is None:
-        return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + offset
+        return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + shift
     values = np.array([[result.parameters[name] for name in setup.parameters.names]])
-    return replay(setup, paths).path_loss(values)[0] + offset
+    return replay(setup, paths).path_loss(values)[0] + shift
 
 
-def _offset(result: Result, links: Measurements) -> NDArray[np.float64]:
-    if not result.offsets_db:
-        return np.zeros(len(links))
-    unknown = [name for name in links.group_names if name not in result.offsets_db]
-    if unknown:
-        known = ", ".join(result.offsets_db)
-        raise InputError(f"{links.source}: group {unknown[0]!r} has no calibrated offset; known: {known}")
-    return np.array([result.offsets_db[name] for name in links.group_names])[links.group_index]
+def predict_interval(
+    result: Result,
+    links: Measurements | pd.DataFrame,
+    level: float = 0.9,
+    progress: Progress | None = None,
+    *,
+    anyway: bool = False,
+) -> pd.DataFrame:
+    """Path loss at links that were never measured, with the interval that a measurement there would lie in.
+
+    Three things make it wide: errors of single links, of the size that they have where nothing was fitted if the
+    calibration held links out; parameters, over all values that explain the links about as well; and for a group that
+    was never measured the spread of those that were.
+
+    Args:
+        result: The calibration.
+        links: The links, or a table, as for `predict`; groups need not have been measured.
+        level: Probability that a measurement lies within.
+        progress: Called with the stage "tracing" after every launch.
+        anyway: Predict although a file of the scene or an antenna changed since the calibration.
+
+    Returns:
+        One row per link: path_loss_db, lower_db, upper_db, and basis, what the interval was taken from. Where no path
+        leads, the path loss is infinite and the ends are missing.
+
+    Raises:
+        InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had too
+            few links to tell the size of errors.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"level = {level:g}: must lie between 0 and 1, as 0.9")
+    links = _links(result, links)
+    size, basis = _residual(result)
+    setup = Setup.open(result.study, links=links)
+    if not anyway:
+        _check_files(result, setup)
+    shift = _shift(result, links, result.draws, strangers=True)
+    names = setup.parameters.names
+    values = np.array([[result.parameters[name] for name in names]])
+    if result.draws:
+        values = np.vstack([values, np.stack([result.draws[name] for name in names], axis=1)])
+    modelled = replay(setup, setup.trace(result.materials, progress)).path_loss(values) + shift.value
+    best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
+    drawn = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
+    variance = size**2 + shift.spread**2 + (np.mean(drawn**2, axis=0) if len(drawn) else 0.0)
+    freedom = max(result.counts["calibrated_on"] - len(names), 1)
+    half = np.where(reached, stdtrit(freedom, (1 + level) / 2) * np.sqrt(variance), np.nan)
+    ending = "" if len(drawn) else ", parameters as if known"
+    said = np.where(shift.spread > 0, f"{basis}{ending}, group never measured", f"{basis}{ending}")
+    return pd.DataFrame(
+        {
+            "path_loss_db": best,
+            "lower_db": best - half,
+            "upper_db": best + half,
+            "basis": np.where(reached, said, "no path"),
+        }
+    )
+
+
+def _links(result: Result, links: Measurements | pd.DataFrame) -> Measurements:
+    if isinstance(links, Measurements):
+        return links
+    study = result.study
+    return links_from_frame(
+        links, group=study.offset.per if study.offset else None, frequency=study.links.frequency
+    )
+
+
+def _residual(result: Result) -> tuple[float, str]:
+    """Standard deviation of single links' errors [dB], and what it was taken from."""
+    if result.residual_db is not None:
+        return result.residual_db, f"errors of {result.residual_basis}"
+    count = result.counts["calibrated_on"]
+    freedom = count - len(result.parameters) - len(result.offsets_db)
+    if freedom < 1:
+        raise InputError(
+            f"{result.study.path}: {count} links are too few to tell the size of errors; measure more, or predict "
+            "without a level"
+        )
+    return result.rmse_db * float(np.sqrt(count / freedom)), f"errors of {count} links calibrated on"
+
+
+class Shift(NamedTuple):
+    """What nuisances add to path loss.
+
+    Attributes:
+        value: By the best coefficients, then by each draw [1 + draws, n], [dB].
+        spread: Standard deviation at links of groups that were never seen, else 0 [n], [dB].
+    """
+
+    value: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+
+def _shift(
+    result: Result, links: Measurements, draws: dict[str, list[float]], strangers: bool = False
+) -> Shift:
+    count = 1 + len(next(iter(draws.values()), ()))
+    value, variance = np.zeros((count, len(links))), np.zeros(len(links))
+    for name, by, labels, known in _terms(result, links):
+        column = np.ones(len(links)) if by == CONSTANT else _column(result, links, name, by)
+        best = np.array(list(known.values()))
+        every = np.stack([
+            np.array([known[label], *draws.get(f"{name}[{label}]" if label else name, [known[label]] * (count - 1))])
+            for label in known
+        ], axis=1)  # fmt: skip
+        given = np.full(len(links), "") if labels is None else labels
+        order = {label: place for place, label in enumerate(known)}
+        place = np.array([order.get(str(label), -1) for label in given])
+        if (place < 0).any() and not strangers:
+            stranger = str(given[int(np.argmax(place < 0))])
+            raise InputError(
+                f"{links.source}: group {stranger!r} has no calibrated {name}; known: {', '.join(known)}"
+            )
+        mean = every.mean(axis=1, keepdims=True)
+        value += column * np.where(place >= 0, every[:, place], mean)
+        size = np.std(best, ddof=1) if len(best) > 1 else UNKNOWN_DB
+        variance += np.where(place >= 0, 0.0, (column * size) ** 2 * (1 + 1 / len(best)))
+    return Shift(value, np.sqrt(variance))
+
+
+def _terms(
+    result: Result, links: Measurements
+) -> Iterator[tuple[str, str, NDArray[np.str_] | None, dict[str, float]]]:
+    """Name, column, labels at the links and coefficients of every nuisance."""
+    if result.offsets_db:
+        grouped = result.study.offset is not None and result.study.offset.per is not None
+        yield OFFSET, CONSTANT, links.group if grouped else None, result.offsets_db
+    for name, known in result.nuisances.items():
+        section = result.study.nuisance[name]
+        labels = None if section.per is None else links.table.labels(section.per)
+        if known:
+            yield name, section.by, labels, known
+
+
+def _column(result: Result, links: Measurements, name: str, by: str) -> NDArray[np.float64]:
+    value = np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)
+    return value - result.nuisance_centres.get(name, 0.0)
 
 
 def _check_files(result: Result, setup: Setup) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,6 +22,15 @@ SILENT_DB: Final = 1.0
 
 MOVED: Final = 0.25
 """Share of its range that another parameter moves by where it is said to make up for one."""
+
+
+Shown = Callable[[int, float], float]
+"""A parameter's place and its value to the value that words are to give, where the search has a scale of its own."""
+
+
+def as_it_is(_: int, value: float) -> float:
+    """The value itself."""
+    return value
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,7 @@ def verdicts(
     freedom: int,
     *,
     level: float = 0.95,
+    shown: Shown = as_it_is,
 ) -> list[Verdict]:
     """What the data tell of every parameter.
 
@@ -71,6 +81,7 @@ def verdicts(
         upper: Upper bounds [d].
         freedom: Number of links less those of parameters and nuisances.
         level: Confidence.
+        shown: What reasons give for a value.
 
     Returns:
         One verdict for every parameter.
@@ -89,9 +100,11 @@ def verdicts(
             name = "not identifiable"
             reason = _blindness(curve, evaluate, names, best, upper - lower, threshold)
         elif len(pieces) > 1:
-            name, reason = "ambiguous", _separate(curve, pieces, least, level)
+            name, reason = "ambiguous", _separate(curve, pieces, least, level, shown)
         elif ends:
-            side = f"below {high:.4g}" if ends == ["lower"] else f"above {low:.4g}"
+            side = (
+                f"below {shown(index, high):.4g}" if ends == ["lower"] else f"above {shown(index, low):.4g}"
+            )
             reason = f"the interval ends at the {ends[0]} bound: the data say only that it lies {side}"
             name = "at bound"
         else:
@@ -111,14 +124,16 @@ def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float
     return found
 
 
-def _separate(curve: Profile, pieces: tuple[tuple[float, float], ...], least: float, level: float) -> str:
+def _separate(
+    curve: Profile, pieces: tuple[tuple[float, float], ...], least: float, level: float, shown: Shown
+) -> str:
     """The minima that fit, with how much worse each fits than the best."""
     parts = []
     for low, high in pieces:
         inside = (curve.value >= low) & (curve.value <= high)
         at = np.flatnonzero(inside)[np.argmin(curve.square[inside])]
         behind = np.sqrt(curve.square[at]) - np.sqrt(least)
-        parts.append(f"{curve.value[at]:.4g} ({behind:.2f} dB behind the best)")
+        parts.append(f"{shown(curve.index, curve.value[at]):.4g} ({behind:.2f} dB behind the best)")
     return f"{len(pieces)} separate ranges fit at {level:.0%}: around {', '.join(parts)}"
 
 

@@ -186,24 +186,45 @@ def descend(
         Points to evaluate [s, d].
 
     Returns:
-        The searches that converged or were still moving at the end.
+        The searches that converged or were still moving at the end, then those that were given up: they stand so near
+        a minimum of their own that they could not catch up any more.
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
-    settled = starts.rows(np.zeros(len(starts.cost), dtype=bool))
+    settled = behind = starts.rows(np.zeros(len(starts.cost), dtype=bool))
     for _ in range(iterations):
         step, predicted = damped_steps(starts)
         still = (predicted <= tolerance * starts.cost) | (np.abs(step).max(axis=1) <= tolerance)
         settled = joined(settled, starts.rows(still))
         lowest = min(starts.cost.min(initial=np.inf), settled.cost.min(initial=np.inf))
         hopeless = starts.cost - catch_up * predicted > lowest
-        moving = ~still & ~hopeless & ~redundant(starts, settled)
+        merged = redundant(starts, settled)
+        behind = joined(behind, starts.rows(hopeless & ~still & ~merged))
+        moving = ~still & ~hopeless & ~merged
         starts, step, predicted = starts.rows(moving), step[moving], predicted[moving]
         if not moving.any():
             break
         unit = np.clip(starts.unit + step, 0.0, 1.0)
         starts = advance(starts, begin(unit, (yield unit)), predicted)
-    return joined(settled, starts)
+    return joined(joined(settled, starts), behind)
+
+
+def distinct(starts: Starts, apart: float) -> Starts:
+    """Of searches that ended near one another the best ones.
+
+    Args:
+        starts: The searches.
+        apart: Distance in the unit cube below which two are taken for one.
+
+    Returns:
+        The rest, the lowest cost first.
+    """
+    order = np.argsort(starts.cost, kind="stable")
+    near = cdist(starts.unit[order], starts.unit[order]) < apart
+    kept = np.zeros(len(order), dtype=bool)
+    for row in range(len(order)):
+        kept[row] = not (near[row] & kept).any()
+    return Starts(*(getattr(starts, field.name)[order[kept]] for field in fields(Starts)))
 
 
 def joined(first: Starts, second: Starts) -> Starts:

@@ -4,12 +4,12 @@ Local searches are cheap where derivatives come with the residuals, and a batch 
 more than one; so many starts run side by side, and each `ask` holds the next trial point of every start that
 is still moving. RMSE over permittivities is multimodal (slab resonances), which is why one start is not
 enough. A search is given up when it nears a better one, or lies so far behind the best that it can hardly
-catch up. The steps are those of `descent.py`.
+catch up; where it stood is kept as a minimum of its own (`minima`), for what fits nearly as well tells how
+far the best can be trusted. The steps are those of `descent.py`.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import ClassVar, final
 
 import numpy as np
@@ -19,7 +19,7 @@ from calibray.errors import InputError
 from calibray.optimizers.archive import Archive, Objective, root_mean_square
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.descent import descend
+from calibray.optimizers.descent import descend, distinct
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import design
 from calibray.optimizers.schedule import Schedule
@@ -27,6 +27,8 @@ from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0
 """Predicted decreases that a search may lie behind the best one before it is given up."""
+APART = 0.01
+"""Distance in the unit cube below which two searches are taken to have ended in the same minimum."""
 
 
 @final
@@ -95,13 +97,15 @@ class LeastSquares(Optimizer):
         sobol = design("sobol", self.starts, box.dimension, self._rng)
         unit = np.concatenate([box.to_unit(self.x0), *told_best, sobol])
         descent = descend(unit, self.iterations, self.tolerance, CATCH_UP)
-        with suppress(StopIteration):
+        try:
             unit = next(descent)
             while True:
                 told = yield box.from_unit(unit)
                 failed = ~np.isfinite(told.y)[:, None]
                 residuals = np.where(failed, np.inf, told.errors)
                 unit = descent.send((residuals, told.slopes * box.width))
+        except StopIteration as end:
+            self._session.minima = box.from_unit(distinct(end.value, APART).unit)
 
 
 def _user_starts(x0: ArrayLike | None, box: Box) -> NDArray[np.float64]:

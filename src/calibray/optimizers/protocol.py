@@ -88,6 +88,15 @@ class Optimizer(ABC):
         return self._session.best
 
     @property
+    def minima(self) -> NDArray[np.float64]:
+        """Where the search ended [k, d]: the best point, then every other minimum that the method keeps.
+
+        Raises:
+            InputError: Nothing has been told yet.
+        """
+        return np.concatenate([self.best.x[None], self._session.minima])
+
+    @property
     def evaluations(self) -> int:
         """Number of evaluations told, asked for or not."""
         return len(self._session.archive)

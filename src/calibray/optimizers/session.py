@@ -36,6 +36,9 @@ class Session:
         uses: What the algorithm uses of an evaluation: "value", "residuals", "jacobian".
         search: Starts the algorithm on the archive; nothing of it runs before the first `ask`.
         objective: The value that belongs to residuals, where they are used.
+
+    Attributes:
+        minima: Distinct minima that the algorithm found beside the best [k, d]; none until it leaves some.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class Session:
         self._answers: list[Evaluations | None] = []
         self._links: int | None = None
         self._finished = False
+        self.minima = np.empty((0, box.dimension))
 
     @property
     def done(self) -> bool:

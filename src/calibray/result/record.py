@@ -40,7 +40,8 @@ class Result:
         study: The study, with the method, seed and engine that ran.
         parameters: Calibrated values by name, in the fields' units.
         initial_parameters: Values before calibration.
-        intervals: 95 % intervals and verdicts by parameter; empty where the engine gives no derivatives.
+        intervals: 95 % intervals and verdicts with their reasons, by parameter; empty where the engine gives no
+            derivatives.
         materials: All materials of the scene at its carrier, the calibrated values in place.
         offsets_db: Offsets by group, [dB]; the nameless group stands for all links; empty without `[offset]`.
         rmse_db: RMSE over the links calibrated on (paper eq. 1), [dB].
@@ -68,6 +69,17 @@ class Result:
         groups_without_path: Groups that have no offset, because no link of theirs to calibrate on has a path.
         enclosed: Antennas that stand inside closed bodies of the scene; None where nothing was looked for.
         scene: The scene as it was read, from which the calibrated one is written; None in a result that was loaded.
+        nuisances: Coefficients of the study's further nuisances by name and group, [dB] per unit of the column.
+        nuisance_centres: What was taken off the column of those that turn about a point.
+        draws: Values of the parameters, and of nuisances, that explain the links about as well as those found; empty
+            where none could be drawn.
+        free_offset_db: The offset that would fit best beside a study without `[offset]`, [dB]; None where not tried.
+        free_offset_error_db: Its standard error, [dB].
+        remarks: What is to be said aloud of this calibration, a sentence each.
+        profile_calls: Replays that intervals and draws took, beside the RT calls of the method.
+        profile_seconds: Time that these took [s].
+        residual_db: Standard deviation of a link's error that predictions are given, [dB]; None where not known.
+        residual_basis: What it was taken from.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
         paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
         prepared: What was left out, averaged or moved before rows were links, and how many of them.
@@ -101,6 +113,16 @@ class Result:
     files: dict[str, str] = field(default_factory=dict)
     paths: Paths | None = None
     prepared: dict[str, int] = field(default_factory=dict)
+    nuisances: dict[str, dict[str, float]] = field(default_factory=dict)
+    nuisance_centres: dict[str, float] = field(default_factory=dict)
+    draws: dict[str, list[float]] = field(default_factory=dict)
+    free_offset_db: float | None = None
+    free_offset_error_db: float | None = None
+    remarks: tuple[str, ...] = ()
+    profile_calls: int = 0
+    profile_seconds: float = 0.0
+    residual_db: float | None = None
+    residual_basis: str = ""
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -185,6 +207,16 @@ class Result:
             "antennas_indoors": None if self.enclosed is None else self.enclosed.indoors,
             "files": self.files,
             "prepared": self.prepared,
+            "nuisances": self.nuisances,
+            "nuisance_centres": self.nuisance_centres,
+            "draws": self.draws,
+            "free_offset_db": self.free_offset_db,
+            "free_offset_error_db": self.free_offset_error_db,
+            "remarks": list(self.remarks),
+            "profile_calls": self.profile_calls,
+            "profile_seconds": self.profile_seconds,
+            "residual_db": self.residual_db,
+            "residual_basis": self.residual_basis,
         }
 
     @classmethod
@@ -240,3 +272,30 @@ class Result:
         from calibray.inference.prediction import predict
 
         return predict(self, links, progress, anyway=anyway)
+
+    def predict_interval(
+        self,
+        links: Measurements | pd.DataFrame,
+        level: float = 0.9,
+        progress: Progress | None = None,
+        *,
+        anyway: bool = False,
+    ) -> pd.DataFrame:
+        """Path loss with its interval at links that were never measured; see `calibray.inference.prediction`.
+
+        Args:
+            links: The links, or a table, as for `predict`; groups need not have been measured.
+            level: Probability that a measurement lies within.
+            progress: Called with the stage "tracing" after every launch.
+            anyway: Predict although a file of the scene or an antenna changed since the calibration.
+
+        Returns:
+            One row per link: path_loss_db, lower_db, upper_db [dB], and basis, what the interval was taken from.
+
+        Raises:
+            InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had
+                too few links to tell the size of errors.
+        """
+        from calibray.inference.prediction import predict_interval
+
+        return predict_interval(self, links, level, progress, anyway=anyway)

@@ -74,6 +74,16 @@ class Stored(Section):
     antennas_indoors: bool | None = None
     files: dict[str, Digest] = Field(default_factory=dict)
     prepared: dict[str, Count] = Field(default_factory=dict)
+    nuisances: dict[str, dict[str, float]] = Field(default_factory=dict)
+    nuisance_centres: dict[str, float] = Field(default_factory=dict)
+    draws: dict[str, list[float]] = Field(default_factory=dict)
+    free_offset_db: float | None = None
+    free_offset_error_db: Error | None = None
+    remarks: tuple[str, ...] = ()
+    profile_calls: Count = 0
+    profile_seconds: Seconds = 0.0
+    residual_db: Error | None = None
+    residual_basis: str = ""
 
 
 def read_stored(source: Path) -> tuple[Stored, Study]:
@@ -139,6 +149,11 @@ def _check(stored: Stored, study: Study, source: Path) -> None:
             )
     if unknown := sorted(set(stored.intervals) - set(names)):
         raise InputError(f"{source}: intervals: {shortened(repr(unknown[0]))} is no parameter of the study")
+    if sorted(stored.nuisances) != sorted(study.nuisance):
+        raise InputError(f"{source}: nuisances: are not those of the study; run the study again")
+    lengths = {len(values) for values in stored.draws.values()}
+    if len(lengths) > 1 or (stored.draws and not set(names) <= set(stored.draws)):
+        raise InputError(f"{source}: draws: are not one of each parameter; run the study again")
     if (study.offset is None) != (not stored.offsets_db and not stored.groups_without_path):
         state = "missing" if study.offset else "there, and the study has none"
         raise InputError(f"{source}: offsets_db: are {state}; run the study again")

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
 
 if TYPE_CHECKING:
+    from calibray.inference.intervals import Interval
     from calibray.result.record import Result
     from calibray.tracing.enclosed import Enclosed
+
+SHOWN: Final = 3
+"""Pieces of an interval that are shown one by one."""
 
 
 def heading(result: Result) -> str:
@@ -49,9 +53,12 @@ def tables(result: Result) -> tuple[Table, ...]:
         result: The calibration.
 
     Returns:
-        Links, parameters, offsets if there are any, accuracy and cost.
+        Links, parameters and the reasons of their verdicts, nuisances if there are any, accuracy, remarks and cost.
     """
-    every = (links(result), parameters(result), offsets(result), accuracy(result), costs(result))
+    every = (
+        links(result), parameters(result), reasons(result), offsets(result), accuracy(result), remarks(result),
+        costs(result),
+    )  # fmt: skip
     return tuple(table for table in every if table.rows)
 
 
@@ -115,18 +122,52 @@ def parameters(result: Result) -> Table:
         unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
         label = Column(name, "" if unit == "1" else unit).heading
         before, interval = result.initial_parameters[name], result.intervals.get(name)
-        ends = (
-            (f"{interval.lower:.4g} to {interval.upper:.4g}", interval.verdict)
-            if interval
-            else ("-", "not known")
-        )
+        ends = (ends_text(interval), interval.verdict) if interval else ("-", "not known")
         rows.append((label, f"{before:.4g}", f"{after:.4g}", *ends))
     columns = (Column(), numbers("before"), numbers("after"), numbers("95 % interval"), Column("verdict"))
     return Table("Parameters", columns, tuple(rows))
 
 
+def ends_text(interval: Interval) -> str:
+    """The ends of an interval, of each piece while they are few.
+
+    Args:
+        interval: The interval.
+
+    Returns:
+        The ends as words.
+    """
+    pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN else ((interval.lower, interval.upper),)
+    return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
+
+
+def reasons(result: Result) -> Table:
+    """Why every verdict is what it is; no rows where none is known.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        The table.
+    """
+    rows = [(name, found.reason) for name, found in result.intervals.items() if found.reason]
+    return Table("Why", (Column(), Column()), tuple(rows))
+
+
+def remarks(result: Result) -> Table:
+    """What is to be said aloud.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        A table of sentences.
+    """
+    return Table("To be noted", (Column(),), tuple((sentence,) for sentence in result.remarks))
+
+
 def offsets(result: Result) -> Table:
-    """The offset of every group; no rows without `[offset]`.
+    """The offset of every group and the coefficients of further nuisances; no rows where there are none.
 
     Args:
         result: The calibration.
@@ -136,7 +177,11 @@ def offsets(result: Result) -> Table:
     """
     rows = [(name or "all links", f"{value:+.2f}") for name, value in result.offsets_db.items()]
     rows += [(name or "all links", "no link with a path") for name in result.groups_without_path]
-    return Table("Offsets", (Column(), numbers(unit="dB")), tuple(rows))
+    for name, values in result.nuisances.items():
+        rows += [(f"{name}, {label}" if label else name, f"{value:+.3g}") for label, value in values.items()]
+    return Table(
+        "Offsets" if not result.nuisances else "Nuisances", (Column(), numbers(unit="dB")), tuple(rows)
+    )
 
 
 def accuracy(result: Result) -> Table:
@@ -172,6 +217,9 @@ def costs(result: Result) -> Table:
         rows.append(("answered by the ledger", f"{result.ledger_hits:,}"))
     if result.retrace_gap_db is not None:
         rows.append(("change on tracing again", f"{result.retrace_gap_db:.2f} dB"))
+    if result.profile_calls:
+        took = f"{result.profile_calls:,} in {result.profile_seconds:.1f} s"
+        rows.append(("replays for intervals", took))
     rows.append(("tracing", f"{result.trace_seconds:.1f} s"))
     rows.append(("calibrating", f"{result.seconds:.1f} s"))
     return Table("Cost", (Column(), numbers()), tuple(rows))

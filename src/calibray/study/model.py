@@ -22,7 +22,7 @@ from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import Measurements, measured_links
 from calibray.measurements.tables import read_table
-from calibray.parameters import Parameter, Parameters, itu_start, make_parameter
+from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
 from calibray.spelling import shortened
 from calibray.study.engines import part_engine
@@ -35,6 +35,8 @@ from calibray.study.sections import (
     LinksSection,
     MaterialSection,
     MethodSection,
+    NoiseSection,
+    NuisanceSection,
     ObjectiveSection,
     OffsetSection,
     ParameterSection,
@@ -50,6 +52,9 @@ if TYPE_CHECKING:
 
 VERSION: Final = 1
 """The version of the study file that this module reads."""
+
+LATER: Final = ("nuisance", "noise")
+"""Sections that version 1 did not have at first; without content they are not written."""
 
 BUNDLED: Final = "sionna:"
 """What the name of a scene bundled with Sionna RT begins with."""
@@ -69,6 +74,8 @@ class Study(Section):
         objective: How paths become a path loss.
         parameters: The free parameters by name, in the order of a candidate's components.
         offset: The nuisance offset, or None.
+        nuisance: Further columns of the nuisance by name.
+        noise: The errors of measured links.
         holdout: The links held out, or None.
         fidelity: When to trace again.
         method: The optimizer.
@@ -85,6 +92,8 @@ class Study(Section):
     objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
     parameters: dict[str, ParameterSection]
     offset: OffsetSection | None = None
+    nuisance: dict[str, NuisanceSection] = Field(default_factory=dict)
+    noise: NoiseSection = Field(default_factory=NoiseSection)
     holdout: HoldoutSection | None = None
     fidelity: FidelitySection = Field(default_factory=FidelitySection)
     method: MethodSection = Field(default_factory=MethodSection)
@@ -123,7 +132,11 @@ class Study(Section):
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
             lower, upper = entry.bounds
             names.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
+            if entry.prior is not None:
+                entry.centre(name, frequency)
         Parameters(tuple(names))
+        if "offset" in self.nuisance:
+            raise InputError("nuisance.offset: [offset] has this name; choose another")
         return self
 
     @classmethod
@@ -257,7 +270,7 @@ class Study(Section):
         )
 
     def held_out(self, measurements: Measurements) -> NDArray[np.bool_]:
-        """Which links are held out; none without ``[holdout]``.
+        """Which links are held out; none without ``[holdout]``, or where each block is in turn.
 
         Args:
             measurements: Links with the columns that the hold-out's filter names.
@@ -268,7 +281,7 @@ class Study(Section):
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.
         """
-        if self.holdout is None:
+        if self.holdout is None or self.holdout.where is None:
             return np.zeros(len(measurements), dtype=bool)
         return measurements.held_out(self.holdout.where)
 
@@ -290,7 +303,20 @@ class Study(Section):
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.
         """
-        return (measurements, None) if self.holdout is None else measurements.split(self.holdout.where)
+        if self.holdout is None or self.holdout.where is None:
+            return measurements, None
+        return measurements.split(self.holdout.where)
+
+    @property
+    def priors(self) -> LogNormal:
+        """What is known of the parameters beforehand, by their places in a candidate."""
+        entries = enumerate(self.parameters.items())
+        known = [(k, name, entry, entry.prior) for k, (name, entry) in entries if entry.prior is not None]
+        return LogNormal(
+            tuple(k for k, *_ in known),
+            tuple(entry.centre(name, self.scene.frequency) for _, name, entry, _ in known),
+            tuple(prior.spread for *_, prior in known),
+        )
 
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None
@@ -347,6 +373,10 @@ class Study(Section):
     def content(self) -> dict[str, Any]:
         """The study as plain values, every default written out; `from_content` takes it back."""
         content = self.model_dump(mode="json", exclude_none=True)
+        for name in LATER:
+            # Studies without them keep the fingerprint that they always had.
+            if not content[name]:
+                del content[name]
         content["engine"] |= self._other_engines
         return content
 

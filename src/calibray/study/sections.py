@@ -11,7 +11,7 @@ from calibray.closed import CLOSED, Section, Text
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
-from calibray.parameters import Scale
+from calibray.parameters import Scale, itu_start
 from calibray.study.options import check_options
 from calibray.tracing.settings import Antenna, TraceSettings
 
@@ -203,6 +203,26 @@ class ObjectiveSection(Section):
         return self
 
 
+class PriorSection(Section):
+    """What is known of a parameter beforehand: log-normal around a value.
+
+    Attributes:
+        itu: ITU-R P.2040 material, with "@" and the revision or without, whose value it lies around.
+        value: That value itself, in the field's unit, in place of `itu`.
+        spread: Standard deviation of its logarithm: 0.3 stands for about 30 %.
+    """
+
+    itu: Text | None = None
+    value: Annotated[float, Field(gt=0)] | None = None
+    spread: Annotated[float, Field(gt=0, le=10)]
+
+    @model_validator(mode="after")
+    def _one_centre(self) -> Self:
+        if (self.itu is None) == (self.value is None):
+            raise InputError("a prior lies around an ITU material or a value: give one of itu and value")
+        return self
+
+
 class ParameterSection(Section):
     """``[parameters]``, one entry: the bounds, start and scale of one parameter.
 
@@ -210,11 +230,45 @@ class ParameterSection(Section):
         bounds: Lower and upper bound, in the field's unit.
         start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
         scale: "linear" or "log".
+        prior: What is known of it beforehand; nothing but the bounds if absent.
     """
 
     bounds: tuple[float, float]
     start: float | str | None = None
     scale: Scale = "linear"
+    prior: PriorSection | None = None
+
+    def centre(self, name: str, frequency: float) -> float:
+        """The value that the prior lies around.
+
+        Args:
+            name: The parameter.
+            frequency: The carrier [Hz].
+
+        Returns:
+            The value, in the field's unit.
+
+        Raises:
+            InputError: There is no prior, ITU-R P.2040 gives no such value, or a bound or the value is not positive.
+        """
+        if self.prior is None:
+            raise InputError(f"{name}: has no prior")
+        value = self.prior.value
+        if value is None:
+            value = itu_start(name, f"itu:{self.prior.itu}", frequency)
+        if not min(value, self.bounds[0]) > 0:
+            raise InputError(
+                f"{name}: a prior is of the logarithm: its value, {value:g}, and the lower bound, {self.bounds[0]:g}, "
+                "must be greater than 0"
+            )
+        return value
+
+
+def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Refuse bounds of which the lower is not the lesser."""
+    if value is not None and value[0] >= value[1]:
+        raise InputError("the lower bound must be less than the upper")
+    return value
 
 
 class OffsetSection(Section):
@@ -223,27 +277,62 @@ class OffsetSection(Section):
     Attributes:
         per: Column of group labels, or several whose labels are joined; one offset for all links if absent.
         bounds: Lower and upper bound [dB]; unbounded if absent.
+        prior_db: Standard deviation of a Gaussian prior around zero [dB]; flat if absent.
     """
 
     per: Text | tuple[Text, ...] | None = None
     bounds: tuple[float, float] | None = None
+    prior_db: Annotated[float, Field(gt=0)] | None = None
 
-    @field_validator("bounds")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and value[0] >= value[1]:
-            raise InputError("the lower bound must be less than the upper")
-        return value
+    _ordered = field_validator("bounds")(_ordered)
+
+
+class NuisanceSection(Section):
+    """``[nuisance.NAME]``: a column of the links times an unknown coefficient, for all links or one per group.
+
+    Attributes:
+        by: "constant", "log_distance" (decades of distance) or a numeric column of the links.
+        per: Column of group labels; one coefficient for all links if absent.
+        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent.
+    """
+
+    by: Text
+    per: Text | None = None
+    bounds: tuple[float, float] | None = None
+    prior: Annotated[float, Field(gt=0)] | None = None
+
+    _ordered = field_validator("bounds")(_ordered)
+
+
+class NoiseSection(Section):
+    """``[noise]``: the errors of measured links.
+
+    Attributes:
+        std_db: Standard deviation of a link's error [dB], against which priors are weighed; estimated if absent.
+    """
+
+    std_db: Annotated[float, Field(gt=0)] | None = None
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: the links kept from calibration to judge it by.
+    """``[holdout]``: the links kept from calibration to judge it by; one of three ways to choose them.
 
     Attributes:
         where: Row filter; the links that pass are held out.
+        blocks: Number of spatial blocks, each held out in turn.
+        by: Column of labels; the links of each label are held out in turn.
     """
 
-    where: Text
+    where: Text | None = None
+    blocks: Annotated[int, Field(ge=2, le=100)] | None = None
+    by: Text | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if sum(way is not None for way in (self.where, self.blocks, self.by)) != 1:
+            raise InputError("holdout: give one of where, blocks and by")
+        return self
 
 
 class FidelitySection(Section):

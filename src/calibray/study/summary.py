@@ -9,6 +9,21 @@ from calibray.tables.glance import hertz
 
 if TYPE_CHECKING:
     from calibray.study.model import Study
+    from calibray.study.sections import HoldoutSection
+
+
+def held_out(section: HoldoutSection) -> str:
+    """Which links are held out, in words.
+
+    Args:
+        section: How they are chosen.
+
+    Returns:
+        The filter, or what is held out in turn.
+    """
+    if section.where is not None:
+        return section.where
+    return f"{section.blocks} blocks in turn" if section.by is None else f"each {section.by} in turn"
 
 
 def summary(plan: Study) -> tuple[Table, ...]:
@@ -31,7 +46,10 @@ def summary(plan: Study) -> tuple[Table, ...]:
         names = per if isinstance(per, str) else " and ".join(per or ())
         rows.append(("offset", f"per {names}" if names else "one for all links"))
     if plan.holdout is not None:
-        rows.append(("held out", plan.holdout.where))
+        rows.append(("held out", held_out(plan.holdout)))
+    rows += [
+        (name, f"{term.by}, per {term.per}" if term.per else term.by) for name, term in plan.nuisance.items()
+    ]
     rows.append(("method", f"{plan.method.name}, seed {plan.method.seed}"))
     rows.append(("engine", plan.engine.name))
     bounds = tuple(

@@ -1,0 +1,227 @@
+"""Calibrate again without each block of links in turn, by several models, and judge them by the block left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray import engines
+from calibray.calibration.methods import local_searches
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import rounds
+from calibray.calibration.weighing import weighed
+from calibray.engines.protocol import Differentiable
+from calibray.errors import EngineError, InputError
+from calibray.inference.blocks import blocks as parted
+from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term
+from calibray.inference.objective import Objective
+from calibray.inference.rivals import kriging, log_distance
+from calibray.inference.validation import BEFORE, CALIBRATED, KRIGING, LAW, PRIOR, SLOPE, Validation
+from calibray.optimizers import LeastSquares
+from calibray.parameters import LogNormal
+from calibray.progress import Progress
+from calibray.study import Setup, Study
+from calibray.tracing.factory import SIONNA
+from calibray.tracing.protocol import TracerFactory
+
+BLOCKS: Final = 4
+"""Spatial blocks where the study names none."""
+
+SPREAD: Final = 0.3
+"""Standard deviation of the logarithm of a parameter around its start, where the model has priors."""
+
+MINIMA: Final = 24
+"""Minima over all links that the search without a block starts from, beside points of its own."""
+
+SEARCHES: Final = 32
+"""Points of its own."""
+
+TX: Final = "tx"
+"""Label of a link's transmitter where the table has no such column: its position."""
+
+
+def validate(
+    study: Study | Setup,
+    *,
+    blocks: int | None = None,
+    by: str | None = None,
+    progress: Progress | None = None,
+    tracer: TracerFactory = SIONNA,
+) -> Validation:
+    """Judge models by links that they were not fitted to: leave one block out.
+
+    Args:
+        study: The study, opened or not; on the engine "replay".
+        blocks: Number of spatial blocks, each held out in turn; the study's, or 4, if None and `by` is None.
+        by: Column whose labels are held out in turn; "tx" for the place of the transmitter.
+        progress: Called with the stages "tracing" and "validating".
+        tracer: What opens the scene in a ray tracer; a study that is open brings its own.
+
+    Returns:
+        Held-out errors of every model, with their table and one sentence.
+
+    Raises:
+        InputError: The study is on another engine, or cannot be parted so.
+        EngineError: The engine failed.
+    """
+    setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
+    if blocks is not None and by is not None:
+        raise InputError("validate: give blocks or by, not both")
+    # Links that the study holds out are held out in turn like all others.
+    setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
+    check_engine(setup.study)
+    problem = weighed(Problem.of(setup, engines.make(setup, progress=progress)))
+    return validated(problem, blocks, by, progress)
+
+
+def check_engine(study: Study) -> None:
+    """Refuse an engine on which calibrating a dozen times over would be too dear.
+
+    Args:
+        study: The study.
+
+    Raises:
+        InputError: The engine is not "replay".
+    """
+    if study.engine.name != "replay":
+        raise InputError(
+            f"{study.path}: blocks held out in turn take a calibration each, and the engine {study.engine.name!r} is "
+            "too dear; set engine.name to 'replay', or hold links out by where"
+        )
+
+
+def validated(
+    problem: Problem, blocks: int | None = None, by: str | None = None, progress: Progress | None = None
+) -> Validation:
+    """Judge models on a problem that is set up, over all its links.
+
+    Args:
+        problem: The problem.
+        blocks: Number of spatial blocks; the study's if None and `by` is None.
+        by: Column whose labels are held out in turn.
+        progress: Called with the stage "validating".
+
+    Returns:
+        Held-out errors of every model.
+
+    Raises:
+        InputError: The links cannot be parted so.
+    """
+    links, objective = problem.setup.links, problem.objective
+    block, labels = _parted(problem, blocks, by)
+    searches = min(local_searches(_interactions(problem)), 128)
+    known = _minima(problem, np.zeros((0, len(problem.parameters))), searches)
+    names = (BEFORE, CALIBRATED, PRIOR, SLOPE, LAW, KRIGING)
+    errors = {name: np.full(len(links), np.nan) for name in names}
+    for number in range(len(labels)):
+        here = block == number
+        part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
+        for name, model in _models(part, known).items():
+            errors[name][here] = (model - objective.measured)[here]
+        if progress is not None:
+            progress("validating", number + 1, len(labels))
+    judged = (block >= 0) & np.isfinite(errors[BEFORE]) & np.isfinite(errors[CALIBRATED])
+    whole = {name: each for name, each in errors.items() if np.isfinite(each[judged]).all()}
+    position = np.where(judged, block, -1)
+    return Validation(labels, position, whole, links.rx)
+
+
+def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Block of every link, -1 where it does not count, and the blocks' labels."""
+    links, holdout = problem.setup.links, problem.setup.study.holdout
+    if count is None and by is None and holdout is not None:
+        count, by = holdout.blocks, holdout.by
+    counted = problem.objective.weight > 0
+    block = np.full(len(links), -1, dtype=np.int64)
+    if by is None:
+        count = BLOCKS if count is None else count
+        block[counted] = parted(links.rx[counted, :2], count)
+        labels = tuple(str(number + 1) for number in range(count))
+    else:
+        if by == TX and by not in links.frame:
+            given = np.unique(links.tx, axis=0, return_inverse=True)[1].reshape(-1).astype(str)
+        else:
+            given = links.table.labels(by)
+        names, place = np.unique(given[counted], return_inverse=True)
+        block[counted], labels = place, tuple(map(str, names))
+    fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
+    unknowns = len(problem.parameters) + int(problem.objective.determined.sum())
+    if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
+        raise InputError(
+            f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} to calibrate "
+            f"{unknowns} unknowns on; name two blocks or more, of fewer links each"
+        )
+    return block, labels
+
+
+def _models(part: Problem, known: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Path loss of every model at all links, fitted to those that count [L], [dB]."""
+    setup, objective = part.setup, part.objective
+    calibrated = _minima(part, known)
+    found = {
+        BEFORE: _predicted(_with_term(objective, CONSTANT, setup), part.before),
+        CALIBRATED: _at(part, calibrated[0]),
+    }
+    rows = objective.num_counted
+    freedom = max(rows - len(part.parameters) - int(objective.determined.sum()), 1)
+    noise = float(part.evaluate(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / freedom)
+    prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
+    slope = replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))
+    for name, variant in ((PRIOR, prior), (SLOPE, slope)):
+        found[name] = _at(variant, _minima(variant, calibrated)[0])
+    frequency = setup.study.scene.frequency
+    found[LAW] = log_distance(setup.links, objective, frequency)
+    try:
+        found[KRIGING] = kriging(setup.links, objective, found[LAW])
+    except (InputError, EngineError):
+        # Too few or too many links, or all at one place: nothing to krige.
+        found[KRIGING] = np.full(len(setup.links), np.nan)
+    return found
+
+
+def _minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHES) -> NDArray[np.float64]:
+    """Minima of a problem by local searches, the best first [k, d]."""
+    search = LeastSquares(*problem.parameters.search_bounds, starts=searches, x0=known[:MINIMA])
+    for _ in rounds(search, problem.evaluate):
+        pass
+    return search.minima
+
+
+def _at(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _predicted(problem.objective, problem.evaluate(point[None]).modelled[0])
+
+
+def _predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Path loss with the nuisance fitted to the links that count; a group that has none gets the mean [L], [dB]."""
+    coefficients = objective.coefficients(path_loss[None])
+    filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
+    return objective.capped(path_loss) + objective.nuisance.contribution(filled)[0]
+
+
+def _with_term(objective: Objective, by: str, setup: Setup) -> Objective:
+    """The objective with one coefficient of a kind for all links, if it has none of that kind."""
+    if any(term.by == by for term in objective.nuisance.terms):
+        return objective
+    term = make_term(setup.links, f"{by} of all links", by)
+    terms = (*objective.nuisance.terms, term)
+    return replace(objective, nuisance=Nuisance(len(setup.links), terms))
+
+
+def _start_priors(problem: Problem) -> LogNormal:
+    """The study's priors, and one around the start of every other parameter that is positive."""
+    parameters, given = problem.parameters, problem.priors
+    place = [
+        k for k, each in enumerate(parameters) if k not in given.index and each.lower > 0 and each.start > 0
+    ]
+    return LogNormal(
+        (*given.index, *place),
+        (*given.centre, *(float(parameters.start[k]) for k in place)),
+        (*given.spread, *(SPREAD for _ in place)),
+    )
+
+
+def _interactions(problem: Problem) -> int:
+    return problem.engine.interactions if isinstance(problem.engine, Differentiable) else 1

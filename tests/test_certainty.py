@@ -1,0 +1,199 @@
+"""What a calibration says of its own certainty: intervals, a free offset, priors, held-out blocks, predictions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import planted
+from calibray import engines
+from calibray.calibration import calibrate
+from calibray.calibration.problem import Problem
+from calibray.calibration.validate import validated
+from calibray.errors import InputError
+from calibray.inference.validation import CALIBRATED, LAW
+from calibray.paths import take_links
+from calibray.result import Result, tables
+from calibray.study import Setup
+from calibray.tables.text import render
+
+FEW = {"name": "auto", "options": {"starts": 64}}
+MARBLE = "marble.relative_permittivity"
+
+
+@pytest.fixture(autouse=True)
+def _no_cache(monkeypatch):
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+
+
+def run(folder, table: pd.DataFrame, **sections) -> Result:
+    sections = {"method": FEW, **sections}
+    return calibrate(planted.study(folder, table, **sections), engine=planted.engine())
+
+
+@pytest.fixture(scope="module")
+def noisy() -> pd.DataFrame:
+    return planted.campaign(noise_db=0.3)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory, noisy) -> Result:
+    """A calibration with noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", "")
+        return run(tmp_path_factory.mktemp("plain"), noisy)
+
+
+def test_intervals_come_from_profiles_and_say_why(result):
+    assert result.profile_calls > 100
+    for name, found in result.intervals.items():
+        assert (
+            found.pieces[0][0] == found.lower <= result.parameters[name] <= found.upper == found.pieces[-1][1]
+        )
+        assert found.reason
+    assert result.intervals[MARBLE].lower <= planted.TRUTH[MARBLE] <= result.intervals[MARBLE].upper
+    text = render(*tables.tables(result))
+    assert result.intervals[MARBLE].reason in text
+    assert f"{result.profile_calls:,} in" in text
+
+
+def test_draws_explain_the_links_about_as_well(result):
+    names = list(result.parameters)
+    points = np.stack([result.draws[name] for name in names], axis=1)
+    measured = result.links.measured_db.to_numpy()
+    rmse = np.sqrt(np.mean((planted.engine().path_loss(points) - measured) ** 2, axis=1))
+    assert rmse.min() >= result.rmse_db - 1e-9
+    assert np.median(rmse) < 1.5 * result.rmse_db
+    assert np.median(np.std(points, axis=0)) > 1e-3
+
+
+def test_an_offset_that_is_not_declared_is_said_aloud(tmp_path, noisy, result):
+    shifted = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + 4.0))
+    assert shifted.free_offset_db == pytest.approx(4.0, abs=4 * shifted.free_offset_error_db)
+    assert any("A free offset would be +" in remark for remark in shifted.remarks)
+    assert "A free offset" in render(*tables.tables(shifted))
+    # Negative controls: none planted, or one declared.
+    assert abs(result.free_offset_db) < 3 * result.free_offset_error_db
+    assert not any("free offset" in remark for remark in result.remarks)
+    declared = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + 4.0), offset={})
+    assert declared.free_offset_db is None
+
+
+def test_a_prior_pulls_and_its_weight_is_that_of_the_noise(tmp_path, noisy, result):
+    def found(spread, **sections):
+        entry = {"bounds": planted.BOUNDS, "prior": {"value": 4.0, "spread": spread}}
+        bounds = {name: {"bounds": planted.BOUNDS} for name in planted.TRUTH}
+        return run(tmp_path, noisy, parameters={**bounds, MARBLE: entry}, **sections)
+
+    free, tight, loud = found(5.0), found(0.01), found(0.1, noise={"std_db": 30.0})
+    assert free.parameters == pytest.approx(result.parameters, rel=2e-2)
+    assert tight.parameters[MARBLE] == pytest.approx(4.0, rel=0.1)
+    assert loud.parameters[MARBLE] == pytest.approx(4.0, rel=0.05)
+    # The RMSE stays the paper's, of the links alone.
+    assert tight.rmse_db > result.rmse_db
+    assert tight.rmse_db == tight.history.best_db.iloc[-1]
+    loss = planted.path_loss(tight.parameters)
+    assert np.sqrt(np.mean((loss - noisy.path_loss_db) ** 2)) == pytest.approx(tight.rmse_db)
+
+
+def test_a_slope_is_found_reported_and_predicted_with(tmp_path, noisy):
+    distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    table = noisy.assign(path_loss_db=planted.path_loss() + 9.0 * np.log10(distance), level=np.arange(12.0))
+    sections = {"offset": {}, "nuisance": {"clutter": {"by": "log_distance"}}}
+    found = run(tmp_path, table, **sections)
+    assert found.nuisances["clutter"][""] == pytest.approx(9.0, abs=0.1)
+    assert found.parameters == pytest.approx(planted.TRUTH, rel=0.05)
+    found.save(tmp_path / "out")
+    loaded = Result.load(tmp_path / "out")
+    assert loaded.content() == found.content()
+    again = loaded.predict(planted.links())
+    assert again == pytest.approx(found.links.after_db.to_numpy(), abs=1e-6)
+    assert "clutter" in render(*tables.tables(found))
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"nuisance": {"offset": {"by": "constant"}}}, "nuisance.offset"),
+        ({"nuisance": {"a": {"by": "constant", "prior": 0}}}, "prior"),
+        ({"holdout": {"blocks": 4, "by": "half"}}, "one of where, blocks and by"),
+        ({"holdout": {}}, "one of where, blocks and by"),
+        ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"spread": 0.3}}}}, "one of itu and value"),
+        ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"itu": "bread", "spread": 1}}}}, "bread"),
+    ],
+)
+def test_keys_that_mean_nothing_are_refused(tmp_path, noisy, sections, message):
+    with pytest.raises(InputError, match=message):
+        planted.study(tmp_path, noisy, **sections)
+
+
+def test_the_noise_must_be_stated_where_it_cannot_be_estimated(tmp_path, noisy):
+    entry = {
+        name: {"bounds": planted.BOUNDS, "prior": {"value": 4.0, "spread": 0.3}} for name in planted.TRUTH
+    }
+    table = noisy.head(3)
+    study = planted.study(tmp_path, table, parameters=entry, method=FEW)
+    few = engines.Replay(take_links(planted.engine().paths, np.arange(3)), planted.engine().parameters)
+    with pytest.raises(InputError, match=r"noise\.std_db: is required"):
+        calibrate(study, engine=few)
+
+
+def validation(folder, table, **sections):
+    """Blocks held out in turn, on the paths traced once."""
+    setup = Setup.open(planted.study(folder, table, **sections))
+    return validated(Problem.of(setup, planted.engine()), **({} if sections else {"blocks": 3}))
+
+
+def test_calibration_helps_where_its_truth_was_planted(tmp_path, noisy):
+    found = validation(tmp_path, noisy)
+    assert found.table.loc[CALIBRATED, "rmse_db"] < 0.5 * found.table.loc[LAW, "rmse_db"]
+    assert "did not help" not in found.sentence
+    assert found.best.startswith("calibrated")
+
+
+def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
+    distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    noise = 0.5 * np.random.default_rng(5).standard_normal(12)
+    law = noisy.assign(path_loss_db=30 + 35 * np.log10(distance) + noise)
+    found = validation(tmp_path, law, offset={}, holdout={"blocks": 3})
+    assert found.sentence.startswith("Calibration did not help")
+    assert found.best not in ("calibrated", "calibrated with prior")
+
+
+def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
+    found = run(tmp_path, noisy, holdout={"by": "half"})
+    assert not found.links.held_out.any()
+    assert found.holdout_rmse_db > found.rmse_db
+    assert found.residual_basis == "2 blocks held out in turn"
+    assert found.residual_db == pytest.approx(found.holdout_rmse_db)
+    assert any(remark.startswith("Calibration ") for remark in found.remarks)
+
+
+def test_prediction_tells_how_sure_it_is(tmp_path, noisy, result):
+    table = result.predict_interval(planted.links(), 0.9)
+    truth = planted.path_loss()
+    assert table.path_loss_db.to_numpy() == pytest.approx(result.predict(planted.links()), abs=1e-6)
+    assert ((table.lower_db < truth) & (truth < table.upper_db)).mean() > 0.8
+    wider = result.predict_interval(planted.links(), 0.99)
+    assert (wider.upper_db > table.upper_db).all()
+    assert set(table.basis) == {"errors of 12 links calibrated on"}
+    blocked = result.predict_interval(planted.links(blocked=True))
+    assert blocked.basis[planted.INSIDE] == "no path"
+    assert np.isnan(blocked.lower_db[planted.INSIDE])
+    with pytest.raises(InputError, match=r"level = 1\.5"):
+        result.predict_interval(planted.links(), 1.5)
+
+
+def test_a_group_never_measured_gets_the_spread_of_the_others(tmp_path, noisy):
+    shift = noisy.half.map({"west": -6.0, "east": 6.0})
+    found = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + shift), offset={"per": "half"})
+    seen = found.predict_interval(planted.links())
+    unseen = found.predict_interval(planted.links().assign(half="north"))
+    width = (unseen.upper_db - unseen.lower_db) / (seen.upper_db - seen.lower_db)
+    assert (width > 3).all()
+    assert all("group never measured" in basis for basis in unseen.basis)
+    middle = found.predict(planted.links().assign(half="west")) + found.predict(
+        planted.links().assign(half="east")
+    )
+    assert unseen.path_loss_db.to_numpy() == pytest.approx(middle / 2, abs=1e-6)
