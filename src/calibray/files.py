@@ -147,6 +147,23 @@ def is_own(file: Path) -> bool:
     return False
 
 
+def check_unchanged(file: Path) -> None:
+    """Refuse a file that Calibray signed and that is another now; one that nobody signed may be what it is.
+
+    Args:
+        file: The file, which can be read.
+
+    Raises:
+        InputError: The file changed since it was written.
+    """
+    signed = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
+    if signed and _signature(file, file.name) not in signed:
+        raise InputError(
+            f"{file}: changed since Calibray wrote it, and may say what was never found; run the study again, or "
+            "give --anyway (anyway=True)"
+        )
+
+
 def _signatures(folder: Path) -> list[str]:
     try:
         return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()

@@ -7,7 +7,7 @@ running, 2 for bad input. Commands import what they need when they run, so that 
 from __future__ import annotations
 
 from importlib import metadata
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -27,8 +27,27 @@ from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
 
 
+LONGEST: Final = 4096
+"""The number of characters beyond which an argument is refused; Linux takes no longer path."""
+
+
 class Commands(TyperGroup):
     """A group of commands whose expected failures are one message and an exit status, not a traceback."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Part the command from what is its own.
+
+        Args:
+            ctx: What will be parsed.
+            args: The command line.
+
+        Returns:
+            The arguments that are the command's.
+        """
+        for argument in args:
+            if len(argument) > LONGEST:
+                ctx.fail(f"an argument has {len(argument)} characters, must have at most {LONGEST}")
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
