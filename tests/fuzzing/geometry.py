@@ -21,9 +21,9 @@ from fuzzing.mutations import NUMBERS, TEXTS, damage
 from fuzzing.outcome import Case
 from fuzzing.world import OWN, World
 
-TRACED = 0.5
+TRACED = 0.3
 """Share of the scenes that are traced where they can be read."""
-_NAMES = ("scene.xml", "meshes", "[objects]", "[materials]", "material", "scene", "trace", "shape")
+_NAMES = ("scene.xml", "meshes", "mesh ", "[objects]", "[materials]", "material", "scene", "trace", "shape")
 
 
 def _traced(study: Path, whole: bool) -> Callable[[], list[float]]:

@@ -22,7 +22,7 @@ from fuzzing.mutations import TEXTS, damage, edited, hostile, soup, toml
 from fuzzing.outcome import Case, Exited
 from fuzzing.world import OWN, World
 
-DEEP = 0.3
+DEEP = 0.15
 """Share of the studies that are run to the end; the rest is opened."""
 VARIANTS: tuple[Mapping[str, Any], ...] = (
     {},

@@ -11,17 +11,17 @@ from fuzzing.world import World
 
 SHARES = {
     inputs.study: 22,
-    inputs.row_filter: 10,
-    inputs.table: 12,
-    geometry.scene: 10,
-    geometry.mesh: 9,
-    geometry.antenna: 5,
-    stored.paths: 8,
+    inputs.row_filter: 12,
+    inputs.table: 14,
+    geometry.scene: 8,
+    geometry.mesh: 8,
+    geometry.antenna: 7,
+    stored.paths: 9,
     stored.cache: 3,
-    stored.ledger: 5,
+    stored.ledger: 4,
     stored.result: 8,
-    outside.answer: 3,
-    outside.line: 10,
+    outside.answer: 2,
+    outside.line: 7,
 }
 """Cases of each kind of a hundred or so."""
 

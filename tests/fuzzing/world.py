@@ -9,6 +9,7 @@ import io
 import json
 import os
 import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,11 @@ class World:
         found = path_loss(setup.tracer.trace(setup.links))
         if not np.array_equal(found, self.right["path_loss"]):
             raise RuntimeError(f"an undamaged study gives {found}, gave {self.right['path_loss']}")
+        with tempfile.TemporaryDirectory(dir=self.place) as folder:
+            again = rmse(self.copy(Path(folder)), "-o", Path(folder) / "out")["rmse_db"]
+            if not np.isclose(again, self.right["rmse"], rtol=1e-9):
+                raise RuntimeError(f"an undamaged study gives {again} dB, gave {self.right['rmse']} dB")
+            predicted(self.base / "out", self.base / "new.csv")
 
     def copy(self, folder: Path, *more: str) -> Path:
         """Copy the user's files, and more of what calibrating left; gives the study file."""

@@ -26,7 +26,6 @@ from calibray.cli.schema import schema
 from calibray.cli.trace import trace
 from calibray.errors import EngineError, InputError
 
-
 LONGEST: Final = 4096
 """The number of characters beyond which an argument is refused; Linux takes no longer path."""
 
@@ -59,7 +58,8 @@ class Commands(TyperGroup):
             What the command returns.
 
         Raises:
-            typer.Exit: With 2 on bad input, with 1 when an engine failed.
+            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or written.
+            BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
             return super().invoke(ctx)
@@ -68,6 +68,12 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from error
         except EngineError as error:
             typer.echo(f"Error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            place = "" if error.filename is None else f"{error.filename}: "
+            typer.echo(f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True)
             raise typer.Exit(1) from error
 
 

@@ -94,7 +94,8 @@ def words(fault: Mapping[str, Any]) -> str:
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
-    return str(_WORDS.get(fault["type"]) or fault["msg"]).format(**context)
+    template = _WORDS.get(fault["type"])
+    return fault["msg"] if template is None else template.format(**context)
 
 
 def dotted(path: Sequence[str | int]) -> str:
