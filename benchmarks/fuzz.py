@@ -23,6 +23,7 @@ import threading
 import time
 import traceback
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -59,12 +60,13 @@ def work(place: Path, seed: int) -> None:
             case = make(seed, number, found, folder)
         except Exception:
             case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
+        started = time.monotonic()
         watch.programs = case.kind in ("study", "answer", "ledger", "line")
         verdict = judge(case, folder, watch)
         if peak() > MEMORY:
             verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")
-        told = {"number": number, "kind": case.kind, "note": case.note, "verdict": verdict.verdict, "detail": verdict.detail}
-        print(json.dumps(told), file=answers, flush=True)
+        told = {"number": number, "kind": case.kind, "note": case.note} | asdict(verdict)
+        print(json.dumps(told | {"seconds": time.monotonic() - started}), file=answers, flush=True)
         _remove(folder)
 
 
@@ -136,7 +138,7 @@ class Worker:
         verdict = "crash" if line == "" else "announced" if COST.search(said) else "hang"
         detail = f"status {self._process.returncode}, {said}"
         self._start()
-        return {"number": number, "kind": case.kind, "note": case.note, "verdict": verdict, "detail": detail}
+        return {"number": number, "kind": case.kind, "note": case.note, "verdict": verdict, "detail": detail, "seconds": LIMIT}
 
     def end(self) -> None:
         """End the process and what it started."""
@@ -184,10 +186,11 @@ def report(found: list[dict[str, object]]) -> int:
     """Print counts by kind and by what came of it; 1 if something forbidden did."""
     counts = Counter((str(told["kind"]), str(told["verdict"])) for told in found)
     columns = [*ALLOWED, *FORBIDDEN]
-    print(f"{'':9}{'cases':>7}" + "".join(f"{name:>11}" for name in columns))
+    print(f"{'':9}{'cases':>7}{'ms':>7}" + "".join(f"{name:>11}" for name in columns))
     for kind in [*sorted({kind for kind, _ in counts}), "all"]:
         row = [sum(n for (k, v), n in counts.items() if kind in (k, "all") and v == name) for name in columns]
-        print(f"{kind:9}{sum(row):7}" + "".join(f"{number:11}" for number in row))
+        spent = [float(str(told["seconds"])) for told in found if kind in (told["kind"], "all")]
+        print(f"{kind:9}{sum(row):7}{1e3 * sum(spent) / len(spent):7.0f}" + "".join(f"{number:11}" for number in row))
     bad = sorted(int(str(told["number"])) for told in found if told["verdict"] in FORBIDDEN)
     if bad:
         print(f"\nforbidden: {', '.join(map(str, bad[:100]))}; see one again with --case N")
