@@ -118,7 +118,10 @@ _FAMILIAR = {
     "engine": ("replay", "retrace", "command"), "method": ("random", "auto", "gwo", "sobol"), "methods": ("random,sobol", "random@8", ","),
     "seed": ("0", "7"), "seeds": ("1", "2", "0"), "budget": ("4", "1"), "workers": ("1", "2", "0"),
 }  # fmt: skip
-_SLOW = ("demo", "doctor")
+_HERE = {
+    "folder": "out", "links_file": "new.csv", "study_file": "study.toml", "scene": "scene.xml", "links": "links.csv",
+    "subject": "scene.xml",
+}  # fmt: skip
 
 
 def line(rng: Random, found: World, folder: Path) -> Case:
@@ -132,15 +135,14 @@ def line(rng: Random, found: World, folder: Path) -> Case:
         name = rng.choice(sorted(command.commands))
         words.append(name)
         command = command.commands[name]
-    slow = words[-1] in _SLOW
-    if words[-1] == "doctor":
-        words.append(rng.choice(VALUES))
+    if words == ["compare"]:
+        words += ["--methods=random@8", "--seeds=1"]  # what is given below counts, being later
     for parameter in command.params:
         required = parameter.required or _is_argument(parameter)
         if not (required and rng.random() < 0.97) and rng.random() < 0.7:
             continue
-        words += _given(rng, parameter, slow)
-    if slow and words[0] == "demo":
+        words += _given(rng, parameter)
+    if words[0] == "demo":
         words += ["--engine", rng.choice(("nothing", "", "command"))]  # or it would run for minutes
     if rng.random() < 0.05:
         words.insert(rng.randrange(len(words) + 1), rng.choice(VALUES))
@@ -161,13 +163,13 @@ def _is_argument(parameter: Any) -> bool:
     return parameter.param_type_name == "argument"
 
 
-def _given(rng: Random, parameter: Any, slow: bool) -> list[str]:
+def _given(rng: Random, parameter: Any) -> list[str]:
     """The words that give a parameter a value."""
     name = parameter.name or ""
     if name in ("out",):
         value = rng.choice(TARGETS)
     elif _is_argument(parameter) and rng.random() < 0.8:
-        value = {"folder": "out", "links_file": "new.csv", "study_file": "study.toml"}.get(name, rng.choice(TARGETS))
+        value = _HERE.get(name, rng.choice(TARGETS))
     elif name in _FAMILIAR and rng.random() < 0.6:
         value = rng.choice(_FAMILIAR[name])
     else:

@@ -132,10 +132,10 @@ def calibray(*arguments: object) -> str:
             if not hasattr(error, "exit_code"):
                 raise
             raise Exited(error.exit_code, str(error)) from None
-    if status:
-        err.seek(0)
-        raise Exited(int(status), err.read())
+    err.seek(0)
     out.seek(0)
+    if status:
+        raise Exited(int(status), err.read() or out.read())
     return out.read()
 
 
