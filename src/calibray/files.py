@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from calibray.errors import InputError
+from calibray.spelling import shortened
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,12 +64,27 @@ def check_folder(folder: str | Path) -> Path:
     Raises:
         InputError: It, or what it would be made in, is a file or cannot be written.
     """
-    target = Path(folder)
+    target = _named(folder, "output folder")
     nearest = next(path for path in (target, *target.absolute().parents) if path.exists())
     if not nearest.is_dir():
         raise InputError(f"output folder {target}: {nearest} is a file; name another folder")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(f"output folder {target}: {nearest} cannot be written; name another folder")
+    return target
+
+
+def _named(path: str | Path, role: str) -> Path:
+    """The path of an output, whose name some file could have."""
+    target = Path(path)
+    place = f"{role} {shortened(str(target), 300)}"
+    try:
+        target.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise InputError(f"{place}: cannot be looked up ({error.strerror}); name another") from None
+    except ValueError as error:
+        raise InputError(f"{place}: cannot be a name ({error}); name another") from None
     return target
 
 
@@ -147,6 +163,23 @@ def is_own(file: Path) -> bool:
     return False
 
 
+def check_unchanged(file: Path) -> None:
+    """Refuse a file that Calibray signed and that is another now; one that nobody signed may be what it is.
+
+    Args:
+        file: The file, which can be read.
+
+    Raises:
+        InputError: The file changed since it was written.
+    """
+    signed = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
+    if signed and _signature(file, file.name) not in signed:
+        raise InputError(
+            f"{file}: changed since Calibray wrote it, and may say what was never found; run the study again, or "
+            "give --anyway (anyway=True)"
+        )
+
+
 def _signatures(folder: Path) -> list[str]:
     try:
         return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -193,7 +226,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
     Raises:
         InputError: It is a folder, its folder does not exist or cannot be written, or what `check_replaceable` refuses.
     """
-    target = Path(file)
+    target = _named(file, "output file")
     if target.is_dir():
         raise InputError(f"output file {target}: is a folder; name a file in it")
     if not target.parent.is_dir():

@@ -7,7 +7,7 @@ running, 2 for bad input. Commands import what they need when they run, so that 
 from __future__ import annotations
 
 from importlib import metadata
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -27,9 +27,27 @@ from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
 
+LONGEST: Final = 4096
+"""The number of characters beyond which an argument is refused; Linux takes no longer path."""
+
 
 class Commands(TyperGroup):
     """A group of commands whose expected failures are one message and an exit status, not a traceback."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Part the command from what is its own.
+
+        Args:
+            ctx: What will be parsed.
+            args: The command line.
+
+        Returns:
+            The arguments that are the command's.
+        """
+        for argument in args:
+            if len(argument) > LONGEST:
+                ctx.fail(f"an argument has {len(argument)} characters, must have at most {LONGEST}")
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -41,7 +59,8 @@ class Commands(TyperGroup):
             What the command returns.
 
         Raises:
-            typer.Exit: With 2 on bad input, with 1 when an engine failed.
+            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or written.
+            BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
             return super().invoke(ctx)
@@ -50,6 +69,12 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from error
         except EngineError as error:
             typer.echo(f"Error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            place = "" if error.filename is None else f"{error.filename}: "
+            typer.echo(f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True)
             raise typer.Exit(1) from error
 
 

@@ -40,6 +40,7 @@ def compare(
 
     from calibray.cli.progress import progress_bars
     from calibray.comparison.arena import study_arena
+    from calibray.comparison.comparison import Contender
     from calibray.comparison.comparison import compare as run_all
     from calibray.comparison.tables import optimum, table
     from calibray.files import check_outputs
@@ -49,6 +50,9 @@ def compare(
 
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     names = [name.strip() for name in methods.split(",") if name.strip()]
+    contenders = [Contender.parse(name, budget) for name in dict.fromkeys(names)]
+    calls = seeds * sum(contender.budget for contender in contenders)
+    typer.echo(f"{seeds * len(contenders):,} runs of {calls:,} RT calls together, less those kept in {out}", err=True)
     with progress_bars(log) as progress:
         finished = run_all(
             partial(study_arena, study_file),

@@ -54,7 +54,7 @@ def _machine() -> None:
 def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
     """Examine a scene, or a study's scene with its antennas."""
     from calibray.cli.progress import progress_bars
-    from calibray.report import scenes as report
+    from calibray.reporting import scenes as report
     from calibray.scenes.diagnosis import diagnose
     from calibray.study import Study
     from calibray.tables.text import render
@@ -74,7 +74,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
 def _draw(study: Study, plot: Path, overwrite: bool) -> None:
     """Draw a study's antennas over its scene."""
-    from calibray.report.scenes import save_positions
+    from calibray.reporting.scenes import save_positions
 
     links = study.measurements()
     save_positions(plot, study.scene_source, links.tx, links.rx, study.files(), overwrite)

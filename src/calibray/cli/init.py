@@ -38,7 +38,7 @@ def init(
     """Look at a scene and a table of links, tell what is assumed and why, and write a study that runs."""
     from calibray.cli.sanity import warn
     from calibray.files import check_file, write_text
-    from calibray.report.scenes import assumed, save_positions
+    from calibray.reporting.scenes import assumed, save_positions
     from calibray.study.draft import draft
     from calibray.study.draft_text import SCHEMA_FILE
     from calibray.study.schema import schema_text

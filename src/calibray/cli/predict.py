@@ -46,7 +46,7 @@ def predict(
     ] = None,
     anyway: Annotated[
         bool,
-        typer.Option("--anyway", help="Predict although a file of the scene or an antenna changed since."),
+        typer.Option("--anyway", help="Predict although a file of the result, the scene or an antenna changed since."),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -59,7 +59,7 @@ def predict(
     from calibray.result import Result
     from calibray.tables.text import rows_text
 
-    result = Result.load(folder)
+    result = Result.load(folder, anyway=anyway)
     study = result.study
     links = read_links(
         links_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency

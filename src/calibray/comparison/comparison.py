@@ -39,6 +39,7 @@ ROUNDING_DB: Final = 1e-7  # below which objectives are taken for equal
 OPTIMUM: Final = "optimum"  # the run that finds it, among the runs kept
 REFERENCE: Final = "least-squares"  # which finds it
 OPTIMUM_STARTS: Final = {False: 2048, True: 64}  # its local searches on small and on large path programs
+MOST: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}  # beyond which no comparison ends
 
 Open = Callable[[], Arena]
 
@@ -86,9 +87,10 @@ class Contender:
             with suppress(ValueError):
                 budget = int(own)
         least = 1 if schedule is None else schedule.least
-        if (own and own != str(budget)) or budget < least:
+        if (own and own != str(budget)) or not least <= budget <= MOST["budget"]:
             raise InputError(
-                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number >= {least}"
+                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number of {least} to "
+                f"{MOST['budget']:,}"
             )
         return Contender(name, method, budget)
 
@@ -299,8 +301,8 @@ def compare(
         InputError: A method, a number or the folder cannot be used.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):
-        if value < 1:
-            raise InputError(f"{name} = {value}; it must be at least 1")
+        if not 1 <= value <= MOST[name]:
+            raise InputError(f"{name} = {value}; it must be 1 to {MOST[name]:,}")
     contenders = tuple(Contender.parse(name, budget) for name in dict.fromkeys(methods))
     if not contenders:
         raise InputError(f"methods: none is named; {did_you_mean('', METHODS)}")

@@ -98,11 +98,12 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
         The experiment.
 
     Raises:
-        InputError: The engine is unknown.
+        InputError: The engine is unknown, or the seed is impossible.
     """
     study = Study.load(demo_study_path())
     started = time.perf_counter()
     setup = Setup.open(study)
+    setup.replace(seed=seed, engine=engine)  # what cannot be used is refused before anything is traced
     replay = engines.make(setup, "replay", progress)
     trace_seconds = time.perf_counter() - started
     chosen = replay if engine == "replay" else engines.make(setup, engine)

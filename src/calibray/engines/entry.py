@@ -83,7 +83,8 @@ def read_entry(
         The entry, or what is wrong with the row.
     """
     blob, seconds, failure, digest = columns
-    if not isinstance(blob, bytes) or not isinstance(seconds, float) or not isinstance(failure, str):
+    parts = (problem, str), (candidate, bytes), (blob, bytes), (seconds, float), (failure, str)
+    if not all(isinstance(part, kind) for part, kind in parts):
         return "a value of another type"
     if len(blob) % 8 or (num_links is not None and len(blob) != 8 * num_links):
         return f"{len(blob)} bytes of path loss" + ("" if num_links is None else f" for {num_links} links")

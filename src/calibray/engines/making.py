@@ -48,7 +48,7 @@ def make(
             the study's scene, links or parameters cannot be used.
     """
     setup = study.opened()
-    name = name or setup.study.engine.name
+    name = setup.study.engine.name if name is None else name
     if name not in KINDS:
         raise InputError(f"engine {name!r}: must be one of {', '.join(KINDS)}")
     if executor is not None and not KINDS[name].external:

@@ -162,6 +162,8 @@ def _read_csv(path: Path) -> SourceTable:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             text = file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
@@ -171,11 +173,11 @@ def _read_csv(path: Path) -> SourceTable:
         return SourceTable(pd.DataFrame())
     try:
         frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
-    except pd.errors.ParserError as error:
-        # Reading from memory fails for one reason only: pandas takes Ctrl-C in the midst of it for a failure.
+    except ValueError as error:
+        # Reading from memory fails so for one reason only: pandas takes Ctrl-C in the midst of it for a failure.
         if "source failed" in str(error):
             raise KeyboardInterrupt from None
-        raise
+        raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
     if len(frame) != len(lines):
         raise InputError(f"{path}: {len(lines)} rows stand in it but {len(frame)} are read; check its quotes")
     return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import check_outputs, write_text
+from calibray.files import check_outputs, check_unchanged, write_text
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
@@ -220,11 +220,12 @@ class Result:
         }
 
     @classmethod
-    def load(cls, folder: str | Path) -> Result:
+    def load(cls, folder: str | Path, *, anyway: bool = False) -> Result:
         """Read a folder that `save` wrote.
 
         Args:
             folder: The folder.
+            anyway: Read it although its files changed since they were written.
 
         Returns:
             The result.
@@ -235,6 +236,9 @@ class Result:
         source = Path(folder) / RESULT_FILE
         stored, study = read_stored(source)
         links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
+        for name in () if anyway else (RESULT_FILE, *COLUMNS):
+            if (source.parent / name).exists():
+                check_unchanged(source.parent / name)
         given = {name: getattr(stored, name) for name in type(stored).model_fields}
         for name in ("version", "study_file", "links", "antennas_indoors"):
             del given[name]

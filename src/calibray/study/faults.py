@@ -64,7 +64,7 @@ def explain(
         if location[:1] and location[0] in tagged:
             # The kind stands behind the table's name, which is no key.
             location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
-        path = _path(location, content)
+        path = _path(location, content, fault["type"] == "missing")
         key = dotted(path)
         if fault["type"] in _UNKNOWN:
             line = f"{key}: unknown key; {did_you_mean(str(path[-1]), _keys(model, path[:-1]))}"
@@ -94,7 +94,8 @@ def words(fault: Mapping[str, Any]) -> str:
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
-    return str(_WORDS.get(fault["type"]) or fault["msg"]).format(**context)
+    template = _WORDS.get(fault["type"])
+    return fault["msg"] if template is None else template.format(**context)
 
 
 def dotted(path: Sequence[str | int]) -> str:
@@ -109,13 +110,13 @@ def dotted(path: Sequence[str | int]) -> str:
     return text
 
 
-def _path(location: Sequence[str | int], content: Any) -> tuple[str | int, ...]:
-    """Pydantic's location without the parts that name a type instead of a key."""
+def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
+    """Pydantic's location without the parts that name a type instead of a key; only a missing key is in no table."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1
         if isinstance(content, Mapping):
-            if part not in content and not last:
+            if part not in content and not (missing and last):
                 break
             content = content.get(part)
         elif isinstance(content, list) and isinstance(part, int):

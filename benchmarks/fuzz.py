@@ -1,0 +1,245 @@
+"""Hostile input of every kind, thousands of cases from a seed; says what came of each kind, and what must not.
+
+Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W], or, to see one case again,
+python benchmarks/fuzz.py --seed S --case N [--keep DIR]
+
+Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root on
+Linux everything but a temporary folder is read-only to them, in a mount namespace of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import json
+import os
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+LIMIT = 30.0
+"""Processor time that a case may take [s]; waiting for it counts a quarter, so that a busy machine is no hang."""
+START = 600.0
+"""Time that a worker may take to start [s]."""
+INSIDE = "CALIBRAY_FUZZ_PLACE"  # the temporary folder, set within the mount namespace
+COST = re.compile(r"\b(GiB|MiB|GB|rays|minutes|hours|seconds|calls)\b")
+
+
+def work(place: Path, seed: int) -> None:
+    """Run the cases whose numbers stand on standard input, and print what came of each."""
+    from fuzzing.kinds import make
+    from fuzzing.outcome import MEMORY, Case, Verdict, Watch, judge, peak, restart_peak
+    from fuzzing.world import World
+
+    faulthandler.enable()
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    found = World.open(place)
+    found.warm()
+    watch = Watch(str(place))
+    sys.addaudithook(watch)
+    print("ready", file=answers, flush=True)
+    for line in sys.stdin:
+        number = int(line)
+        folder = Path(tempfile.mkdtemp(dir=place, prefix=f"case-{number}-"))
+        os.environ["CALIBRAY_CACHE"] = str(place / "cache")
+        os.ftruncate(2, 0)
+        restart_peak()
+        try:
+            case = make(seed, number, found, folder)
+        except Exception:
+            case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
+        started = time.monotonic()
+        watch.programs = case.kind in ("study", "answer", "ledger", "line")
+        verdict = judge(case, folder, watch)
+        if peak() > MEMORY:
+            verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")
+        told = {"number": number, "kind": case.kind, "note": case.note} | asdict(verdict)
+        print(json.dumps(told | {"seconds": time.monotonic() - started}), file=answers, flush=True)
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a case's folder, unless it is to be kept."""
+    if "CALIBRAY_FUZZ_KEEP" not in os.environ:
+        for path in (folder, *folder.rglob("*")):
+            if path.is_dir() and not path.is_symlink():
+                path.chmod(0o700)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class Worker:
+    """A process that runs cases, and is started again when it is lost."""
+
+    def __init__(self, place: Path, name: str, seed: int) -> None:
+        self._place, self._errors, self._seed = place, place / f"{name}.err", seed
+        self._start()
+
+    def _start(self) -> None:
+        command = [sys.executable, __file__, "--work", str(self._place), "--seed", str(self._seed)]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors.open("ab"), text=True,
+            start_new_session=True,
+        )  # fmt: skip
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._listen, args=(self._process, self._lines), daemon=True).start()
+        if self._next(START) != "ready\n":
+            sys.exit(f"a worker does not start:\n{self._errors.read_text()[-3000:]}")
+
+    @staticmethod
+    def _listen(process: subprocess.Popen, lines: queue.Queue[str]) -> None:
+        for line in process.stdout:
+            lines.put(line)
+        lines.put("")
+
+    def _next(self, limit: float) -> str | None:
+        try:
+            return self._lines.get(timeout=limit)
+        except queue.Empty:
+            return None
+
+    def _spent(self) -> float:
+        """Processor time of the process [s]; 0 where the system does not tell."""
+        try:
+            words = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
+
+    def run(self, number: int) -> dict[str, object]:
+        """Run a case, and tell what came of it."""
+        from fuzzing.kinds import make
+        from fuzzing.world import World
+
+        self._process.stdin.write(f"{number}\n")
+        self._process.stdin.flush()
+        line, before, started = None, self._spent(), time.monotonic()
+        while line is None and max(self._spent() - before, (time.monotonic() - started) / 4) < LIMIT:
+            line = self._next(1.0)
+        if line:
+            return json.loads(line)
+        said = self._errors.read_text(errors="replace")[-3000:]
+        self.end()
+        folder = Path(tempfile.mkdtemp(dir=self._place, prefix=f"again-{number}-"))
+        world = World(self._place, self._place / "base", json.loads((self._place / "base/right.json").read_text()))
+        case = make(self._seed, number, world, folder)
+        _remove(folder)
+        verdict = "crash" if line == "" else "announced" if COST.search(said) else "hang"
+        detail = f"status {self._process.returncode}, {said}"
+        self._start()
+        return {"number": number, "kind": case.kind, "note": case.note, "verdict": verdict, "detail": detail, "seconds": LIMIT}
+
+    def end(self) -> None:
+        """End the process and what it started."""
+        try:
+            os.killpg(self._process.pid, 9)
+        except ProcessLookupError:
+            pass
+        self._process.wait()
+
+
+def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dict[str, object]]:
+    """Run cases, with progress on stderr."""
+    waiting: queue.Queue[int] = queue.Queue()
+    for number in numbers:
+        waiting.put(number)
+    found: list[dict[str, object]] = []
+
+    def serve(worker: Worker) -> None:
+        while True:
+            try:
+                number = waiting.get_nowait()
+            except queue.Empty:
+                return
+            told = worker.run(number)
+            found.append(told)
+            if told["verdict"] in FORBIDDEN:
+                print(f"\ncase {number}: {told['verdict']}: {told['kind']}, {told['note']}\n{told['detail']}", file=sys.stderr)
+
+    crew = [Worker(place, f"worker-{k}", seed) for k in range(min(workers, len(numbers)))]
+    threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in crew]
+    started = time.monotonic()
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        time.sleep(0.5)
+        if sys.stderr.isatty():
+            print(f"\r{len(found)} of {len(numbers)} cases, {time.monotonic() - started:.0f} s", end="", file=sys.stderr)
+    print(file=sys.stderr)
+    for worker in crew:
+        worker.end()
+    return found
+
+
+def report(found: list[dict[str, object]]) -> int:
+    """Print counts by kind and by what came of it; 1 if something forbidden did."""
+    counts = Counter((str(told["kind"]), str(told["verdict"])) for told in found)
+    columns = [*ALLOWED, *FORBIDDEN]
+    print(f"{'':9}{'cases':>7}{'ms':>7}" + "".join(f"{name:>11}" for name in columns))
+    for kind in [*sorted({kind for kind, _ in counts}), "all"]:
+        row = [sum(n for (k, v), n in counts.items() if kind in (k, "all") and v == name) for name in columns]
+        spent = [float(str(told["seconds"])) for told in found if kind in (told["kind"], "all")]
+        print(f"{kind:9}{sum(row):7}{1e3 * sum(spent) / len(spent):7.0f}" + "".join(f"{number:11}" for number in row))
+    bad = sorted(int(str(told["number"])) for told in found if told["verdict"] in FORBIDDEN)
+    if bad:
+        print(f"\nforbidden: {', '.join(map(str, bad[:100]))}; see one again with --case N")
+    return 1 if bad else 0
+
+
+def main(place: Path, chosen: argparse.Namespace) -> int:
+    """Run the cases that were chosen."""
+    numbers = [chosen.case] if chosen.case is not None else list(range(chosen.first, chosen.first + chosen.cases))
+    found = attack(place, numbers, chosen.seed, chosen.workers)
+    if chosen.case is not None:
+        told = found[0]
+        print(f"{told['kind']}: {told['note']}\n{told['verdict']}: {told['detail']}")
+    return report(found)
+
+
+def _apart(place: str) -> int:
+    """Start again where nothing but the temporary folder can be written; its files lie in memory."""
+    script = (
+        f"mount --make-rprivate / && mount -t tmpfs -o size=2g tmpfs {place} && mount -o remount,bind,ro / && "
+        'mount -o remount,bind,ro /dev; mount -t tmpfs -o size=1g tmpfs /dev/shm; exec "$@"'
+    )
+    command = ["unshare", "-m", "sh", "-c", script, "sh", sys.executable, *sys.argv]
+    return subprocess.run(command, check=False, env={**os.environ, INSIDE: place}).returncode
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=1000)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--case", type=int, help="run this one, and print all of it")
+    parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.work is not None:
+        work(options.work, options.seed)
+        sys.exit()
+    from fuzzing.outcome import ALLOWED, FORBIDDEN
+
+    if INSIDE not in os.environ:
+        with tempfile.TemporaryDirectory(prefix="calibray-fuzz-") as fresh:
+            alone = ["unshare", "-m", "true"]
+            if os.geteuid() == 0 and subprocess.run(alone, check=False, stderr=subprocess.DEVNULL).returncode == 0:
+                sys.exit(_apart(fresh))
+            os.environ[INSIDE] = fresh
+            print("no mounts allowed here: cases run as this user does", file=sys.stderr)
+            os.environ |= {"HOME": fresh, "TMPDIR": fresh, "XDG_STATE_HOME": f"{fresh}/state"}
+            sys.exit(main(Path(fresh), options))
+    here = os.environ[INSIDE]
+    os.environ |= {"HOME": here, "TMPDIR": here, "XDG_STATE_HOME": f"{here}/state", "XDG_CACHE_HOME": f"{here}/.cache"}
+    sys.exit(main(Path(here), options))

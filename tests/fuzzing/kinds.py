@@ -1,0 +1,43 @@
+"""All kinds of input, each with its share of the cases, and a case by its number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from random import Random
+
+from fuzzing import geometry, inputs, outside, stored
+from fuzzing.outcome import Case
+from fuzzing.world import World
+
+SHARES = {
+    inputs.study: 22,
+    inputs.row_filter: 12,
+    inputs.table: 14,
+    geometry.scene: 8,
+    geometry.mesh: 8,
+    geometry.antenna: 7,
+    stored.paths: 9,
+    stored.cache: 3,
+    stored.ledger: 4,
+    stored.result: 8,
+    outside.answer: 2,
+    outside.line: 7,
+}
+"""Cases of each kind of a hundred or so."""
+
+
+def make(seed: int, number: int, found: World, folder: Path) -> Case:
+    """A case: the same for the same seed and number, wherever it is made.
+
+    Args:
+        seed: The seed of the suite.
+        number: Number of the case.
+        found: The world.
+        folder: An empty folder for the case's files.
+
+    Returns:
+        The case.
+    """
+    rng = Random(f"{seed}/{number}")
+    kind = rng.choices(list(SHARES), list(SHARES.values()))[0]
+    return kind(rng, found, folder)
