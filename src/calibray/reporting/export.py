@@ -68,14 +68,15 @@ def export(result: Result, folder: str | Path, copy_meshes: bool = False) -> tup
         for k, axis in enumerate("xyz")
     }
     group = {} if links.group is None else {"group": links.group}
-    materials = pd.DataFrame(list(_rows(result)))
+    rows = list(_rows(result))
+    materials = pd.DataFrame(rows)
     script = files("calibray.reporting") / "templates" / "load_scene.py"
     content = {
         "load_scene.py": script.read_text(encoding="utf-8"),
         "calibration.json": _json(_calibration(result)),
         "links.csv": result.links.assign(**places, **group).to_csv(index=False, float_format="%.9g"),
         "materials.csv": materials.to_csv(index=False, float_format="%.9g"),
-        "materials.json": _json({row["material"]: _known(row) for row in materials.to_dict("records")}),
+        "materials.json": _json({row["material"]: _known(row) for row in rows}),
         "materials.m": matlab(materials, study.scene.frequency),
     }
     try:

@@ -130,8 +130,8 @@ def path_loss_by_receiver(results: Mapping[str, Result]) -> Figure:
     draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
     draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
     for method, result in results.items():
-        style = {"color": COLORS.get(method, BLUE), "label": label(method)}
-        draw(result.links["after_db"], "-", ".", ms=2 if many else 4, lw=1.3, **style)
+        color, size = COLORS.get(method, BLUE), 2 if many else 4
+        draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=1.3)
     axes.set_xlim(0, len(links) + 1)
     axes.legend(frameon=False, ncols=2)
     return figure

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Paths, take
 from calibray.study import Setup
@@ -28,7 +29,8 @@ class Rays:
     """Paths to be drawn.
 
     Attributes:
-        paths: The strongest paths of every link, strongest first, with their points of interaction.
+        paths: The strongest paths of every link, strongest first.
+        vertex: Their points of interaction [I, 3], [m].
         gain_db: Their power gain in the calibrated scene, without offset [P], [dB].
         per_link: How many of a link are kept at most.
         traced: How many were traced.
@@ -36,6 +38,7 @@ class Rays:
     """
 
     paths: Paths
+    vertex: NDArray[np.float32]
     gain_db: NDArray[np.float64]
     per_link: int
     traced: int
@@ -71,7 +74,12 @@ def strongest(paths: Paths, result: Result) -> Rays:
 
     Returns:
         The paths that are shown.
+
+    Raises:
+        InputError: The paths do not tell where they interact, as those of older files.
     """
+    if paths.vertex is None:
+        raise InputError("the paths hold no points of interaction; trace again")
     gain = path_gains(paths, result.materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as path loss is.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
@@ -88,8 +96,10 @@ def strongest(paths: Paths, result: Result) -> Rays:
         np.stack([np.repeat(paths.link, np.diff(paths.first)), paths.material], axis=1), axis=0
     )[:, 1]
     meets = np.bincount(touched, minlength=len(paths.materials))
+    shown = take(paths, chosen)
     return Rays(
-        take(paths, chosen),
+        shown,
+        paths.vertex[:0] if shown.vertex is None else shown.vertex,
         gain_db[chosen],
         per_link,
         paths.num_paths,

@@ -63,7 +63,7 @@ def packed(
     if triangles is not None and len(triangles.face):
         near.append(triangles.vertex)
     if rays is not None:
-        near.append(rays.paths.vertex.astype(float))
+        near.append(rays.vertex.astype(float))
     grid = Grid.over(*near)
     return {
         "low": grid.low.tolist(),
@@ -109,7 +109,7 @@ def _paths(rays: Rays, grid: Grid) -> dict[str, Any]:
         "kind": _text(paths.kind.astype(np.uint8)),
         "material": _text(paths.material.astype(np.uint16)),
         "materials": list(paths.materials),
-        "vertex": _text(grid.steps(paths.vertex.astype(float))),
+        "vertex": _text(grid.steps(rays.vertex.astype(float))),
         "per_link": rays.per_link,
         "traced": rays.traced,
     }

@@ -173,7 +173,7 @@ class Result:
             self.study.scene_source, self.study.scene.frequency, self.study.overrides, self.study.objects
         )
         export_scene(scene, self.materials, target / SCENE_FILE)
-        write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.6g"))
+        write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.10g"))
         write_text(target / HISTORY_FILE, self.history.to_csv(index=False, float_format="%.9g"))
         write_text(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
 

@@ -43,7 +43,8 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     if not file.exists():
         file = folder / FIRST_NAMES[name]
     try:
-        table = pd.read_csv(file)
+        # A group may be called 7, or NA.
+        table = pd.read_csv(file, converters={"group": str})
     except (OSError, ValueError) as error:
         raise InputError(
             f"{file}: is no table of `calibray run` ({str(error).splitlines()[0]}); name its --out folder"
@@ -65,4 +66,5 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
             )
     if not len(table):
         raise InputError(f"{file}: has no rows; run the study again")
-    return table
+    places = [column for column in table if str(column)[:3] in ("tx_", "rx_")]
+    return table.astype(dict.fromkeys(places, float))
