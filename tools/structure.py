@@ -79,10 +79,19 @@ def room(path: str) -> str:
     return Path(path).parts[0].removesuffix(".py")
 
 
+def run(tree: ast.AST) -> Iterator[ast.AST]:
+    """The nodes of a module, without what only type checkers look at."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        yield node
+        yield from run(node)
+
+
 def targets(tree: ast.Module, path: str) -> Iterator[str]:
-    """Rooms and top-level modules that a module imports, wherever in it the import stands."""
+    """Rooms and top-level modules that a module imports when it runs, wherever in it the import stands."""
     above = [PACKAGE, *Path(path).parent.parts]
-    for node in ast.walk(tree):
+    for node in run(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
