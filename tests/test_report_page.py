@@ -373,7 +373,7 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     monkeypatch.setattr(reports, "page", None)
 
-    def found(study, method, seed, out, **_):
+    def found(*_, out, **__):
         result = Result.load(written)
         result.save(out)
         return result
