@@ -70,7 +70,8 @@ def test_plain_sionna_gives_the_reported_path_loss(folder, tmp_path):
 
 def test_tables_hold_the_calibrated_constants_and_intervals(folder, tmp_path):
     result = Result.load(folder / "out")
-    assert set(export(result, tmp_path)) == set(FILES) == {path.name for path in tmp_path.iterdir()}
+    assert export(result, tmp_path) == FILES
+    assert all((tmp_path / name).is_file() for name in FILES)
     table = pd.read_csv(tmp_path / "materials.csv").set_index("material")
     content = json.loads((tmp_path / "materials.json").read_text())
     for name, value in result.parameters.items():
@@ -114,12 +115,25 @@ def test_meshes_of_one_name_are_kept_apart(tmp_path):
     (tmp_path / "out").mkdir()
     stone = {"stone": Material(5.0, 0.05, 0.2)}
     export_scene(scene, stone, tmp_path / "out" / "scene.xml", copy_meshes=True)
-    copies = {path.name: path.read_text() for path in (tmp_path / "out" / "meshes").iterdir()}
+    copies = {path.name: path.read_text() for path in (tmp_path / "out" / "meshes").glob("*.ply")}
     assert copies == {
         "a.ply": (tmp_path / "meshes" / "a.ply").read_text(),
         "a-2.ply": (tmp_path / "more" / "a.ply").read_text(),
     }
     assert len(read_scene(tmp_path / "out" / "scene.xml", 3e9).objects) == 2
+
+
+def test_files_of_others_are_not_replaced(folder, tmp_path):
+    result = Result.load(folder / "out")
+    (tmp_path / "links.csv").write_text("mine")
+    with pytest.raises(InputError, match="was not written by Calibray"):
+        export(result, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["links.csv"]
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(InputError, match="was not written by Calibray"):
+        cb.report(result, tmp_path / "report.html")
+    export(result, tmp_path, overwrite=True)
+    export(result, tmp_path)
 
 
 def test_a_folder_that_is_a_file_is_refused(folder, tmp_path):

@@ -15,7 +15,7 @@ SIGNATURES = {
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
     "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite",
-    "report": "result, file, figures, progress",
+    "report": "result, file, figures, overwrite, progress",
     "validate": "study, blocks, by, progress, tracer",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",

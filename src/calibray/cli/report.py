@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import log
+from calibray.cli.console import Overwrite, log
 
 
 def report(
@@ -21,6 +21,7 @@ def report(
     figures: Annotated[
         bool, typer.Option("--figures", help="Write the figures as well, as SVG and PNG, into DIR/figures.")
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a result as one HTML file that opens from disk: summary, values, figures, map, and the scene in 3-D."""
     from calibray.cli.progress import progress_bars
@@ -31,5 +32,6 @@ def report(
     result = Result.load(folder)
     with progress_bars(log) as progress:
         pictures = folder / FIGURES if figures else None
-        written = write(result, out or folder / FILE, figures=pictures, progress=progress)
+        file = out or folder / FILE
+        written = write(result, file, figures=pictures, overwrite=overwrite, progress=progress)
     typer.echo(f"Written to {written}", err=True)

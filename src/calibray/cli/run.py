@@ -63,11 +63,11 @@ def run(
         typer.echo(json.dumps(result.content(), indent=2))
     else:
         typer.echo(render(tables.heading(result), *tables.tables(result)))
-    written = [*FILES, *_reported(result, out, figures)]
+    written = [*FILES, *_reported(result, out, figures, overwrite)]
     typer.echo(f"Written to {out}: {', '.join(written)}", err=True)
 
 
-def _reported(result: Result, out: Path, figures: bool) -> list[str]:
+def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
     """Write the report beside a result that is safe by now: what goes wrong here is told, and loses nothing."""
     from calibray.cli.progress import progress_bars
 
@@ -76,7 +76,7 @@ def _reported(result: Result, out: Path, figures: bool) -> list[str]:
 
         folder = out / page.FIGURES if figures else None
         with progress_bars(log) as progress:
-            page.report(result, out / page.FILE, figures=folder, progress=progress)
+            page.report(result, out / page.FILE, figures=folder, overwrite=overwrite, progress=progress)
     except Exception as error:
         typer.echo(f"Warning: no report ({error}); try again with: calibray report {out}", err=True)
         return []

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from calibray import diagnosis
 from calibray.errors import EngineError, InputError
-from calibray.files import check_file, check_folder, write_text
+from calibray.files import check_file, check_outputs, write_text
 from calibray.reporting import figures as drawings
 from calibray.reporting import style
 from calibray.reporting.plan import RAMP, WIDTH, Plan, plan, ramp, ramp_limit
@@ -59,6 +59,8 @@ CAPTIONS: Final = {
     "residual-by-group": "The same by group: median, quartiles, and whiskers around 90 % of the links.",
 }
 
+PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("svg", "png"))
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -84,6 +86,7 @@ def report(
     file: str | Path = FILE,
     *,
     figures: str | Path | None = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Write a calibration as one HTML file that opens from disk, for people to look at.
@@ -92,16 +95,18 @@ def report(
         result: The calibration. Paths that it does not hold are taken from the cache, or else traced.
         file: File to write; replaced only once the new one is complete.
         figures: Folder to write the figures into as well, each as SVG and as PNG; made if absent.
+        overwrite: Replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
     Returns:
         The file.
 
     Raises:
-        InputError: The file or the folder cannot be written.
+        InputError: The file or the folder cannot be written, or a file there must not be replaced.
     """
-    target = check_file(file)
-    folder = None if figures is None else check_folder(figures)
+    inputs = result.study.files()
+    target = check_file(file, inputs, overwrite)
+    folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)
     shown = gather(result, progress)
     drawn = drawings.every(result, shown.links)
     try:

@@ -10,7 +10,7 @@ from shutil import copyfile
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.files import write_text
+from calibray.files import replacing, write_text
 from calibray.materials import ITU_MATERIALS, Material
 from calibray.scenes.scene import TRACED, Scene, material_element
 
@@ -80,7 +80,10 @@ def _copied(mesh: Path, folder: Path, copies: dict[str, Path]) -> Path:
         number += 1
         name = f"{mesh.stem}-{number}{mesh.suffix}"
     folder.mkdir(parents=True, exist_ok=True)
-    copyfile(mesh, folder / name)
+    if (folder / name).exists() and (folder / name).samefile(mesh):
+        return mesh
+    with replacing(folder / name) as partial:
+        copyfile(mesh, partial)
     return folder / name
 
 
