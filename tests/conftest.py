@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from calibray.cli import progress
+
 # Every run draws the same examples, and a busy machine fails no test.
 settings.register_profile("calibray", derandomize=True, deadline=None)
 settings.load_profile("calibray")
@@ -18,3 +20,11 @@ def data_folder() -> Path:
     if not (folder / "nist_boulder").is_dir():
         pytest.skip(f"no measured data in {folder}; name their folder in CALIBRAY_DATA")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_lines_of_progress():
+    """What stands on stderr does not depend on how busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "EVERY", 1e6)
+        yield

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,7 +87,9 @@ def ran(folder):
 
 def test_run_writes_its_files_and_says_so_on_stderr(folder, ran):
     assert sorted(path.name for path in (folder / "out").iterdir()) == sorted([*FILES, SIGNATURES])
-    assert ran.stderr == f"Written to {folder / 'out'}: {', '.join(FILES)}\n"
+    warning, *rest = ran.stderr.splitlines(keepends=True)
+    assert "1 of 12 receivers stand inside buildings" in warning
+    assert "".join(rest) == f"Written to {folder / 'out'}: {', '.join(FILES)}\n"
     assert Result.load(folder / "out").parameters == pytest.approx(planted.TRUTH, abs=1e-3)
 
 
@@ -273,13 +276,49 @@ def test_tables_fit_what_there_is(folder, ran):
     assert "not known" in text
 
 
-@pytest.mark.parametrize("watched", [True, False])
-def test_progress_is_drawn_only_where_somebody_watches(watched):
-    console = Console(file=io.StringIO(), force_terminal=watched, width=80)
+def test_progress_is_a_bar_where_somebody_watches():
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
     with progress_bars(console) as progress:
-        progress("tracing", 5, 12)
+        progress("tracing", 0, 12)
         progress("calibrating", 30, None)
         progress("calibrating", 60, 225)
     drawn = console.file.getvalue()
-    assert bool(drawn) == watched
-    assert ("calibrating" in drawn) == watched
+    assert "calibrating" in drawn
+    assert "0/12" in drawn
+    assert "0/?" not in drawn
+
+
+def test_progress_is_lines_elsewhere_even_while_nothing_is_reported():
+    console = Console(file=io.StringIO(), force_terminal=False, width=20)
+    with progress_bars(console, every=0.02) as progress:
+        while "starting" not in console.file.getvalue():
+            time.sleep(0.01)
+        progress("tracing", 0, 12)
+        progress("tracing", 5, 12)
+        while "tracing 5/12" not in console.file.getvalue():
+            time.sleep(0.01)
+        told = len(console.file.getvalue().splitlines())
+        while len(console.file.getvalue().splitlines()) < told + 3:
+            time.sleep(0.01)
+    lines = console.file.getvalue().splitlines()
+    assert "\x1b" not in console.file.getvalue()
+    assert re.fullmatch(r"tracing 5/12, 42 %, [0-9.e+]+/s, \d+ s, about \d+ s left", lines[-1])
+
+
+def test_short_work_prints_no_line():
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with progress_bars(console) as progress:
+        progress("tracing", 5, 12)
+    assert console.file.getvalue() == ""
+
+
+def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
+    monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path))
+    (tmp_path / f"{'a' * 64}.h5").write_bytes(b"0" * 2_000_000)
+    (tmp_path / "mine.h5").write_bytes(b"0")
+    listed = calibray("cache")
+    assert re.search(rf"folder +{tmp_path}\ntraces +1\nsize +2.0 MB", listed.stdout)
+    assert "Removed 1 traces" in calibray("cache", "--clear").stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    assert "CALIBRAY_CACHE is empty" in calibray("cache").stdout

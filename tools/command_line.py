@@ -16,7 +16,8 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "command-line.md"
 HEAD = """# The command line
 
 Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while running, 2 for
-bad input. This page is written by `python tools/command_line.py`.
+bad input, 130 for Ctrl-C. Progress is a bar on a terminal, and elsewhere a line every few seconds. This page is written
+by `python tools/command_line.py`.
 """
 
 

@@ -1,7 +1,7 @@
 """The command line as a whole: its commands, and how their failures end.
 
-Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while
-running, 2 for bad input. Commands import what they need when they run, so that `--version` answers at once.
+Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while running, 2 for
+bad input, 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
+from calibray.cli.cache import cache
 from calibray.cli.compare import compare
 from calibray.cli.demo import demo
 from calibray.cli.doctor import doctor
@@ -29,6 +30,9 @@ from calibray.errors import EngineError, InputError
 
 LONGEST: Final = 4096
 """The number of characters beyond which an argument is refused; Linux takes no longer path."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it: 128 and the number of the signal."""
 
 
 class Commands(TyperGroup):
@@ -59,7 +63,8 @@ class Commands(TyperGroup):
             What the command returns.
 
         Raises:
-            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or written.
+            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or
+                written, with 130 on Ctrl-C.
             BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
@@ -74,8 +79,14 @@ class Commands(TyperGroup):
             raise
         except OSError as error:
             place = "" if error.filename is None else f"{error.filename}: "
-            typer.echo(f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True)
+            typer.echo(
+                f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True
+            )
             raise typer.Exit(1) from error
+        except KeyboardInterrupt as error:
+            # What the command has to say of what was kept it said itself.
+            typer.echo("Interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from error
 
 
 app = typer.Typer(
@@ -105,6 +116,21 @@ def calibray(
     """Calibrate the radio materials of a ray-traced scene from measurements."""
 
 
-for command in (doctor, demo, init, schema, run, report, compare, validate, trace, predict, export, ledger):
+COMMANDS = (  # one after the other, as `--help` lists them
+    doctor,
+    demo,
+    init,
+    schema,
+    run,
+    report,
+    compare,
+    validate,
+    trace,
+    predict,
+    export,
+    ledger,
+    cache,
+)
+for command in COMMANDS:
     app.command()(command)
 app.add_typer(scene)

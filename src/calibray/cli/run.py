@@ -57,14 +57,36 @@ def run(
     check_outputs(out, FILES, study.files(), overwrite)
     setup = study.opened()
     warn(study, setup.links)
-    with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
-        result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
+    try:
+        with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
+            result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
+    except KeyboardInterrupt:
+        typer.echo(_kept(out), err=True)
+        raise
     if as_json:
         typer.echo(json.dumps(result.content(), indent=2))
     else:
         typer.echo(render(tables.heading(result), *tables.tables(result)))
     written = [*FILES, *_reported(result, out, figures, overwrite)]
     typer.echo(f"Written to {out}: {', '.join(written)}", err=True)
+
+
+def _kept(out: Path) -> str:
+    """What an interrupted run left, and how to go on."""
+    from contextlib import closing
+
+    from calibray.engines import open_ledger
+    from calibray.engines.ledger import LEDGER_FILE
+    from calibray.tracing import cache
+
+    parts = []
+    if (out / LEDGER_FILE).is_file():
+        with closing(open_ledger(out)) as ledger:
+            parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
+    if cache.kept():
+        parts.append(f"finished traces in {cache.folder()}")
+    kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished that could be kept."
+    return f"{kept} Start the same command again to go on; what is kept is not computed twice."
 
 
 def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -27,6 +28,7 @@ from calibray.scenes import Scene
 from calibray.tracing.settings import Antenna, TraceSettings
 
 VARIABLE: Final = "CALIBRAY_CACHE"
+_ENTRY: Final = re.compile(r"[0-9a-f]{64}\.h5")
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -110,14 +112,29 @@ def keep(digest: str, paths: Paths) -> None:
         return
 
 
-def _path(digest: str) -> Path | None:
-    folder = os.environ.get(VARIABLE)
-    if folder == "":
+def folder() -> Path | None:
+    """Where traces are kept, whether it is there yet or not; None where they are not."""
+    named = os.environ.get(VARIABLE)
+    if named == "":
         return None
-    if folder is None:
+    if named is None:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(home) / "calibray"
-    return Path(folder) / f"{digest}.h5"
+        return Path(home) / "calibray"
+    return Path(named)
+
+
+def kept() -> list[Path]:
+    """The traces that are kept, the latest first; no other file of the folder."""
+    here = folder()
+    if here is None or not here.is_dir():
+        return []
+    traces = [path for path in here.iterdir() if _ENTRY.fullmatch(path.name) and path.is_file()]
+    return sorted(traces, key=lambda path: path.stat().st_mtime, reverse=True)
+
+
+def _path(digest: str) -> Path | None:
+    here = folder()
+    return None if here is None else here / f"{digest}.h5"
 
 
 def meshes(scene: Scene) -> Iterator[Path]:

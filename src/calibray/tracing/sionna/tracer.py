@@ -169,7 +169,8 @@ class Tracer:
 
         Args:
             links: The links.
-            progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
+            progress: Called with ("tracing", receivers traced, receivers in all) before the first launch and after
+                every one.
             materials: Constants in place of the scene's, by name.
 
         Returns:
@@ -186,6 +187,8 @@ class Tracer:
         chunks: list[Chunk] = []
         pieces: list[Chunk] = []
         found = done = 0
+        if progress is not None:
+            progress("tracing", 0, len(rx))
         for launch in self.plan(links).launches:
             pieces.append(self._trace_launch(launch, rx[launch.links], room - found))
             found += len(pieces[-1].link)

@@ -1,0 +1,92 @@
+"""Ctrl-C in a terminal: what was kept is told, the status is 130, and the same command goes on from there."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import programs
+from calibray.engines import open_ledger
+from test_cli_run import write_study
+
+COMMAND = [sys.executable, "-c", "from calibray.cli import main; main()"]
+PATIENCE = 120.0  # [s]
+
+
+def paid(folder: Path) -> int:
+    """RT calls in the ledger of a folder."""
+    if not (folder / "ledger.sqlite").is_file():
+        return 0
+    with closing(open_ledger(folder)) as ledger:
+        return len(ledger.table())
+
+
+def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
+    """Status and screen of a command in a pseudo-terminal, Ctrl-C pressed once so many RT calls are paid for."""
+    own, theirs = pty.openpty()
+    environment = {**os.environ, "CALIBRAY_CACHE": "", "TERM": "xterm"}
+    process = subprocess.Popen(
+        [*COMMAND, *map(str, words)], stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
+        start_new_session=True, preexec_fn=_take_terminal,
+    )  # fmt: skip
+    os.close(theirs)
+    screen, pressed, deadline = b"", False, time.monotonic() + PATIENCE
+    try:
+        while time.monotonic() < deadline:
+            if select.select([own], [], [], 0.1)[0]:
+                try:
+                    read = os.read(own, 65536)
+                except OSError:
+                    break
+                screen += read
+            if not pressed and paid(out) >= until:
+                os.write(own, b"\x03")
+                pressed = True
+            if process.poll() is not None and not select.select([own], [], [], 0)[0]:
+                break
+        return process.wait(timeout=PATIENCE), screen.decode()
+    finally:
+        process.kill()
+        os.close(own)
+
+
+def _take_terminal() -> None:
+    """Make standard input the terminal that Ctrl-C is typed in."""
+    import fcntl
+    import termios
+
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+def test_ctrl_c_tells_what_was_kept_and_how_to_go_on(tmp_path):
+    method = {"name": "auto", "options": {"budget": 18}}
+    write_study(
+        tmp_path, programs.content(tmp_path, before="import time; time.sleep(0.3)") | {"method": method}
+    )
+    out = tmp_path / "out"
+    status, screen = in_terminal(["run", tmp_path / "study.toml", "--out", out], out, until=3)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]|\s+", " ", screen)
+    assert status == 130, plain
+    kept = paid(out)
+    assert kept >= 3
+    assert f"Kept: {kept} RT calls in" in plain
+    assert "Start the same command again to go on" in plain
+    assert "Traceback" not in plain
+    asked = len(programs.calls(tmp_path))
+    again = subprocess.run(
+        [*COMMAND, "run", tmp_path / "study.toml", "--out", out],
+        env={**os.environ, "CALIBRAY_CACHE": ""}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert again.returncode == 0, again.stderr
+    # The first call is the scene as it was, which the method's budget of 18 does not count.
+    assert re.search(rf"answered by the ledger +{kept - 1}\n", again.stdout)
+    assert len(programs.calls(tmp_path)) == asked + 19 - kept
+    # The second run took seconds without a terminal.
+    assert "\x1b" not in again.stderr
