@@ -74,7 +74,9 @@ class Commands(TyperGroup):
             raise
         except OSError as error:
             place = "" if error.filename is None else f"{error.filename}: "
-            typer.echo(f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True)
+            typer.echo(
+                f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True
+            )
             raise typer.Exit(1) from error
 
 
