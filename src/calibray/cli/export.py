@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibray.cli.console import Overwrite
+
 
 def export(
     folder: Annotated[
@@ -19,10 +21,11 @@ def export(
         bool,
         typer.Option("--copy", help="Copy the meshes too, so that the folder can be given away."),
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.reporting.export import export as write
     from calibray.result import Result
 
-    names = write(Result.load(folder), out, copy)
+    names = write(Result.load(folder), out, copy, overwrite=overwrite)
     typer.echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas as pd
 
 from calibray.errors import InputError
-from calibray.files import check_folder, write_text
+from calibray.files import check_outputs, write_text
 from calibray.materials import FIELDS
 from calibray.reporting.survey import survey
 from calibray.scenes import export_scene, read_scene
@@ -41,21 +41,26 @@ end
 """
 
 
-def export(result: Result, folder: str | Path, copy_meshes: bool = False) -> tuple[str, ...]:
+def export(
+    result: Result, folder: str | Path, copy_meshes: bool = False, *, overwrite: bool = False
+) -> tuple[str, ...]:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables.
 
     Args:
         result: The calibration.
         folder: Folder to write into; made if absent.
         copy_meshes: Whether meshes are copied into the folder; else the scene refers to them where they lie.
+        overwrite: Replace files that Calibray did not write; the study's own are never replaced.
 
     Returns:
         Names of the files in the folder.
 
     Raises:
-        InputError: The folder cannot be written, or scene or links cannot be read any more.
+        InputError: The folder cannot be written, a file there must not be replaced, or scene or links cannot be
+            read any more.
     """
-    target, study = check_folder(folder), result.study
+    study = result.study
+    target = check_outputs(folder, FILES, study.files(), overwrite)
     scene = result.scene or read_scene(
         study.scene_source, study.scene.frequency, study.overrides, study.objects
     )
@@ -81,7 +86,7 @@ def export(result: Result, folder: str | Path, copy_meshes: bool = False) -> tup
     }
     try:
         target.mkdir(parents=True, exist_ok=True)
-        export_scene(scene, result.materials, target / "scene.xml", copy_meshes)
+        export_scene(scene, result.materials, target / "scene.xml", copy_meshes, overwrite)
         for name, text in content.items():
             write_text(target / name, text)
     except OSError as error:

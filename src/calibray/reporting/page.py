@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from calibray import diagnosis
 from calibray.errors import EngineError, InputError
-from calibray.files import check_file, check_folder, write_text
+from calibray.files import check_file, check_folder, check_outputs, write_text
 from calibray.reporting import figures as drawings
 from calibray.reporting import style
 from calibray.reporting.plan import RAMP, WIDTH, Plan, plan, ramp, ramp_limit
@@ -98,12 +98,14 @@ def report(
         The file.
 
     Raises:
-        InputError: The file or the folder cannot be written.
+        InputError: The file or the folder cannot be written, or a file there is not Calibray's.
     """
     target = check_file(file)
     folder = None if figures is None else check_folder(figures)
     shown = gather(result, progress)
     drawn = drawings.every(result, shown.links)
+    if folder is not None:
+        check_outputs(folder, [f"{name}.{suffix}" for name in drawn for suffix in ("svg", "png")])
     try:
         write_text(target, page(result, shown, drawn))
         if folder is not None:

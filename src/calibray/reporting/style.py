@@ -19,6 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from calibray.files import replacing
+
 INK: Final = "#222222"
 FAINT: Final = "#8a8a8a"
 LINE: Final = "#e6e6e6"
@@ -115,11 +117,11 @@ def write(figure: Figure, path: Path) -> Path:
     Returns:
         The file.
     """
-    with styled():
+    with styled(), replacing(path) as partial:
         if path.suffix == ".svg":
-            FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None})
+            FigureCanvasSVG(figure).print_svg(partial, metadata={"Date": None})
         else:
-            FigureCanvasAgg(figure).print_png(path)
+            FigureCanvasAgg(figure).print_png(partial)
     return path
 
 
