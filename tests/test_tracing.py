@@ -16,12 +16,12 @@ from sionna.rt.utils import fibonacci_lattice
 import calibray as cb
 from calibray.errors import EngineError, InputError
 from calibray.fields import path_gains, path_loss
+from calibray.interruption import interruptible
 from calibray.paths import Paths
 from calibray.scenes import read_scene
 from calibray.tracing.launches import directions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from calibray.tracing.sionna.interruption import interruptible
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9

@@ -18,6 +18,7 @@ from calibray.calibration.weighing import weighed
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.files import check_outputs
+from calibray.interruption import interruptible
 from calibray.progress import Progress
 from calibray.result import FILES, Result
 from calibray.study import Setup, Study
@@ -25,6 +26,7 @@ from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import TracerFactory
 
 
+@interruptible()
 def calibrate(
     study: Study | Setup,
     method: str | None = None,

@@ -83,8 +83,9 @@ def read_entry(
         The entry, or what is wrong with the row.
     """
     blob, seconds, failure, digest = columns
-    parts = (problem, str), (candidate, bytes), (blob, bytes), (seconds, float), (failure, str)
-    if not all(isinstance(part, kind) for part, kind in parts):
+    if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
+        return "a value of another type"
+    if not (isinstance(seconds, float) and isinstance(failure, str)):
         return "a value of another type"
     if len(blob) % 8 or (num_links is not None and len(blob) != 8 * num_links):
         return f"{len(blob)} bytes of path loss" + ("" if num_links is None else f" for {num_links} links")

@@ -132,7 +132,7 @@ def _separate(
     for low, high in pieces:
         inside = (curve.value >= low) & (curve.value <= high)
         at = np.flatnonzero(inside)[np.argmin(curve.square[inside])]
-        behind = np.sqrt(curve.square[at]) - np.sqrt(least)
+        behind = float(np.sqrt(curve.square[at])) - float(np.sqrt(least))
         parts.append(f"{shown(curve.index, float(curve.value[at])):.4g} ({behind:.2f} dB behind the best)")
     return f"{len(pieces)} separate ranges fit at {level:.0%}: around {', '.join(parts)}"
 

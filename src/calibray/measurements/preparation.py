@@ -238,7 +238,7 @@ def _placed(
     for end, place in (("tx", tx), ("rx", rx)):
         if frame is not None:
             try:
-                rows = with_scene_positions(rows, end, frame, *place)
+                rows = with_scene_positions(rows, end, frame, place[0], place[1], place[2])
             except InputError as error:
                 raise InputError(f"{table.source}: {end}: {error}") from None
         else:
@@ -264,7 +264,8 @@ def _averaged(
     mean = averaged(rows, value, label, sense, keep, [*map(str, place[1]), _UNHEARD])
     first = ~rows[keep].assign(**{_ROW: label}).duplicated().to_numpy()
     joined = table.frame.loc[first].reset_index(drop=True)
-    joined = joined.assign(**{name: mean[name].to_numpy() for name in (value, *place[1], "std_db", "count")})
+    filled = {str(name): mean[name].to_numpy() for name in (value, *place[1], "std_db", "count")}
+    joined = joined.assign(**filled)
     share = mean[_UNHEARD].to_numpy()
     made = SourceTable(joined, table.row[first], table.source)
     counts["samples averaged"] = len(table)

@@ -103,7 +103,7 @@ class Overhead:
         """
         place = np.asarray(points, dtype=float).reshape(-1, 3)[:, :2]
         low, high = self.bounds[:2] - margin, self.bounds[3:5] + margin
-        return ((place < low) | (place > high)).any(axis=1)
+        return np.asarray(((place < low) | (place > high)).any(axis=1))
 
     def _surfaces(self, place: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """The heights of the faces at places: number of the place, and height [m]."""

@@ -88,7 +88,9 @@ def draft(
     Raises:
         InputError: A file cannot be read, or something cannot be told from the files and was not given.
     """
-    made = _Drafting(scene, Path(links), Path(target), transmitters and Path(transmitters), frequency, tx)
+    made = _Drafting(
+        scene, Path(links), Path(target), Path(transmitters) if transmitters else None, frequency, tx
+    )
     content = made.content()
     text = toml(content, {each.what: each.reason for each in made.assumed})
     study = Study.from_content(tomllib.loads(text), target)
@@ -226,7 +228,7 @@ class _Drafting:
         rx = guessing.place(self.table.frame, "rx", own=True)
         if rx is None:
             raise InputError(
-                f"{self.links}: no columns look like the receivers' positions ({', '.join(self.table.frame)}); call "
+                f"{self.links}: no columns look like the receivers' positions ({', '.join(map(str, self.table.frame))}); call "
                 "them rx_x, rx_y, rx_z [m], or longitude and latitude"
             )
         if self.given_tx is not None:
@@ -235,7 +237,7 @@ class _Drafting:
             tx = guessing.place(self.sites.frame, "tx", own=True)
             if tx is None:
                 raise InputError(
-                    f"{self.transmitters}: no columns look like positions ({', '.join(self.sites.frame)})"
+                    f"{self.transmitters}: no columns look like positions ({', '.join(map(str, self.sites.frame))})"
                 )
             return rx, self._renamed(tx)
         return rx, guessing.place(self.table.frame, "tx", own=False)
@@ -299,7 +301,7 @@ class _Drafting:
         if rx.position == "scene" and name is not None and up is not None and frame[up].nunique() == 1:
             z = frame[rx.height] if rx.height else pd.Series(np.full(len(frame), RECEIVER_HEIGHT))
             found = np.sqrt(frame[rx.x] ** 2 + frame[rx.y] ** 2 + (z - frame[up]) ** 2)
-            if float((found - frame[name]).abs().median()) < _MISS:
+            if float(np.median(np.abs(found - frame[name]))) < _MISS:
                 height = float(frame[up].iloc[0])
                 self._assume("links.tx", f"0, 0, {height:g}", f"column {name} is the distance from there")
                 return [0.0, 0.0, height]

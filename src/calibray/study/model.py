@@ -402,11 +402,11 @@ class Study(Section):
             raise InputError(f"{self._path}: {key} = {file!r}: {error}") from None
 
     def _check_files(self) -> None:
-        files: list[tuple[str, str, str | Path | None]] = [
+        files: list[tuple[str, str, str | Path]] = [
             ("scene.file", self.scene.file, self.scene_source),
             ("links.file", self.links.file, self.links_path),
         ]
-        if self.links.transmitters is not None:
+        if self.links.transmitters is not None and self.transmitters_path is not None:
             files.append(("links.transmitters", self.links.transmitters, self.transmitters_path))
         for end, antenna in zip(("tx", "rx"), self.antenna_pair, strict=True):
             if antenna.gain_file is not None:

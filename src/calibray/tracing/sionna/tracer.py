@@ -26,6 +26,7 @@ from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from calibray.errors import EngineError, InputError
+from calibray.interruption import interruptible
 from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
@@ -40,7 +41,6 @@ from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
-from calibray.tracing.sionna.interruption import interruptible
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.stored import Trace
 

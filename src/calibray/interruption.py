@@ -1,4 +1,4 @@
-"""Ctrl-C in the midst of a kernel, which Dr.Jit takes for a failure of its own."""
+"""Ctrl-C in the midst of compiled code, which libraries take for a failure of their own."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ def interruptible() -> Iterator[None]:
     """Let an interruption through as what it is.
 
     Yields:
-        Nothing; what runs meanwhile may use Dr.Jit.
+        Nothing; what runs meanwhile may call Dr.Jit or import compiled modules.
 
     Raises:
-        KeyboardInterrupt: Dr.Jit raised an error because of one.
-        RuntimeError: Dr.Jit raised an error for another reason.
+        KeyboardInterrupt: An error was raised because of one.
+        RuntimeError: An error was raised for another reason.
+        SystemError: The same, of an import.
     """
     try:
         yield
-    except RuntimeError as error:
+    # Dr.Jit raises the one in a loop, the interpreter the other in an import.
+    except (RuntimeError, SystemError) as error:
         cause: BaseException | None = error
         while cause is not None:
             if isinstance(cause, KeyboardInterrupt):
