@@ -228,8 +228,8 @@ class _Drafting:
         rx = guessing.place(self.table.frame, "rx", own=True)
         if rx is None:
             raise InputError(
-                f"{self.links}: no columns look like the receivers' positions ({', '.join(map(str, self.table.frame))}); call "
-                "them rx_x, rx_y, rx_z [m], or longitude and latitude"
+                f"{self.links}: no columns look like the receivers' positions "
+                f"({', '.join(map(str, self.table.frame))}); call them rx_x, rx_y, rx_z [m], or longitude and latitude"
             )
         if self.given_tx is not None:
             return rx, None
