@@ -3,8 +3,8 @@
 Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W], or, to see one case again,
 python benchmarks/fuzz.py --seed S --case N [--keep DIR]
 
-Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root on
-Linux everything but a temporary folder is read-only to them, in a mount namespace of its own.
+Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root
+on Linux everything but a temporary folder is read-only to them, in a mount namespace of its own.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import threading
 import time
 import traceback
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -132,20 +133,27 @@ class Worker:
         said = self._errors.read_text(errors="replace")[-3000:]
         self.end()
         folder = Path(tempfile.mkdtemp(dir=self._place, prefix=f"again-{number}-"))
-        world = World(self._place, self._place / "base", json.loads((self._place / "base/right.json").read_text()))
+        world = World(
+            self._place, self._place / "base", json.loads((self._place / "base/right.json").read_text())
+        )
         case = make(self._seed, number, world, folder)
         _remove(folder)
         verdict = "crash" if line == "" else "announced" if COST.search(said) else "hang"
         detail = f"status {self._process.returncode}, {said}"
         self._start()
-        return {"number": number, "kind": case.kind, "note": case.note, "verdict": verdict, "detail": detail, "seconds": LIMIT}
+        return {
+            "number": number,
+            "kind": case.kind,
+            "note": case.note,
+            "verdict": verdict,
+            "detail": detail,
+            "seconds": LIMIT,
+        }
 
     def end(self) -> None:
         """End the process and what it started."""
-        try:
+        with suppress(ProcessLookupError):
             os.killpg(self._process.pid, 9)
-        except ProcessLookupError:
-            pass
         self._process.wait()
 
 
@@ -165,17 +173,23 @@ def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dic
             told = worker.run(number)
             found.append(told)
             if told["verdict"] in FORBIDDEN:
-                print(f"\ncase {number}: {told['verdict']}: {told['kind']}, {told['note']}\n{told['detail']}", file=sys.stderr)
+                print(
+                    f"\ncase {number}: {told['verdict']}: {told['kind']}, {told['note']}\n{told['detail']}",
+                    file=sys.stderr,
+                )
 
     crew = [Worker(place, f"worker-{k}", seed) for k in range(min(workers, len(numbers)))]
     threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in crew]
     started = time.monotonic()
     for thread in threads:
         thread.start()
+    seen, told = sys.stderr.isatty(), started
     while any(thread.is_alive() for thread in threads):
         time.sleep(0.5)
-        if sys.stderr.isatty():
-            print(f"\r{len(found)} of {len(numbers)} cases, {time.monotonic() - started:.0f} s", end="", file=sys.stderr)
+        if seen or time.monotonic() - told > 30:
+            told = time.monotonic()
+            line = f"{len(found)} of {len(numbers)} cases, {told - started:.0f} s"
+            print(line, end="\r" if seen else "\n", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     for worker in crew:
         worker.end()
@@ -190,7 +204,10 @@ def report(found: list[dict[str, object]]) -> int:
     for kind in [*sorted({kind for kind, _ in counts}), "all"]:
         row = [sum(n for (k, v), n in counts.items() if kind in (k, "all") and v == name) for name in columns]
         spent = [float(str(told["seconds"])) for told in found if kind in (told["kind"], "all")]
-        print(f"{kind:9}{sum(row):7}{1e3 * sum(spent) / len(spent):7.0f}" + "".join(f"{number:11}" for number in row))
+        print(
+            f"{kind:9}{sum(row):7}{1e3 * sum(spent) / len(spent):7.0f}"
+            + "".join(f"{number:11}" for number in row)
+        )
     bad = sorted(int(str(told["number"])) for told in found if told["verdict"] in FORBIDDEN)
     if bad:
         print(f"\nforbidden: {', '.join(map(str, bad[:100]))}; see one again with --case N")
@@ -199,7 +216,9 @@ def report(found: list[dict[str, object]]) -> int:
 
 def main(place: Path, chosen: argparse.Namespace) -> int:
     """Run the cases that were chosen."""
-    numbers = [chosen.case] if chosen.case is not None else list(range(chosen.first, chosen.first + chosen.cases))
+    numbers = (
+        [chosen.case] if chosen.case is not None else list(range(chosen.first, chosen.first + chosen.cases))
+    )
     found = attack(place, numbers, chosen.seed, chosen.workers)
     if chosen.case is not None:
         told = found[0]
@@ -234,12 +253,20 @@ if __name__ == "__main__":
     if INSIDE not in os.environ:
         with tempfile.TemporaryDirectory(prefix="calibray-fuzz-") as fresh:
             alone = ["unshare", "-m", "true"]
-            if os.geteuid() == 0 and subprocess.run(alone, check=False, stderr=subprocess.DEVNULL).returncode == 0:
+            if (
+                os.geteuid() == 0
+                and subprocess.run(alone, check=False, stderr=subprocess.DEVNULL).returncode == 0
+            ):
                 sys.exit(_apart(fresh))
             os.environ[INSIDE] = fresh
             print("no mounts allowed here: cases run as this user does", file=sys.stderr)
             os.environ |= {"HOME": fresh, "TMPDIR": fresh, "XDG_STATE_HOME": f"{fresh}/state"}
             sys.exit(main(Path(fresh), options))
     here = os.environ[INSIDE]
-    os.environ |= {"HOME": here, "TMPDIR": here, "XDG_STATE_HOME": f"{here}/state", "XDG_CACHE_HOME": f"{here}/.cache"}
+    os.environ |= {
+        "HOME": here,
+        "TMPDIR": here,
+        "XDG_STATE_HOME": f"{here}/state",
+        "XDG_CACHE_HOME": f"{here}/.cache",
+    }
     sys.exit(main(Path(here), options))

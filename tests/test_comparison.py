@@ -249,7 +249,10 @@ def test_markdown_has_a_row_for_each_method(small):
     ("arguments", "message"),
     [
         ({"methods": ["gwoo"]}, "method 'gwoo': there is no such method; did you mean 'gwo'"),
-        ({"methods": ["gwo@x"]}, "method 'gwo@x': a budget of x RT calls; it must be a whole number of 24 to 1,000,000"),
+        (
+            {"methods": ["gwo@x"]},
+            "'gwo@x': a budget of x RT calls; it must be a whole number of 24 to 1,000,000",
+        ),
         ({"methods": ["gwo@-60"]}, "a budget of -60"),
         ({"methods": ["gwo"], "budget": 10}, "a budget of 10 RT calls"),
         ({"methods": []}, "none is named"),

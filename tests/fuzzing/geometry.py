@@ -39,29 +39,54 @@ def _traced(study: Path, whole: bool) -> Callable[[], list[float]]:
 
 
 DOCUMENTS: tuple[Callable[[str], str], ...] = (
-    lambda t: '<?xml version="1.0"?><!DOCTYPE s [<!ENTITY a "b"><!ENTITY b "&a;&a;">]>' + t.replace("mat-roof", "&b;"),
+    lambda t: (
+        '<?xml version="1.0"?><!DOCTYPE s [<!ENTITY a "b"><!ENTITY b "&a;&a;">]>'
+        + t.replace("mat-roof", "&b;")
+    ),
     lambda t: '<!DOCTYPE s [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + t.replace("walls", "&a;", 1),
-    lambda t: "<!DOCTYPE s [" + '<!ENTITY a0 "' + "x" * 50 + '">'
-    + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 20}">' for k in range(1, 9)) + "]>" + t.replace("mat-roof", "&a8;"),
+    lambda t: (
+        "<!DOCTYPE s ["
+        + '<!ENTITY a0 "'
+        + "x" * 50
+        + '">'
+        + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 20}">' for k in range(1, 9))
+        + "]>"
+        + t.replace("mat-roof", "&a8;")
+    ),
     lambda t: '<?xml version="1.0" encoding="utf-16"?>' + t,
     lambda t: '<?xml version="1.0" encoding="x-none"?>' + t,
     lambda t: '<?xml version="1.1"?>' + t,
     lambda t: "<scene>" * 5000 + "</scene>" * 5000,
-    lambda t: t.replace("<shape", "<group>" * 300 + "<shape", 1).replace("</shape>", "</shape>" + "</group>" * 300, 1),
+    lambda t: t.replace("<shape", "<group>" * 300 + "<shape", 1).replace(
+        "</shape>", "</shape>" + "</group>" * 300, 1
+    ),
     lambda t: t.replace("<scene ", '<scene xmlns="http://x.y/z" '),
     lambda t: t.replace("<scene ", '<m:scene xmlns:m="http://x.y/z" ').replace("</scene>", "</m:scene>"),
     lambda t: t.replace("</scene>", '<include filename="scene.xml"/></scene>'),
     lambda t: t.replace("</scene>", '<default name="f" value="x"/></scene>').replace("house.ply", "$f"),
     lambda t: t.replace("</scene>", '<path value="/etc"/></scene>'),
-    lambda t: t.replace("</scene>", '<sensor type="perspective"><float name="fov" value="x"/></sensor></scene>'),
+    lambda t: t.replace(
+        "</scene>", '<sensor type="perspective"><float name="fov" value="x"/></sensor></scene>'
+    ),
     lambda t: t.replace("</scene>", '<integrator type="nothing"/></scene>'),
-    lambda t: t.replace("</scene>", '<emitter type="envmap"><string name="filename" value="no.exr"/></emitter></scene>'),
-    lambda t: t.replace("</scene>", '<shape type="sphere" id="mesh-s"><ref id="mat-walls" name="bsdf"/></shape></scene>'),
-    lambda t: t.replace("</scene>", '<shape type="shapegroup" id="mesh-s"><ref id="mat-walls" name="bsdf"/></shape></scene>'),
-    lambda t: t.replace("</scene>", '<shape type="cube" id="mesh-c"><ref id="mat-walls" name="bsdf"/></shape></scene>'),
-    lambda t: t.replace("</scene>", '<shape type="serialized" id="mesh-c"><string name="filename" value="links.csv"/>'
-                        '<ref id="mat-walls" name="bsdf"/></shape></scene>'),
-    lambda t: t.replace("</scene>", t[t.index("<shape"):]),
+    lambda t: t.replace(
+        "</scene>", '<emitter type="envmap"><string name="filename" value="no.exr"/></emitter></scene>'
+    ),
+    lambda t: t.replace(
+        "</scene>", '<shape type="sphere" id="mesh-s"><ref id="mat-walls" name="bsdf"/></shape></scene>'
+    ),
+    lambda t: t.replace(
+        "</scene>", '<shape type="shapegroup" id="mesh-s"><ref id="mat-walls" name="bsdf"/></shape></scene>'
+    ),
+    lambda t: t.replace(
+        "</scene>", '<shape type="cube" id="mesh-c"><ref id="mat-walls" name="bsdf"/></shape></scene>'
+    ),
+    lambda t: t.replace(
+        "</scene>",
+        '<shape type="serialized" id="mesh-c"><string name="filename" value="links.csv"/>'
+        '<ref id="mat-walls" name="bsdf"/></shape></scene>',
+    ),
+    lambda t: t.replace("</scene>", t[t.index("<shape") :]),
     lambda t: t.replace("mesh-shed", "mesh-house"),
     lambda t: t.replace("meshes/shed.ply", "../../../../etc/passwd"),
     lambda t: t.replace("meshes/shed.ply", "/dev/zero"),
@@ -74,10 +99,28 @@ DOCUMENTS: tuple[Callable[[str], str], ...] = (
     lambda t: t.replace('<scale x="80" y="80"/>', '<matrix value="1 2 3"/>'),
     lambda t: t.replace('<scale x="80" y="80"/>', '<scale x="1e38" y="1e38"/>'),
     lambda t: t.replace('<scale x="80" y="80"/>', '<lookat origin="0,0,0" target="0,0,0" up="0,0,0"/>'),
-    lambda t: t.replace("</bsdf>", '<texture type="bitmap" name="t"><string name="filename" value="no.png"/></texture></bsdf>', 1),
-    lambda t: t.replace("\"wood\"", '"wood\0"'),
-)  # fmt: skip
-_TAGS = ("shape", "bsdf", "float", "string", "transform", "ref", "boolean", "integer", "emitter", "scene", "x", "rgb", "medium")
+    lambda t: t.replace(
+        "</bsdf>",
+        '<texture type="bitmap" name="t"><string name="filename" value="no.png"/></texture></bsdf>',
+        1,
+    ),
+    lambda t: t.replace('"wood"', '"wood\0"'),
+)
+_TAGS = (
+    "shape",
+    "bsdf",
+    "float",
+    "string",
+    "transform",
+    "ref",
+    "boolean",
+    "integer",
+    "emitter",
+    "scene",
+    "x",
+    "rgb",
+    "medium",
+)
 
 
 def scene(rng: Random, found: World, folder: Path) -> Case:
@@ -118,7 +161,9 @@ def _edit(rng: Random, root: ElementTree.Element) -> str:
             return f"tag {child.tag}"
         case _:
             key = rng.choice((*child.attrib, "id", "name", "type", "value"))
-            value = rng.choice((*TEXTS, *map(str, NUMBERS[:12]), "obj", "ply", "sphere", "cube", "nan", "disk", "0, 0"))
+            value = rng.choice(
+                (*TEXTS, *map(str, NUMBERS[:12]), "obj", "ply", "sphere", "cube", "nan", "disk", "0, 0")
+            )
             # What no XML can hold is another attack's.
             child.set(key, re.sub("[\0-\x08]", "?", value)[:2000])
             return f"{child.tag}.{key} = {value[:40]!r}"
@@ -149,12 +194,16 @@ def _wrong(rng: Random, raw: bytes, name: str) -> tuple[bytes, str, bool]:
     first = lines.index("end_header") + 1 if name.endswith("ply") else 0
     row = rng.randrange(first, len(lines))
     words = lines[row].split()
-    value = rng.choice(("nan", "inf", "-1", "999", "1e30", "x", "", "1.5", "2147483648", "-2147483649", "1e400", "0"))
+    value = rng.choice(
+        ("nan", "inf", "-1", "999", "1e30", "x", "", "1.5", "2147483648", "-2147483649", "1e400", "0")
+    )
     face = words[0] in ("f", "3") and len(words) == 4
     words[rng.randrange(1 if face or name.endswith("obj") else 0, len(words))] = value
     lines[row] = " ".join(words)
     # Mitsuba takes an OBJ's vertices backwards where they are negative, as the format says.
-    bad = value in ("nan", "inf", "x", "") or (face and value in ("999", "1e30", "2147483648", "1.5", "-2147483649", "1e400"))
+    bad = value in ("nan", "inf", "x", "") or (
+        face and value in ("999", "1e30", "2147483648", "1.5", "-2147483649", "1e400")
+    )
     return "\n".join([*lines, ""]).encode(), f"line {row + 1}: {value!r}", bad and name.endswith("ply")
 
 
@@ -174,12 +223,24 @@ def _header(rng: Random, raw: bytes) -> tuple[bytes, str, bool]:
         case 2:
             return head.encode() + body[: -rng.randrange(1, len(body))], "cut short", True
         case _:
-            old, new = rng.choice((
-                (f"face {faces}", f"face {10**rng.choice((1, 9, 15))}"), (f"vertex {vertices}", f"vertex {vertices - 1}"),
-                (f"vertex {vertices}", f"vertex {10**rng.choice((2, 9, 15))}"), ("little", "big"), ("float x", "double x"),
-                ("uchar int", "uchar short"), ("float z", "float y"), ("end_header", "end"), ("uchar int", "int int"),
-            ))  # fmt: skip
-            return head.replace(old, new).encode() + body, f"{old!r} to {new!r}", old != new and "face 1" not in old
+            old, new = rng.choice(
+                (
+                    (f"face {faces}", f"face {10 ** rng.choice((1, 9, 15))}"),
+                    (f"vertex {vertices}", f"vertex {vertices - 1}"),
+                    (f"vertex {vertices}", f"vertex {10 ** rng.choice((2, 9, 15))}"),
+                    ("little", "big"),
+                    ("float x", "double x"),
+                    ("uchar int", "uchar short"),
+                    ("float z", "float y"),
+                    ("end_header", "end"),
+                    ("uchar int", "int int"),
+                )
+            )
+            return (
+                head.replace(old, new).encode() + body,
+                f"{old!r} to {new!r}",
+                old != new and "face 1" not in old,
+            )
 
 
 def antenna(rng: Random, found: World, folder: Path) -> Case:
@@ -190,7 +251,9 @@ def antenna(rng: Random, found: World, folder: Path) -> Case:
     match rng.randrange(5):
         case 0 | 1:
             cells = lines[row].split(",")
-            value = rng.choice(("", "nan", "x", "1e999", "-inf", "500", "-1e9", "0x1", "1e5", "200", '"', "\0", "12.5"))
+            value = rng.choice(
+                ("", "nan", "x", "1e999", "-inf", "500", "-1e9", "0x1", "1e5", "200", '"', "\0", "12.5")
+            )
             cells[rng.randrange(3)] = value
             lines[row], bad, note = ",".join(cells), value != "12.5", f"row {row}: {value!r}"
         case 2:

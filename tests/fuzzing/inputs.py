@@ -28,7 +28,12 @@ VARIANTS: tuple[Mapping[str, Any], ...] = (
     {},
     {"objective": {"combining": "band", "no_path": "censor", "ceiling_db": 160.0}, "offset": {}},
     {"method": {"name": "gwo", "seed": 3, "options": {"population": 4, "iterations": 3}}},
-    {"method": {"name": "sgwo-im", "options": {"population": 4, "iterations": 3, "full_iterations": 1, "elites": 2}}},
+    {
+        "method": {
+            "name": "sgwo-im",
+            "options": {"population": 4, "iterations": 3, "full_iterations": 1, "elites": 2},
+        }
+    },
     {"holdout": {"where": "half == 'b' and not (x < 45)"}},
     {"engine": {"name": "command", "command": ["/bin/sh", "answer.sh"], "timeout": 5.0, "retries": 0}},
 )
@@ -58,26 +63,119 @@ def study(rng: Random, found: World, folder: Path) -> Case:
     return Case("study", f"open, {notes}", lambda: world.opened(file), bad, names=_NAMES, own=OWN)
 
 
-_NAMES = ("study.toml", "links.csv", "scene.xml", "horn.csv", "method", "trace", "engine", "answer.sh", "objects", "materials")
+_NAMES = (
+    "study.toml",
+    "links.csv",
+    "scene.xml",
+    "horn.csv",
+    "method",
+    "trace",
+    "engine",
+    "answer.sh",
+    "objects",
+    "materials",
+)
 
-FRAME = pd.DataFrame({
-    "x": [1.0, 2.0, 3.5, -4.0], "y": [0.0, -1.0, 2.0, 2.0], "n": [1, 2, 3, 4], "half": ["a", "b", "a", "c"],
-    "my set": ["p", "q", "q", ""],
-})  # fmt: skip
+FRAME = pd.DataFrame(
+    {
+        "x": [1.0, 2.0, 3.5, -4.0],
+        "y": [0.0, -1.0, 2.0, 2.0],
+        "n": [1, 2, 3, 4],
+        "half": ["a", "b", "a", "c"],
+        "my set": ["p", "q", "q", ""],
+    }
+)
 ESCAPES = (
-    "().__class__.__base__.__subclasses__()", "(x.to_csv)('f')", "x.isin([(x.to_csv)('f')])", "builtins.exec('1')",
-    "(x.__init__.__globals__['sys'].modules['os'].system)('id > pwned') != x", "__import__('os').system('id')",
-    "@x", "@pd.read_pickle('f')", "x > 7**7**7**7", "lambda: x", "[i for i in x]", "x if x else y", "f'{x!r}'",
-    "x := 3", "open('f','w')", "half.str.format(x)", "half.str.contains('(a+)+$')", "half.str.contains('(?:a|a)*b' * 9)",
-    "x.values", "x.map(print)", "half.str.cat()", "'a' * 10**9 == half", "x << 2**40 > 1", "x @ y", "~~~~x", "x;y",
-    "not " * 500 + "x", "(" * 200 + "x" + ")" * 200, "-" * 5000 + "x > 1", "x > 1" + " and x > 1" * 3000, "x == " + "9" * 9000,
-    "half.str.pad(10**9)", "half.str.repeat(10**9)", "x > 1e999", "x == nan", "half == '\\ud800'", "half.str.contains('[')",
-)  # fmt: skip
+    "().__class__.__base__.__subclasses__()",
+    "(x.to_csv)('f')",
+    "x.isin([(x.to_csv)('f')])",
+    "builtins.exec('1')",
+    "(x.__init__.__globals__['sys'].modules['os'].system)('id > pwned') != x",
+    "__import__('os').system('id')",
+    "@x",
+    "@pd.read_pickle('f')",
+    "x > 7**7**7**7",
+    "lambda: x",
+    "[i for i in x]",
+    "x if x else y",
+    "f'{x!r}'",
+    "x := 3",
+    "open('f','w')",
+    "half.str.format(x)",
+    "half.str.contains('(a+)+$')",
+    "half.str.contains('(?:a|a)*b' * 9)",
+    "x.values",
+    "x.map(print)",
+    "half.str.cat()",
+    "'a' * 10**9 == half",
+    "x << 2**40 > 1",
+    "x @ y",
+    "~~~~x",
+    "x;y",
+    "not " * 500 + "x",
+    "(" * 200 + "x" + ")" * 200,
+    "-" * 5000 + "x > 1",
+    "x > 1" + " and x > 1" * 3000,
+    "x == " + "9" * 9000,
+    "half.str.pad(10**9)",
+    "half.str.repeat(10**9)",
+    "x > 1e999",
+    "x == nan",
+    "half == '\\ud800'",
+    "half.str.contains('[')",
+)
 _TOKENS = (
-    "x", "y", "n", "half", "`my set`", "z", "1", "2.5", "-", "+", "*", "/", "//", "%", "**", "<", ">", "==", "!=", "<=",
-    "and", "or", "not", "in", "not in", "&", "|", "~", "(", ")", "[", "]", ",", "'a'", "abs", "sqrt", "log(x)", "True",
-    "None", "half.str.contains('a')", "x.isna()", "x.between(1, 2)", "half.isin(['a'])", ".", "@", "=", ":", "{", "}", "0",
-)  # fmt: skip
+    "x",
+    "y",
+    "n",
+    "half",
+    "`my set`",
+    "z",
+    "1",
+    "2.5",
+    "-",
+    "+",
+    "*",
+    "/",
+    "//",
+    "%",
+    "**",
+    "<",
+    ">",
+    "==",
+    "!=",
+    "<=",
+    "and",
+    "or",
+    "not",
+    "in",
+    "not in",
+    "&",
+    "|",
+    "~",
+    "(",
+    ")",
+    "[",
+    "]",
+    ",",
+    "'a'",
+    "abs",
+    "sqrt",
+    "log(x)",
+    "True",
+    "None",
+    "half.str.contains('a')",
+    "x.isna()",
+    "x.between(1, 2)",
+    "half.isin(['a'])",
+    ".",
+    "@",
+    "=",
+    ":",
+    "{",
+    "}",
+    "0",
+)
 
 
 def row_filter(rng: Random, found: World, folder: Path) -> Case:
@@ -85,8 +183,10 @@ def row_filter(rng: Random, found: World, folder: Path) -> Case:
     match rng.randrange(4):
         case 0 | 1:
             text = _condition(rng, 3)
-            rows = [dict(zip(("x", "y", "n", "half"), row, strict=False)) for row in FRAME.itertuples(index=False)]
-            right = np.array([eval(text, {"__builtins__": {}, "abs": abs}, row) for row in rows], dtype=float)  # noqa: S307
+            rows = [
+                dict(zip(("x", "y", "n", "half"), row, strict=False)) for row in FRAME.itertuples(index=False)
+            ]
+            right = np.array([eval(text, {"__builtins__": {}, "abs": abs}, row) for row in rows], dtype=float)
             return Case("filter", text, lambda: evaluate(text, FRAME), expected=right)
         case 2:
             text = rng.choice(ESCAPES)
@@ -103,10 +203,15 @@ def _condition(rng: Random, depth: int) -> str:
         return rng.choice((f"({a}) and ({b})", f"({a}) or ({b})", f"not ({a})", f"({a}) == ({b})"))
     a, b, c = (_term(rng, 2) for _ in range(3))
     signs = ("<", "<=", ">", ">=", "==", "!=")
-    return rng.choice((
-        f"{a} {rng.choice(signs)} {b}", f"{a} {rng.choice(signs)} {b} {rng.choice(signs)} {c}",
-        f"half {rng.choice(('==', '!='))} 'a'", f"half {rng.choice(('in', 'not in'))} ['a', 'c']", "n in [1, 4]",
-    ))  # fmt: skip
+    return rng.choice(
+        (
+            f"{a} {rng.choice(signs)} {b}",
+            f"{a} {rng.choice(signs)} {b} {rng.choice(signs)} {c}",
+            f"half {rng.choice(('==', '!='))} 'a'",
+            f"half {rng.choice(('in', 'not in'))} ['a', 'c']",
+            "n in [1, 4]",
+        )
+    )
 
 
 def _term(rng: Random, depth: int) -> str:
@@ -116,9 +221,38 @@ def _term(rng: Random, depth: int) -> str:
 
 
 CELLS = (
-    "", " ", "nan", "NA", "n/k", "1e999", "-inf", "0x10", "1_000", "1,5", '"1,5"', "=1+1", "\uff11\uff12", "1e5", "--1", "TRUE",
-    '"', "70.0 dB", "1e-400", "9" * 400, "\0", "+5", "5.", ".5", "1 2", "\u22125", "-70", "None", "1/2", "1d5", "1E+2",
-)  # fmt: skip
+    "",
+    " ",
+    "nan",
+    "NA",
+    "n/k",
+    "1e999",
+    "-inf",
+    "0x10",
+    "1_000",
+    "1,5",
+    '"1,5"',
+    "=1+1",
+    "\uff11\uff12",
+    "1e5",
+    "--1",
+    "TRUE",
+    '"',
+    "70.0 dB",
+    "1e-400",
+    "9" * 400,
+    "\0",
+    "+5",
+    "5.",
+    ".5",
+    "1 2",
+    "\u22125",
+    "-70",
+    "None",
+    "1/2",
+    "1d5",
+    "1E+2",
+)
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _USED = ("x", "y", "loss", "w")
 
@@ -133,14 +267,30 @@ def table(rng: Random, found: World, folder: Path) -> Case:
         case 0 | 1 | 2:
             row, column = rng.randrange(1, len(lines)), rng.randrange(5)
             lines[row][column] = rng.choice(CELLS)
-            raw, note = "\n".join(",".join(line) for line in lines).encode(), f"cell {row}, {column}: {lines[row][column]!r}"
+            raw, note = (
+                "\n".join(",".join(line) for line in lines).encode(),
+                f"cell {row}, {column}: {lines[row][column]!r}",
+            )
         case 3:
-            edit = rng.choice((
-                lambda t: t.replace(",", ";"), lambda t: t + t, lambda t: t.replace("loss", "x"), lambda t: "", lambda t: t[:7],
-                lambda t: t.replace("\n", "\r"), lambda t: "\ufeff" + t, lambda t: t.replace("\n", "\r\n"), lambda t: "# hi\n" + t,
-                lambda t: t.replace("10,0", '"10","0'), lambda t: t.replace("\n", ",\n"), lambda t: t.replace("loss", " loss "),
-                lambda t: t.replace(",", " , "), lambda t: t.replace("\n", "\n\n"), lambda t: t + "70,0,80.5,a\n",
-            ))  # fmt: skip
+            edit = rng.choice(
+                (
+                    lambda t: t.replace(",", ";"),
+                    lambda t: t + t,
+                    lambda t: t.replace("loss", "x"),
+                    lambda t: "",
+                    lambda t: t[:7],
+                    lambda t: t.replace("\n", "\r"),
+                    lambda t: "\ufeff" + t,
+                    lambda t: t.replace("\n", "\r\n"),
+                    lambda t: "# hi\n" + t,
+                    lambda t: t.replace("10,0", '"10","0'),
+                    lambda t: t.replace("\n", ",\n"),
+                    lambda t: t.replace("loss", " loss "),
+                    lambda t: t.replace(",", " , "),
+                    lambda t: t.replace("\n", "\n\n"),
+                    lambda t: t + "70,0,80.5,a\n",
+                )
+            )
             raw, note = edit(text).encode(), "layout"
         case 4:
             code = rng.choice(("utf-16", "latin-1", "utf-32", "cp037"))
@@ -153,9 +303,7 @@ def table(rng: Random, found: World, folder: Path) -> Case:
 
 def _read(file: Path, plain: list[list[float]] | None) -> list[float]:
     """What the package reads, once it is certain that it is what stands in the file."""
-    links = read_measurements(
-        file, [0.0, 0.0, 2.0], ["x", "y", 1.5], "loss", group="half", weight="w"
-    )
+    links = read_measurements(file, [0.0, 0.0, 2.0], ["x", "y", 1.5], "loss", group="half", weight="w")
     rows = np.stack([*links.rx[:, :2].T, links.path_loss_db], axis=1)
     if plain is None or rows.shape != np.shape(plain) or not np.allclose(rows, plain, rtol=1e-12, atol=0):
         return [math.nan, *rows.ravel()]

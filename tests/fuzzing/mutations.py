@@ -14,10 +14,66 @@ NUMBERS = (
     *(math.nan, math.inf, -math.inf, 0.1, 1e-9, 1e9, 255, 300.0, -300.0),
 )
 TEXTS = (
-    *("", " ", "\0", "a\0b", "nan", "inf", "-1", "1e999", "None", "true", "../../x", "/", ".", "..", "~", "${HOME}"),
-    *("${X", "${X:-y}", "/dev/zero", "/dev/null", "/proc/self/mem", "x" * 300, "y" * 100_000, "é", "\u202e", "\U0001f4a9"),
-    *("sionna:", "sionna:../../x", "sionna:box", "%s%n", "{0}", "'", '"', "`", "\\", "\n", "*", "[", "iso", "itu:", "itu:wood"),
-    *("links.csv", "scene.xml", "horn.csv", "study.toml", "loss", "half", "x", "walls", "concrete", "auto", "replay"),
+    *(
+        "",
+        " ",
+        "\0",
+        "a\0b",
+        "nan",
+        "inf",
+        "-1",
+        "1e999",
+        "None",
+        "true",
+        "../../x",
+        "/",
+        ".",
+        "..",
+        "~",
+        "${HOME}",
+    ),
+    *(
+        "${X",
+        "${X:-y}",
+        "/dev/zero",
+        "/dev/null",
+        "/proc/self/mem",
+        "x" * 300,
+        "y" * 100_000,
+        "é",
+        "\u202e",
+        "\U0001f4a9",
+    ),
+    *(
+        "sionna:",
+        "sionna:../../x",
+        "sionna:box",
+        "%s%n",
+        "{0}",
+        "'",
+        '"',
+        "`",
+        "\\",
+        "\n",
+        "*",
+        "[",
+        "iso",
+        "itu:",
+        "itu:wood",
+    ),
+    *(
+        "links.csv",
+        "scene.xml",
+        "horn.csv",
+        "study.toml",
+        "loss",
+        "half",
+        "x",
+        "walls",
+        "concrete",
+        "auto",
+        "replay",
+    ),
 )
 OTHERS = (True, False, [], {}, [[]], [1], ["x"], {"x": 1}, [None], list(range(50)))
 
@@ -78,7 +134,9 @@ def edited(rng: Random, tree: Any) -> tuple[Any, str, bool]:
     old, senseless = parent[key], False
     match kind:
         case "near" if isinstance(old, int | float) and not isinstance(old, bool):
-            parent[key] = rng.choice((-old, old * 1.01, old + 1, old * 1e3, old * 1e-3, str(old), [old], old == 0))
+            parent[key] = rng.choice(
+                (-old, old * 1.01, old + 1, old * 1e3, old * 1e-3, str(old), [old], old == 0)
+            )
         case "near" if isinstance(old, str) and old:
             parent[key] = rng.choice((old[:-1], old + "x", old.upper(), old[::-1], f" {old}", old + "\0"))
         case "remove":
@@ -97,7 +155,9 @@ def edited(rng: Random, tree: Any) -> tuple[Any, str, bool]:
 
 def toml(tree: dict[str, Any]) -> str:
     """A tree as TOML; what TOML cannot say comes out as no TOML."""
-    return "".join(f"{json.dumps(str(key), ensure_ascii=False)} = {_toml(value)}\n" for key, value in tree.items())
+    return "".join(
+        f"{json.dumps(str(key), ensure_ascii=False)} = {_toml(value)}\n" for key, value in tree.items()
+    )
 
 
 def _toml(value: Any) -> str:
@@ -107,7 +167,13 @@ def _toml(value: Any) -> str:
         case float():
             return repr(value)
         case dict():
-            return "{" + ", ".join(f"{json.dumps(str(k), ensure_ascii=False)} = {_toml(v)}" for k, v in value.items()) + "}"
+            return (
+                "{"
+                + ", ".join(
+                    f"{json.dumps(str(k), ensure_ascii=False)} = {_toml(v)}" for k, v in value.items()
+                )
+                + "}"
+            )
         case list() | tuple():
             return "[" + ", ".join(map(_toml, value)) + "]"
         case int():

@@ -90,7 +90,10 @@ class Watch:
                 name = path.decode(errors="replace") if isinstance(path, bytes) else path
                 if name.startswith("/") and not name.startswith((self.place, "/dev/null", "/proc/self")):
                     self.seen.append(f"opened {name} for writing")
-        elif event in ("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.fork") and not self.programs:
+        elif (
+            event in ("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.fork")
+            and not self.programs
+        ):
             self.seen.append(f"{event} {str(arguments)[:200]}")
 
 
@@ -173,7 +176,9 @@ def snapshot(folder: Path, own: tuple[str, ...]) -> dict[str, str]:
         if file.is_symlink():
             found[name] = str(file.readlink())
         elif file.is_file():
-            found[name] = hashlib.sha256(file.read_bytes()).hexdigest() if file.stat().st_size < 2**26 else "large"
+            found[name] = (
+                hashlib.sha256(file.read_bytes()).hexdigest() if file.stat().st_size < 2**26 else "large"
+            )
         elif not file.is_dir():
             found[name] = "special"
     return found

@@ -23,13 +23,31 @@ from fuzzing.world import OWN, World
 
 RIGHT = [70.0, 75.5, 80.25, None, 90.0, 95.0, 72.0, 77.0]
 _BEHAVIOURS = (
-    "exit {n}", "kill -{n} $$", "cat answer.json > \"$2\"; exit {n}", "cat answer.json > \"$2\"; kill -{n} $$", "true",
-    "head -c 30000000 /dev/zero", "head -c 30000000 /dev/urandom >&2; exit 3", "mkfifo \"$2\"", "mkdir \"$2\"",
-    "ln -s \"$PWD/answer.json\" \"$2\"", "truncate -s 20G \"$2\"", "ln -s /dev/zero \"$2\"", ": > \"$2\"", "cat \"$1\" > \"$2\"",
-    "rm -rf \"$(dirname \"$2\")\"", "sleep 60", "setsid sleep 60 & sleep 60", "(sleep 60 &) ; exit 1", "printf '\\033[2J\\377' >&2; exit 4",
-    "chmod 000 \"$(dirname \"$2\")\"; exit 5", "rm \"$1\"; cat answer.json > \"$2\"", "kill -9 $PPID", "echo '{{\"path_loss_db\": 70}}' > \"$2\"",
-)  # fmt: skip
-_FAITHFUL = ("cat answer.json > \"$2\"; exit 0", "rm \"$1\"; cat answer.json > \"$2\"")
+    "exit {n}",
+    "kill -{n} $$",
+    'cat answer.json > "$2"; exit {n}',
+    'cat answer.json > "$2"; kill -{n} $$',
+    "true",
+    "head -c 30000000 /dev/zero",
+    "head -c 30000000 /dev/urandom >&2; exit 3",
+    'mkfifo "$2"',
+    'mkdir "$2"',
+    'ln -s "$PWD/answer.json" "$2"',
+    'truncate -s 20G "$2"',
+    'ln -s /dev/zero "$2"',
+    ': > "$2"',
+    'cat "$1" > "$2"',
+    'rm -rf "$(dirname "$2")"',
+    "sleep 60",
+    "setsid sleep 60 & sleep 60",
+    "(sleep 60 &) ; exit 1",
+    "printf '\\033[2J\\377' >&2; exit 4",
+    'chmod 000 "$(dirname "$2")"; exit 5',
+    'rm "$1"; cat answer.json > "$2"',
+    "kill -9 $PPID",
+    'echo \'{{"path_loss_db": 70}}\' > "$2"',
+)
+_FAITHFUL = ('cat answer.json > "$2"; exit 0', 'rm "$1"; cat answer.json > "$2"')
 
 
 def answer(rng: Random, found: World, folder: Path) -> Case:
@@ -49,7 +67,12 @@ def answer(rng: Random, found: World, folder: Path) -> Case:
             changed, note, _ = edited(rng, json.loads(json.dumps({"path_loss_db": RIGHT})))
             raw = json.dumps(changed).encode()
             if rng.random() < 0.2:
-                raw, note = rng.choice((b"[" * 10**6, b'{"path_loss_db": ' + b"[" * 5000, b"1" * 10**6, b"\xff\xfe", b"null")), "odd"
+                raw, note = (
+                    rng.choice(
+                        (b"[" * 10**6, b'{"path_loss_db": ' + b"[" * 5000, b"1" * 10**6, b"\xff\xfe", b"null")
+                    ),
+                    "odd",
+                )
     if right is None and form == "json":
         right = _plain(raw) if script == world.SCRIPT else None
     bad = right is None and (form == "json" or script != world.SCRIPT)
@@ -108,20 +131,62 @@ def _hdf5(rng: Random) -> bytes:
 
 
 VALUES: tuple[str, ...] = tuple(
-    text.replace("\0", "") for text in (*TEXTS[:30], *(str(each)[:400] for each in NUMBERS), "-", "--", "a=b", "concrete:x", "1,2", "1,2,3")
+    text.replace("\0", "")
+    for text in (
+        *TEXTS[:30],
+        *(str(each)[:400] for each in NUMBERS),
+        "-",
+        "--",
+        "a=b",
+        "concrete:x",
+        "1,2",
+        "1,2,3",
+    )
 )
 TARGETS = (
-    "new", "deep/er/new", "links.csv", "scene.xml", "study.toml", "notes.txt", "meshes", ".", "", "new.csv", "fresh.csv", "fresh.h5",
-    "fifo", "link", "dangling", "gone/x.csv", "x" * 300, "a\nb", "\udcff", "/dev/null", "/dev/full", "/proc/self/mem", "out", "paid", "notes.txt/x",
-)  # fmt: skip
+    "new",
+    "deep/er/new",
+    "links.csv",
+    "scene.xml",
+    "study.toml",
+    "notes.txt",
+    "meshes",
+    ".",
+    "",
+    "new.csv",
+    "fresh.csv",
+    "fresh.h5",
+    "fifo",
+    "link",
+    "dangling",
+    "gone/x.csv",
+    "x" * 300,
+    "a\nb",
+    "\udcff",
+    "/dev/null",
+    "/dev/full",
+    "/proc/self/mem",
+    "out",
+    "paid",
+    "notes.txt/x",
+)
 _FAMILIAR = {
-    "engine": ("replay", "retrace", "command"), "method": ("random", "auto", "gwo", "sobol"), "methods": ("random,sobol", "random@8", ","),
-    "seed": ("0", "7"), "seeds": ("1", "2", "0"), "budget": ("4", "1"), "workers": ("1", "2", "0"),
-}  # fmt: skip
+    "engine": ("replay", "retrace", "command"),
+    "method": ("random", "auto", "gwo", "sobol"),
+    "methods": ("random,sobol", "random@8", ","),
+    "seed": ("0", "7"),
+    "seeds": ("1", "2", "0"),
+    "budget": ("4", "1"),
+    "workers": ("1", "2", "0"),
+}
 _HERE = {
-    "folder": "out", "links_file": "new.csv", "study_file": "study.toml", "scene": "scene.xml", "links": "links.csv",
+    "folder": "out",
+    "links_file": "new.csv",
+    "study_file": "study.toml",
+    "scene": "scene.xml",
+    "links": "links.csv",
     "subject": "scene.xml",
-}  # fmt: skip
+}
 
 
 def line(rng: Random, found: World, folder: Path) -> Case:
@@ -155,8 +220,10 @@ def line(rng: Random, found: World, folder: Path) -> Case:
         finally:
             os.chdir(here)
 
-    own = (*OWN, "new", "deep", "fresh", "paid", "meshes/.calibray")
-    return Case("line", shlex.join(words)[:400], act, own=tuple(each for each in own if each != "new") + ("new/*",))
+    own = (*OWN, "deep", "fresh", "paid", "meshes/.calibray")
+    return Case(
+        "line", shlex.join(words)[:400], act, own=tuple(each for each in own if each != "new") + ("new/*",)
+    )
 
 
 def _is_argument(parameter: Any) -> bool:
@@ -178,4 +245,6 @@ def _given(rng: Random, parameter: Any) -> list[str]:
         return [value]
     if getattr(parameter, "is_flag", False):
         return [parameter.opts[0]]
-    return [f"{parameter.opts[0]}={value}"] if parameter.opts[0].startswith("--") else [parameter.opts[0], value]
+    return (
+        [f"{parameter.opts[0]}={value}"] if parameter.opts[0].startswith("--") else [parameter.opts[0], value]
+    )

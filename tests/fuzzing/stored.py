@@ -72,7 +72,9 @@ def _field(rng: Random, file: Path) -> tuple[str, bool]:
                     value = rng.choice((np.nan, np.inf, -1, 10**6, 2**31 - 1, -(2**31), 1e300, 0, 7))
                     if array.dtype.kind in "iu":
                         value = 99 if isinstance(value, float) else value
-                        value = max(min(value, int(np.iinfo(array.dtype).max)), int(np.iinfo(array.dtype).min))
+                        value = max(
+                            min(value, int(np.iinfo(array.dtype).max)), int(np.iinfo(array.dtype).min)
+                        )
                     with np.errstate(over="ignore"):
                         array[place] = value
                     note, bad = f"{name} = {value}", isinstance(value, float) and not np.isfinite(value)
@@ -129,7 +131,12 @@ def ledger(rng: Random, found: World, folder: Path) -> Case:
             arguments += ("-o", folder / rng.choice(("calls.csv", "calls.parquet")))
         if rng.random() < 0.3:
             arguments += ("--forget-failed",)
-        return Case("ledger", f"list, {note}", lambda: world.calibray("ledger", *arguments), own=(*OWN, "paid", "calls."))
+        return Case(
+            "ledger",
+            f"list, {note}",
+            lambda: world.calibray("ledger", *arguments),
+            own=(*OWN, "paid", "calls."),
+        )
 
     def act() -> Any:
         errors = world.rmse(study, "-o", folder / "paid", "--engine", "command")
@@ -139,16 +146,31 @@ def ledger(rng: Random, found: World, folder: Path) -> Case:
 
 
 def _schema(rng: Random, file: Path) -> str:
-    change = rng.choice((
-        "DROP TABLE answers", "DROP TABLE problems", "DROP TABLE claims", "PRAGMA user_version = 3", "PRAGMA user_version = 1",
-        "PRAGMA user_version = 0", "PRAGMA user_version = -7", "ALTER TABLE answers ADD COLUMN more TEXT",
-        "ALTER TABLE answers RENAME COLUMN failure TO fault", "ALTER TABLE answers DROP COLUMN time",
-        "CREATE TRIGGER t BEFORE INSERT ON answers BEGIN SELECT RAISE(ABORT, 'no'); END",
-        "CREATE TRIGGER t AFTER INSERT ON answers BEGIN DELETE FROM answers; END",
-        "ALTER TABLE answers RENAME TO old", "CREATE TABLE other (x)", "PRAGMA application_id = 7", "DELETE FROM problems",
-        "DELETE FROM answers", "INSERT INTO claims SELECT problem, candidate, 'x', 'y', 1e300 FROM answers LIMIT 1",
-        "PRAGMA journal_mode = delete", "PRAGMA encoding = 'UTF-16'", "PRAGMA auto_vacuum = 1",
-    ))  # fmt: skip
+    change = rng.choice(
+        (
+            "DROP TABLE answers",
+            "DROP TABLE problems",
+            "DROP TABLE claims",
+            "PRAGMA user_version = 3",
+            "PRAGMA user_version = 1",
+            "PRAGMA user_version = 0",
+            "PRAGMA user_version = -7",
+            "ALTER TABLE answers ADD COLUMN more TEXT",
+            "ALTER TABLE answers RENAME COLUMN failure TO fault",
+            "ALTER TABLE answers DROP COLUMN time",
+            "CREATE TRIGGER t BEFORE INSERT ON answers BEGIN SELECT RAISE(ABORT, 'no'); END",
+            "CREATE TRIGGER t AFTER INSERT ON answers BEGIN DELETE FROM answers; END",
+            "ALTER TABLE answers RENAME TO old",
+            "CREATE TABLE other (x)",
+            "PRAGMA application_id = 7",
+            "DELETE FROM problems",
+            "DELETE FROM answers",
+            "INSERT INTO claims SELECT problem, candidate, 'x', 'y', 1e300 FROM answers LIMIT 1",
+            "PRAGMA journal_mode = delete",
+            "PRAGMA encoding = 'UTF-16'",
+            "PRAGMA auto_vacuum = 1",
+        )
+    )
     with sqlite3.connect(file) as connection:
         try:
             connection.execute(change)
@@ -163,19 +185,37 @@ def _entry(rng: Random, file: Path) -> tuple[str, bool]:
     with sqlite3.connect(file) as connection:
         run = connection.execute
         rows = run("SELECT id, problem, candidate, path_loss_db, seconds, failure FROM answers").fetchall()
-        number, problem, candidate, blob, seconds, failure = rng.choice(rows)
+        number, problem, candidate, blob, *_ = rng.choice(rows)
         column = rng.choice(("path_loss_db", "seconds", "failure", "candidate", "digest", "time", "problem"))
-        value = rng.choice((
-            b"", b"\0" * 8, blob[:-8], blob + blob, np.full(len(blob) // 8, np.nan).tobytes(), -1.0, float("inf"), 2**60,
-            "x", "y" * 10**6, damage(rng, blob), np.full(len(blob) // 8, -500.0).tobytes(), np.frombuffer(blob).tolist()[0],
-        ))  # fmt: skip
+        value = rng.choice(
+            (
+                b"",
+                b"\0" * 8,
+                blob[:-8],
+                blob + blob,
+                np.full(len(blob) // 8, np.nan).tobytes(),
+                -1.0,
+                float("inf"),
+                2**60,
+                "x",
+                "y" * 10**6,
+                damage(rng, blob),
+                np.full(len(blob) // 8, -500.0).tobytes(),
+                np.frombuffer(blob).tolist()[0],
+            )
+        )
         try:
             run(f"UPDATE answers SET {column} = ? WHERE id = ?", (value, number))
             if again := rng.random() < 0.4:
-                found = run("SELECT path_loss_db, seconds, failure FROM answers WHERE id = ?", (number,)).fetchone()
+                found = run(
+                    "SELECT path_loss_db, seconds, failure FROM answers WHERE id = ?", (number,)
+                ).fetchone()
                 if isinstance(found[0], bytes) and len(found[0]) % 8 == 0:
                     entry = LedgerEntry(np.frombuffer(found[0], "<f8"), found[1], str(found[2]))
-                    run("UPDATE answers SET digest = ? WHERE id = ?", (entry.digest(problem, candidate), number))
+                    run(
+                        "UPDATE answers SET digest = ? WHERE id = ?",
+                        (entry.digest(problem, candidate), number),
+                    )
         except sqlite3.Error as error:
             return f"{column}: {error}", False
     connection.close()
@@ -195,7 +235,9 @@ def result(rng: Random, found: World, folder: Path) -> Case:
                 (out / "result.json").write_text("1" * 5000)
             bad = senseless
         case 3:
-            name = rng.choice(("result.json", "result-links.csv", "result-history.csv", "result-scene.xml", ".calibray"))
+            name = rng.choice(
+                ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml", ".calibray")
+            )
             (out / name).write_bytes(damage(rng, (out / name).read_bytes()))
             note = f"bytes of {name}"
             signed &= name != ".calibray"

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import small_scenes
 import typer.main
 
+import small_scenes
 from calibray.cli.app import app
 from calibray.fields import path_loss
 from calibray.paths import Paths
@@ -93,7 +93,7 @@ def content(**sections: Any) -> dict[str, Any]:
 def horn() -> str:
     """An antenna's gains, every 15 degrees."""
     rows = [
-        f"{azimuth},{elevation},{-(azimuth / 60) ** 2 - (elevation / 60) ** 2 + 2:.4f}"
+        f"{azimuth},{elevation},{-((azimuth / 60) ** 2) - (elevation / 60) ** 2 + 2:.4f}"
         for azimuth in range(-180, 180, 15)
         for elevation in range(-90, 91, 15)
     ]
@@ -126,7 +126,9 @@ def calibray(*arguments: object) -> str:
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(Twice(err)):
         try:
-            status = command().main([str(each) for each in arguments], prog_name="calibray", standalone_mode=False)
+            status = command().main(
+                [str(each) for each in arguments], prog_name="calibray", standalone_mode=False
+            )
         except Exception as error:
             # Typer carries a Click of its own, whose errors are known by what they have.
             if not hasattr(error, "exit_code"):
@@ -245,7 +247,7 @@ def loss(file: Path) -> list[float]:
 def rmse(*arguments: object) -> dict[str, Any]:
     """The errors that `calibray run --json` prints."""
     found = json.loads(calibray("run", *arguments, "--json"))
-    Result.load(next(str(each) for flag, each in zip(arguments, arguments[1:], strict=False) if flag == "-o"))
+    Result.load(arguments[arguments.index("-o") + 1])
     return {key: value for key, value in found.items() if key.endswith("rmse_db")}
 
 

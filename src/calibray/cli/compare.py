@@ -52,7 +52,9 @@ def compare(
     names = [name.strip() for name in methods.split(",") if name.strip()]
     contenders = [Contender.parse(name, budget) for name in dict.fromkeys(names)]
     calls = seeds * sum(contender.budget for contender in contenders)
-    typer.echo(f"{seeds * len(contenders):,} runs of {calls:,} RT calls together, less those kept in {out}", err=True)
+    typer.echo(
+        f"{seeds * len(contenders):,} runs of {calls:,} RT calls together, less those kept in {out}", err=True
+    )
     with progress_bars(log) as progress:
         finished = run_all(
             partial(study_arena, study_file),

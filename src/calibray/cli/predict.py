@@ -46,7 +46,9 @@ def predict(
     ] = None,
     anyway: Annotated[
         bool,
-        typer.Option("--anyway", help="Predict although a file of the result, the scene or an antenna changed since."),
+        typer.Option(
+            "--anyway", help="Predict although a file of the result, the scene or an antenna changed since."
+        ),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:

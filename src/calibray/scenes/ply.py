@@ -71,7 +71,7 @@ def _check(path: Path, vertices: NDArray[np.void] | None, faces: NDArray[np.void
             row = int(np.flatnonzero(wrong)[0])
             raise _malformed(path, f"{axis} of vertex {row} is {vertices[axis][row]}, must be finite")
     corners = np.stack([faces[f"corner {k}"] for k in range(3)], axis=1).astype(np.float64)
-    if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners % 1 != 0)).any():
+    if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
         row, place = (int(index[0]) for index in np.nonzero(wrong))
         raise _malformed(
             path, f"face {row} names vertex {corners[row, place]:g}, must be 0 to {len(vertices) - 1}"
