@@ -10,13 +10,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import shown
 from calibray.engines.entry import LedgerEntry, read_entry
 from calibray.errors import InputError
 from calibray.files import check_file, check_folder
 from calibray.measurements import read_measurements
 from calibray.measurements.filters import evaluate
 from calibray.measurements.tables import read_table
+from calibray.reporting.export import export
 from calibray.result import Result
+from calibray.scenes import export_scene, read_scene
 from calibray.scenes.ply import check_ply
 from calibray.study import Study
 from calibray.study.model import expand
@@ -143,6 +146,21 @@ def test_an_edited_result_is_refused_unless_it_is_meant(tmp_path):
     with pytest.raises(InputError, match=r"result\.json: changed since Calibray wrote it.*--anyway"):
         Result.load(tmp_path)
     assert Result.load(tmp_path, anyway=True).rmse_db == 0.001
+
+
+def test_an_export_takes_no_place_of_the_users_files(found, tmp_path):
+    (tmp_path / "links.csv").write_text("mine\n")
+    with pytest.raises(InputError, match=r"links\.csv: was not written by Calibray"):
+        export(shown.result(), tmp_path)
+    assert [each.name for each in tmp_path.iterdir()] == ["links.csv"]
+    scene = read_scene(found.base / "scene.xml", 3.5e9)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "house.ply").write_text("mine\n")
+    with pytest.raises(InputError, match=r"house\.ply: was not written by Calibray"):
+        export_scene(scene, scene.materials, tmp_path / "scene.xml", copy_meshes=True)
+    # Beside the original, its own meshes are where the copies would go.
+    with pytest.raises(InputError, match="is an input"):
+        export_scene(scene, scene.materials, found.base / "copy.xml", copy_meshes=True, overwrite=True)
 
 
 def test_a_fault_whose_words_hold_braces_is_told(tmp_path):

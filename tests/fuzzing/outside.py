@@ -220,10 +220,8 @@ def line(rng: Random, found: World, folder: Path) -> Case:
         finally:
             os.chdir(here)
 
-    own = (*OWN, "deep", "fresh", "paid", "meshes/.calibray")
-    return Case(
-        "line", shlex.join(words)[:400], act, own=tuple(each for each in own if each != "new") + ("new/*",)
-    )
+    own = (*OWN, "deep", "fresh", "paid", "meshes/.calibray", "new/*")
+    return Case("line", shlex.join(words)[:400], act, own=own)
 
 
 def _is_argument(parameter: Any) -> bool:

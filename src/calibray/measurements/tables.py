@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-import zipfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -211,6 +210,11 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
     return header, lines
 
 
+def _first_line(error: Exception) -> str:
+    """What a library says of a damaged file, which can break it anywhere."""
+    return shortened((str(error).strip() or type(error).__name__).splitlines()[0], 300)
+
+
 def _read_parquet(path: Path) -> SourceTable:
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
@@ -218,22 +222,17 @@ def _read_parquet(path: Path) -> SourceTable:
         raise InputError(
             f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
         ) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from None
+    except Exception as error:
+        raise InputError(f"{path}: not a Parquet file ({_first_line(error)}); export it again") from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 
 def _read_excel(path: Path) -> SourceTable:
-    openpyxl = library("openpyxl", "excel")
+    library("openpyxl", "excel")
     try:
         frame = pd.read_excel(path, engine="openpyxl")
-    except (
-        zipfile.BadZipFile,
-        KeyError,
-        ValueError,
-        openpyxl.utils.exceptions.InvalidFileException,
-    ) as error:
-        raise InputError(f"{path}: not an Excel file ({str(error).splitlines()[0]})") from None
+    except Exception as error:
+        raise InputError(f"{path}: not an Excel file ({_first_line(error)}); save it again") from None
     named = [str(name) for name in frame.columns]
     if repeated := [
         name for name in named if re.fullmatch(r"(.*)\.\d+", name) and name.rpartition(".")[0] in named
