@@ -169,6 +169,7 @@ def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dic
             try:
                 number = waiting.get_nowait()
             except queue.Empty:
+                worker.end()
                 return
             told = worker.run(number)
             found.append(told)
@@ -178,8 +179,13 @@ def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dic
                     file=sys.stderr,
                 )
 
-    crew = [Worker(place, f"worker-{k}", seed) for k in range(min(workers, len(numbers)))]
-    threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in crew]
+    first = Worker(place, "worker-0", seed)  # makes the world that the others find
+    threads = [threading.Thread(target=serve, args=(first,), daemon=True)] + [
+        threading.Thread(
+            target=lambda name: serve(Worker(place, name, seed)), args=(f"worker-{k}",), daemon=True
+        )
+        for k in range(1, min(workers, len(numbers)))
+    ]
     started = time.monotonic()
     for thread in threads:
         thread.start()
@@ -191,8 +197,8 @@ def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dic
             line = f"{len(found)} of {len(numbers)} cases, {told - started:.0f} s"
             print(line, end="\r" if seen else "\n", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    for worker in crew:
-        worker.end()
+    if len(found) < len(numbers):
+        sys.exit(f"only {len(found)} of {len(numbers)} cases were run: a worker could not be started")
     return found
 
 
