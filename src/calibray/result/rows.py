@@ -67,4 +67,8 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     if not len(table):
         raise InputError(f"{file}: has no rows; run the study again")
     places = [column for column in table if str(column)[:3] in ("tx_", "rx_")]
+    if strange := [column for column in places if table[column].dtype.kind not in "if"]:
+        raise InputError(
+            f"{file}: column {strange[0]!r} holds something else than it should; run the study again"
+        )
     return table.astype(dict.fromkeys(places, float))
