@@ -163,6 +163,16 @@ def test_an_export_takes_no_place_of_the_users_files(found, tmp_path):
         export_scene(scene, scene.materials, found.base / "copy.xml", copy_meshes=True, overwrite=True)
 
 
+def test_positions_of_a_result_that_are_no_numbers(tmp_path):
+    source = Path(__file__).parent / "golden" / "result"
+    for file in source.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    links = pd.read_csv(tmp_path / "links.csv")
+    links.assign(rx_z="{'x': 1}").to_csv(tmp_path / "links.csv", index=False)
+    with pytest.raises(InputError, match=r"links\.csv: column 'rx_z' holds something else"):
+        Result.load(tmp_path)
+
+
 def test_a_fault_whose_words_hold_braces_is_told(tmp_path):
     source = Path(__file__).parent / "golden" / "result"
     for file in source.iterdir():
