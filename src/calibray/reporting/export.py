@@ -87,7 +87,7 @@ def export(
     }
     try:
         target.mkdir(parents=True, exist_ok=True)
-        export_scene(scene, result.materials, target / "scene.xml", copy_meshes)
+        export_scene(scene, result.materials, target / "scene.xml", copy_meshes, overwrite)
         for name, text in content.items():
             write_text(target / name, text)
     except OSError as error:

@@ -10,7 +10,7 @@ from shutil import copyfile
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.files import replacing, write_text
+from calibray.files import check_replaceable, replacing, write_text
 from calibray.materials import ITU_MATERIALS, Material
 from calibray.scenes.scene import TRACED, Scene, material_element
 
@@ -19,7 +19,11 @@ MESHES: Final = "meshes"
 
 
 def export_scene(
-    scene: Scene, materials: Mapping[str, Material], target: Path, copy_meshes: bool = False
+    scene: Scene,
+    materials: Mapping[str, Material],
+    target: Path,
+    copy_meshes: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write a scene file with other constants; it refers to the meshes of the original, or to copies.
 
@@ -31,9 +35,10 @@ def export_scene(
         materials: Constants by material name.
         target: File to write.
         copy_meshes: Whether the meshes are copied beside the file, so that the folder can be given away.
+        overwrite: Let copies replace files that Calibray did not write; meshes of the scene are never replaced.
 
     Raises:
-        InputError: A material of the scene is missing.
+        InputError: A material of the scene is missing, or a copy must not take a file's place.
         OSError: A file cannot be written.
     """
     missing = [name for name in scene.materials if name not in materials]
@@ -53,7 +58,7 @@ def export_scene(
         if filename is not None:
             mesh = (scene.path.parent / filename.get("value", "")).resolve()
             if copy_meshes:
-                mesh = _copied(mesh, target.parent.resolve() / MESHES, copies)
+                mesh = _copied(mesh, target.parent.resolve() / MESHES, copies, overwrite)
             filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
     for index, (name, material) in enumerate(materials.items()):
         root.insert(index, material_element(exported_id(name), material))
@@ -73,7 +78,7 @@ def exported_id(name: str) -> str:
     return f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}"
 
 
-def _copied(mesh: Path, folder: Path, copies: dict[str, Path]) -> Path:
+def _copied(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
     """A copy of a mesh; meshes of one name from different folders get numbers."""
     name, number = mesh.name, 1
     while copies.setdefault(name, mesh) != mesh:
@@ -82,6 +87,7 @@ def _copied(mesh: Path, folder: Path, copies: dict[str, Path]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / name).exists() and (folder / name).samefile(mesh):
         return mesh
+    check_replaceable(folder / name, [mesh], overwrite)
     with replacing(folder / name) as partial:
         copyfile(mesh, partial)
     return folder / name
