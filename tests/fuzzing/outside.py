@@ -58,8 +58,8 @@ def answer(rng: Random, found: World, folder: Path) -> Case:
     match rng.randrange(4):
         case 0:
             script = rng.choice(_BEHAVIOURS).format(n=rng.choice((0, 1, 2, 9, 11, 15, 34, 63, 64, 127, 255)))
-            note = script
-            right = RIGHT if "answer.json" in script and form == "json" else None
+            raw, form, note = json.dumps({"path_loss_db": RIGHT}).encode(), "json", script
+            right = RIGHT if "answer.json" in script else None
         case 1 | 2:
             raw, note, script = damage(rng, raw), f"{form} bytes", world.SCRIPT
         case _:
