@@ -61,7 +61,7 @@ def _bars(console: Console) -> Iterator[Progress]:
             if STARTING in tasks:
                 bars.remove_task(tasks.pop(STARTING))
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
+                tasks[stage] = bars.add_task(stage, total=total, completed=done)
             bars.update(tasks[stage], completed=done, total=total)
 
         yield report

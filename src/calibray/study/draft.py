@@ -148,6 +148,8 @@ class _Drafting:
             "trace": trace,
             "parameters": self._parameters(frequency, indoors),
             "offset": {"per": groups} if groups else {},
+            # Refraction is sampled by the materials: traced again once, not until every link stands still.
+            **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),
             "method": {"name": "auto", "seed": 0},
         }
 
