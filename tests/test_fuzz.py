@@ -159,7 +159,9 @@ def test_an_export_takes_no_place_of_the_users_files(found, tmp_path):
     with pytest.raises(InputError, match=r"house\.ply: was not written by Calibray"):
         export_scene(scene, scene.materials, tmp_path / "scene.xml", copy_meshes=True)
     export_scene(scene, scene.materials, tmp_path / "scene.xml", copy_meshes=True, overwrite=True)
-    assert (tmp_path / "meshes" / "house.ply").read_bytes() == (found.base / "meshes" / "house.ply").read_bytes()
+    assert (tmp_path / "meshes" / "house.ply").read_bytes() == (
+        found.base / "meshes" / "house.ply"
+    ).read_bytes()
 
 
 def test_positions_of_a_result_that_are_no_numbers(tmp_path):

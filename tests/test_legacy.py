@@ -28,6 +28,15 @@ MADE_IN = "/srv/calibray-legacy"
 TRACED_DB = 1e-3
 
 
+def holds(new, old):
+    """Whether all that was there is there still; tables may have gained keys."""
+    if isinstance(old, dict):
+        return isinstance(new, dict) and all(
+            key in new and holds(new[key], each) for key, each in old.items()
+        )
+    return new == old
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A copy of the files, which believes to have been made where it lies."""
@@ -44,7 +53,7 @@ def test_a_study_file_means_the_same(name):
     expected = dict(EXPECTED["studies"][name]["content"])
     # Each engine has keys of its own now; those of others were written with their defaults.
     engine = expected.pop("engine")
-    assert {key: value for key, value in study.content().items() if key != "engine"} == expected
+    assert holds(study.content(), expected)
     assert study.engine == cb.Study.from_content({**expected, "engine": engine}, study.path).engine
     assert study.content()["engine"].items() <= engine.items()
     study.measurements()
@@ -69,11 +78,11 @@ def test_a_result_holds_what_was_written(name, folder):
     written = json.loads((LEGACY / name / "result.json").read_text())
     result = cb.Result.load(folder / name)
     content = result.content()
-    # What later versions add is theirs; what was there must be there, the study with its own new defaults.
-    assert {key: content[key] for key in written if key not in ("study", "study_file")} == {
-        key: value for key, value in written.items() if key not in ("study", "study_file")
-    }
-    assert result.study.digest() == EXPECTED["studies"][name]["digest"]
+    # What later versions add is theirs; what was there must be there.
+    for key in ("study", "study_file"):
+        del written[key]
+    assert holds(content, written)
+    assert holds(result.study.content(), EXPECTED["studies"][name]["content"])
     assert len(result.history) == result.rt_calls
     assert result.links.held_out.sum() > 0
     assert result.links.retrace_gap_db.isna().all()

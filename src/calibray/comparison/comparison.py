@@ -323,7 +323,7 @@ def compare(
     if best is None:
         best = store.add(_optimum(arena))
     found = {
-        contender.name: (store.find(*_key(contender, seed)) for seed in range(seeds))
+        contender.name: [store.find(*_key(contender, seed)) for seed in range(seeds)]
         for contender in contenders
     }
     runs = {name: tuple(run for run in each if run is not None) for name, each in found.items()}
