@@ -61,13 +61,15 @@ def work(place: Path, seed: int) -> None:
             case = make(seed, number, found, folder)
         except Exception:
             case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
+        # Told first, for who cannot be asked any more.
+        print(json.dumps({"number": number, "kind": case.kind, "note": case.note}), file=answers, flush=True)
         started = time.monotonic()
         watch.programs = case.kind in ("study", "answer", "ledger", "line")
         verdict = judge(case, folder, watch)
         if peak() > MEMORY:
             verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")
-        told = {"number": number, "kind": case.kind, "note": case.note} | asdict(verdict)
-        print(json.dumps(told | {"seconds": time.monotonic() - started}), file=answers, flush=True)
+        told = asdict(verdict) | {"seconds": time.monotonic() - started}
+        print(json.dumps(told), file=answers, flush=True)
         _remove(folder)
 
 
@@ -120,35 +122,26 @@ class Worker:
 
     def run(self, number: int) -> dict[str, object]:
         """Run a case, and tell what came of it."""
-        from fuzzing.kinds import make
-        from fuzzing.world import World
-
         self._process.stdin.write(f"{number}\n")
         self._process.stdin.flush()
-        line, before, started = None, self._spent(), time.monotonic()
-        while line is None and max(self._spent() - before, (time.monotonic() - started) / 4) < LIMIT:
-            line = self._next(1.0)
-        if line:
-            return json.loads(line)
+        told: dict[str, object] = {"number": number, "kind": "unmade", "note": ""}
+        for _ in range(2):  # what it is, and what came of it
+            line, before, started = None, self._spent(), time.monotonic()
+            while line is None and max(self._spent() - before, (time.monotonic() - started) / 4) < LIMIT:
+                line = self._next(1.0)
+            if not line:
+                return told | self._lost(line == "")
+            told |= json.loads(line)
+        return told
+
+    def _lost(self, ended: bool) -> dict[str, object]:
+        """What came of a case whose process ended, or goes on without end; another takes its place."""
         said = self._errors.read_text(errors="replace")[-3000:]
         self.end()
-        folder = Path(tempfile.mkdtemp(dir=self._place, prefix=f"again-{number}-"))
-        world = World(
-            self._place, self._place / "base", json.loads((self._place / "base/right.json").read_text())
-        )
-        case = make(self._seed, number, world, folder)
-        _remove(folder)
-        verdict = "crash" if line == "" else "announced" if COST.search(said) else "hang"
-        detail = f"status {self._process.returncode}, {said}"
+        verdict = "crash" if ended else "announced" if COST.search(said) else "hang"
+        lost = {"verdict": verdict, "detail": f"status {self._process.returncode}, {said}", "seconds": LIMIT}
         self._start()
-        return {
-            "number": number,
-            "kind": case.kind,
-            "note": case.note,
-            "verdict": verdict,
-            "detail": detail,
-            "seconds": LIMIT,
-        }
+        return lost
 
     def end(self) -> None:
         """End the process and what it started."""

@@ -109,6 +109,13 @@ def test_a_quote_that_is_never_closed(tmp_path):
         read_table(tmp_path / "links.csv")
 
 
+def test_an_overlong_column_is_not_said_again(tmp_path):
+    (tmp_path / "links.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(InputError, match="no column") as refusal:
+        read_table(tmp_path / "links.csv").column("y" * 100_000)
+    assert len(str(refusal.value)) < 1000
+
+
 def test_a_candidate_of_another_type_is_no_entry():
     entry = LedgerEntry(np.array([80.0]), 1.0)
     columns = (entry.blob, 1.0, "", entry.digest("p", b"c"))

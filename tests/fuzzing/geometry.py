@@ -154,7 +154,8 @@ def _edit(rng: Random, root: ElementTree.Element) -> str:
             parent.append(child)
             return f"repeat {child.tag}"
         case 2:
-            rng.choice(parents[0:]).append(child)
+            # Not into itself: such a tree has no end.
+            rng.choice([each for each in parents if each not in set(child.iter())]).append(child)
             return f"move {child.tag}"
         case 3:
             child.tag = rng.choice(_TAGS)

@@ -69,7 +69,9 @@ class SourceTable:
             InputError: There is no such column.
         """
         if name not in self.frame:
-            raise InputError(f"{self.source}: no column {name!r}; {did_you_mean(name, map(str, self.frame))}")
+            raise InputError(
+                f"{self.source}: no column {shortened(name)!r}; {did_you_mean(name, map(str, self.frame))}"
+            )
         return self.frame[name]
 
     def numbers(self, name: str) -> NDArray[np.float64]:

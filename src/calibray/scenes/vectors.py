@@ -12,7 +12,7 @@ from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
 from calibray.extras import library
 from calibray.scenes.footprints import Footprints, HeightRule, HeightSource, cleaned, in_frame, parse_length
-from calibray.spelling import did_you_mean
+from calibray.spelling import did_you_mean, shortened
 
 
 def read_footprints(
@@ -104,7 +104,7 @@ def _centred(outlines: NDArray[Any], crs: str) -> Frame:
 
 def _column(path: Path, columns: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in columns:
-        raise InputError(f"footprints {path}: no column {name!r}; {did_you_mean(name, columns)}")
+        raise InputError(f"footprints {path}: no column {shortened(name)!r}; {did_you_mean(name, columns)}")
     return columns[name]
 
 
