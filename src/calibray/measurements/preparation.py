@@ -305,7 +305,7 @@ def _outside(
     frame = table.frame.assign(**dict(zip(names, places.T, strict=True)))
     return _kept(
         SourceTable(frame, table.row, table.source),
-        ~lost,
+        np.asarray(~lost),
         "receivers deep inside buildings, left out",
         counts,
     )
