@@ -15,7 +15,10 @@ def validate(
     blocks: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=2, help="Spatial blocks, each held out in turn; the study's, or 4, unless given."
+            metavar="N",
+            min=2,
+            max=100,
+            help="Spatial blocks, each held out in turn; the study's, or 4, unless given.",
         ),
     ] = None,
     by: Annotated[
