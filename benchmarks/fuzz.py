@@ -136,9 +136,11 @@ class Worker:
 
     def _lost(self, ended: bool) -> dict[str, object]:
         """What came of a case whose process ended, or goes on without end; another takes its place."""
-        said = self._errors.read_text(errors="replace")[-3000:]
+        from fuzzing.outcome import MEMORY, peak
+
+        said, large = self._errors.read_text(errors="replace")[-3000:], peak(self._process.pid) > MEMORY
         self.end()
-        verdict = "crash" if ended else "announced" if COST.search(said) else "hang"
+        verdict = "crash" if ended else "memory" if large else "announced" if COST.search(said) else "hang"
         lost = {"verdict": verdict, "detail": f"status {self._process.returncode}, {said}", "seconds": LIMIT}
         self._start()
         return lost

@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import shown
+from calibray.calibration.validate import validate
 from calibray.engines.entry import LedgerEntry, read_entry
 from calibray.errors import InputError
 from calibray.files import check_file, check_folder
@@ -139,6 +140,11 @@ def test_the_demo_refuses_an_engine_before_it_traces(engine, tmp_path, monkeypat
 def test_comparisons_without_end_are_refused(arguments, tmp_path):
     ended = run("compare", write(tmp_path), "-o", tmp_path / "out", *arguments)
     assert ended.exit_code == 2, ended.output
+
+
+def test_blocks_without_number_are_refused(found):
+    with pytest.raises(InputError, match=r"blocks = 1000000000; must be 2 to 100"):
+        validate(Study.load(found.base / "study.toml"), blocks=10**9)
 
 
 def test_an_edited_result_is_refused_unless_it_is_meant(tmp_path):

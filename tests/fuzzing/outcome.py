@@ -184,10 +184,10 @@ def snapshot(folder: Path, own: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
-def peak() -> int:
-    """The most memory that this process ever took [bytes], since `restart_peak` where the system can."""
+def peak(process: int | str = "self") -> int:
+    """The most memory that a process ever took [bytes], since `restart_peak` where the system can."""
     try:
-        lines = Path("/proc/self/status").read_text().splitlines()
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
     except (OSError, StopIteration):
         return 0

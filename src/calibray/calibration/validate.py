@@ -30,6 +30,9 @@ from calibray.tracing.protocol import TracerFactory
 BLOCKS: Final = 4
 """Spatial blocks where the study names none."""
 
+MOST_BLOCKS: Final = 100
+"""The largest number of spatial blocks, here as in a study."""
+
 SPREAD: Final = 0.3
 """Standard deviation of the logarithm of a parameter around its start, where the model has priors."""
 
@@ -70,6 +73,8 @@ def validate(
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
         raise InputError("validate: give blocks or by, not both")
+    if blocks is not None and not 2 <= blocks <= MOST_BLOCKS:
+        raise InputError(f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}: each takes a calibration")
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
