@@ -110,6 +110,16 @@ def test_a_quote_that_is_never_closed(tmp_path):
         read_table(tmp_path / "links.csv")
 
 
+def test_whatever_breaks_the_reading_of_parquet_is_told(tmp_path, monkeypatch):
+    def break_off(*_, **__):
+        raise KeyError("name")
+
+    (tmp_path / "links.parquet").write_bytes(b"PAR1")
+    monkeypatch.setattr(pd, "read_parquet", break_off)
+    with pytest.raises(InputError, match=r"links\.parquet: not a Parquet file"):
+        read_table(tmp_path / "links.parquet")
+
+
 def test_an_overlong_column_is_not_said_again(tmp_path):
     (tmp_path / "links.csv").write_text("x,y\n1,2\n")
     with pytest.raises(InputError, match="no column") as refusal:
