@@ -23,6 +23,7 @@ from calibray.files import (
     write_table,
     write_text,
 )
+from calibray.paths import seal
 
 TABLE = pd.DataFrame({"a": [1.0, 2.0]})
 
@@ -49,10 +50,13 @@ def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path)
 
 
 def test_path_files_say_themselves_whose_they_are(tmp_path):
-    for schema, own in (("calibray/paths", True), ("other", False)):
-        with h5py.File(tmp_path / "paths.h5", "w") as file:
-            file.attrs["schema"] = schema
-        assert is_own(tmp_path / "paths.h5") == own
+    file = tmp_path / "paths.h5"
+    with h5py.File(file, "w") as content:
+        content.attrs["schema"] = "calibray/paths"
+    assert not is_own(file)
+    seal(file)
+    (tmp_path / SIGNATURES).unlink()
+    assert is_own(file)
 
 
 def test_a_file_of_the_same_content_and_another_name_is_not_own(tmp_path):

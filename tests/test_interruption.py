@@ -16,7 +16,9 @@ import programs
 from calibray.engines import open_ledger
 from test_cli_run import write_study
 
-COMMAND = [sys.executable, "-c", "from calibray.cli import main; main()"]
+# Its standard input becomes the terminal that Ctrl-C is typed in.
+TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+COMMAND = [sys.executable, "-c", TERMINAL + "from calibray.cli import main; main()"]
 PATIENCE = 120.0  # [s]
 
 
@@ -34,7 +36,7 @@ def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
     environment = {**os.environ, "CALIBRAY_CACHE": "", "TERM": "xterm"}
     process = subprocess.Popen(
         [*COMMAND, *map(str, words)], stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
-        start_new_session=True, preexec_fn=_take_terminal,
+        start_new_session=True,
     )  # fmt: skip
     os.close(theirs)
     screen, pressed, deadline = b"", False, time.monotonic() + PATIENCE
@@ -55,14 +57,6 @@ def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
     finally:
         process.kill()
         os.close(own)
-
-
-def _take_terminal() -> None:
-    """Make standard input the terminal that Ctrl-C is typed in."""
-    import fcntl
-    import termios
-
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 def test_ctrl_c_tells_what_was_kept_and_how_to_go_on(tmp_path):

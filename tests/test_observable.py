@@ -33,7 +33,7 @@ def test_a_campaign_of_delay_spreads_is_calibrated_on(tmp_path):
     engine = planted.engine()
     truth = np.array([planted.TRUTH[name] for name in engine.parameters.names])
     measured = delay_spread(engine, truth[None])[0]
-    setup = setup_of(tmp_path, measured, name="vector-surrogate", options={"budget": 60})
+    setup = setup_of(tmp_path, measured, name="vector-surrogate", options={"budget": 120})
     problem = Problem.of(setup, engine, SPREAD)
     assert not problem.differentiable
     trail = search(problem, choose(problem))

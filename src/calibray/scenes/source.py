@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -55,6 +56,27 @@ def scene_path(source: str) -> Path:
     return path
 
 
+def content(path: Path) -> bytes:
+    """The bytes of a scene's file; read once for as long as it stays the same.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its bytes.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    status = path.stat()
+    return _content(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
+@lru_cache(maxsize=4)
+def _content(path: Path, *_: int) -> bytes:
+    return path.read_bytes()
+
+
 def parse(path: Path, source: str) -> ElementTree.Element:
     """Read the XML of a scene.
 
@@ -69,7 +91,7 @@ def parse(path: Path, source: str) -> ElementTree.Element:
         InputError: The file cannot be read, is not well-formed, lies too deep in itself, or is no scene.
     """
     try:
-        root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
+        root = ElementTree.fromstring(content(path), ElementTree.XMLParser(target=_Builder()))
     except InputError as error:
         raise InputError(f"scene file {source}: {error}") from None
     except OSError as error:

@@ -424,7 +424,8 @@ def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
     """Refuse ``walls.thickness = ...``, which TOML reads as a table "walls" with a key "thickness"."""
     for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
         fields = entry if isinstance(entry, Mapping) else {}
-        if field := next((key for key, value in fields.items() if isinstance(value, Mapping)), None):
+        tables = (key for key, value in fields.items() if isinstance(value, Mapping))
+        if field := next((key for key in tables if key not in ParameterSection.model_fields), None):
             raise InputError(
                 f'{path}: parameters.{name}.{field}: quote the name, "{name}.{field}" = {{ ... }}'
             )

@@ -17,6 +17,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes.source import content
 from calibray.study.model import Study
 from calibray.tracing import cache
 from calibray.tracing.enclosed import Enclosed
@@ -118,7 +119,8 @@ class Setup:
         """SHA-256 of every file that the scene and the antennas are read from, by path as the study finds it."""
         antennas = [Path(each.gain_file) for each in self.study.antenna_pair if each.gain_file is not None]
         files = dict.fromkeys([self.scene.path, *cache.meshes(self.scene), *antennas])
-        return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+        read = {file: content(file) if file == self.scene.path else file.read_bytes() for file in files}
+        return {str(file): hashlib.sha256(each).hexdigest() for file, each in read.items()}
 
     def tracer_at(self, frequency: float) -> Tracer:
         """The ray tracer with the scene at another carrier.
