@@ -18,7 +18,8 @@ from test_cli_run import write_study
 
 # Its standard input becomes the terminal that Ctrl-C is typed in.
 TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
-COMMAND = [sys.executable, "-c", TERMINAL + "from calibray.cli import main; main()"]
+MAIN = "from calibray.cli import main; main()"
+COMMAND, IN_TERMINAL = ([sys.executable, "-c", code] for code in (MAIN, TERMINAL + MAIN))
 PATIENCE = 120.0  # [s]
 
 
@@ -35,7 +36,7 @@ def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
     own, theirs = pty.openpty()
     environment = {**os.environ, "CALIBRAY_CACHE": "", "TERM": "xterm"}
     process = subprocess.Popen(
-        [*COMMAND, *map(str, words)], stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
+        [*IN_TERMINAL, *map(str, words)], stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
         start_new_session=True,
     )  # fmt: skip
     os.close(theirs)
