@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, Preparation
-from calibray.scenes.making import read_frame
 from calibray.scenes.outlines import led_outside, outlines
 from calibray.scenes.source import find_scene
 
@@ -69,6 +68,9 @@ def scene_frame(study: Study) -> Frame:
         return Frame(crs, float(easting), float(northing))
     if origin is not None:
         return Frame.local(*origin)
+    # What makes scenes takes SciPy along; only studies that need a frame load it.
+    from calibray.scenes.making import read_frame
+
     frame = read_frame(find_scene(study.scene_source)[0])
     if frame is None:
         raise InputError(
