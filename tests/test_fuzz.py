@@ -23,7 +23,7 @@ from calibray.result import Result
 from calibray.scenes import export_scene, read_scene
 from calibray.scenes.ply import check_ply
 from calibray.study import Study
-from calibray.study.model import expand
+from calibray.study.reading import expand
 from calibray.tracing import gain_table
 from fuzzing import geometry, inputs, stored, world
 from fuzzing.outcome import ALLOWED, Watch, judge

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -28,6 +26,7 @@ from calibray.spelling import shortened
 from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
 from calibray.study.preparing import AS_THEY_ARE, preparation
+from calibray.study.reading import expand, read_content, refuse_unquoted_names
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -154,17 +153,7 @@ class Study(Section):
                 names a scene or links that do not exist; one line for each fault.
         """
         path = Path(path)
-        if not exists(path):
-            raise InputError(f"{shortened(str(path), 300)}: no such study file")
-        try:
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
-        except (ValueError, RecursionError) as error:
-            # A number of thousands of digits, or lists thousands deep, beside what TOML itself refuses.
-            raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
+        content = read_content(path)
         study = cls.from_content(content, path)
         study._check_files()
         return study
@@ -183,7 +172,7 @@ class Study(Section):
         Raises:
             InputError: A key is unknown or a value impossible; one line for each fault.
         """
-        _refuse_unquoted_names(content.get("parameters"), path)
+        refuse_unquoted_names(content.get("parameters"), path)
         own, others = part_engine(content.get("engine", {}), str(path))
         content = {**content, "engine": own}
         try:
@@ -418,46 +407,3 @@ class Study(Section):
                     f"{self._path}: {key} = {shortened(written)!r}: no such file, "
                     f"{shortened(str(Path(file).absolute()), 300)}"
                 )
-
-
-def _refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
-    """Refuse ``walls.thickness = ...``, which TOML reads as a table "walls" with a key "thickness"."""
-    for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
-        fields = entry if isinstance(entry, Mapping) else {}
-        tables = (key for key, value in fields.items() if isinstance(value, Mapping))
-        if field := next((key for key in tables if key not in ParameterSection.model_fields), None):
-            raise InputError(
-                f'{path}: parameters.{name}.{field}: quote the name, "{name}.{field}" = {{ ... }}'
-            )
-
-
-def expand(text: str, environment: Mapping[str, str]) -> str:
-    """Put in environment variables: ``${NAME}``, or ``${NAME:-default}`` where one may be unset or empty.
-
-    Args:
-        text: The text.
-        environment: The variables.
-
-    Returns:
-        The text with every variable replaced.
-
-    Raises:
-        InputError: A variable without default is not set, or a ``${`` is malformed.
-
-    Example:
-        >>> expand("${HERE:-there}/links.csv", {})
-        'there/links.csv'
-    """
-
-    def value(match: re.Match[str]) -> str:
-        name, default = match.groups()
-        if found := environment.get(name):
-            return found
-        if default is None:
-            raise InputError(f"environment variable {name} is not set; set it, or write ${{{name}:-DEFAULT}}")
-        return default
-
-    expanded, count = re.subn(r"\$\{([A-Za-z_]\w*)(?::-([^{}]*))?\}", value, text)
-    if text.count("${") != count:
-        raise InputError("malformed ${...}; write ${NAME} or ${NAME:-DEFAULT}")
-    return expanded
