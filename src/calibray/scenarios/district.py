@@ -40,6 +40,31 @@ LAMP_HALF_WIDTH: Final = 0.125  # [m]
 
 
 @dataclass(frozen=True)
+class Layout:
+    """Where the streets of a district run, and how high it is built; the paper's area unless told otherwise.
+
+    Attributes:
+        avenues: Centre lines of the streets that run north, x, ascending [m].
+        streets: Centre lines of the streets that run east, y, ascending [m].
+        extent: East-west and north-south [m].
+        parks: Blocks without buildings, column and row.
+        heights: Lowest and highest building [m].
+        beach: Whether the southernmost row of blocks is left free.
+    """
+
+    avenues: tuple[float, ...] = AVENUES
+    streets: tuple[float, ...] = STREETS
+    extent: tuple[float, float] = EXTENT
+    parks: frozenset[tuple[int, int]] = PARKS
+    heights: tuple[float, float] = HEIGHTS
+    beach: bool = True
+
+
+GOLDEN_BEACH: Final = Layout()
+"""The layout of the demo."""
+
+
+@dataclass(frozen=True)
 class Building:
     """One building, a prism with window bays from the ground up to a concrete band.
 
@@ -56,28 +81,32 @@ class Building:
     window_share: float
 
 
-def district(seed: int = SEED) -> tuple[Building, ...]:
+def district(seed: int = SEED, layout: Layout = GOLDEN_BEACH) -> tuple[Building, ...]:
     """Draw the buildings of the district.
 
     Args:
         seed: Seed of the generator; other seeds give other buildings along the same streets.
+        layout: The streets.
 
     Returns:
         The buildings, west to east and south to north.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    columns = _between(AVENUES, EXTENT[0])
-    rows = _between(STREETS, EXTENT[1])[1:]  # the southernmost row is the beach
+    columns = _between(layout.avenues, layout.extent[0])
+    rows = _between(layout.streets, layout.extent[1])[layout.beach :]  # the southernmost row is the beach
     footprints = [
         footprint
         for column, (west, east) in enumerate(columns)
         for row, (south, north) in enumerate(rows)
-        if (column, row) not in PARKS
+        if (column, row) not in layout.parks
         for footprint in _block((west, south, east, north), rng)
     ]
     return tuple(
         Building(
-            f"b{index:03d}", footprint, float(_snapped(rng.uniform(*HEIGHTS))), float(rng.uniform(0.4, 0.6))
+            f"b{index:03d}",
+            footprint,
+            float(_snapped(rng.uniform(*layout.heights))),
+            float(rng.uniform(0.4, 0.6)),
         )
         for index, footprint in enumerate(footprints)
     )
@@ -87,6 +116,7 @@ def scene_objects(
     buildings: Iterable[Building],
     concrete: Callable[[Building], str] = lambda building: "concrete",
     glass: Callable[[Building], str] = lambda building: "glass",
+    layout: Layout = GOLDEN_BEACH,
 ) -> list[MeshObject]:
     """The district as objects of a scene, one for each material.
 
@@ -94,6 +124,7 @@ def scene_objects(
         buildings: The buildings.
         concrete: Name of a building's concrete.
         glass: Name of a building's glass.
+        layout: The streets.
 
     Returns:
         Structures, windows, ground (of soil) and streets (of asphalt); structures and windows of several
@@ -105,7 +136,7 @@ def scene_objects(
         structure, bays = building_meshes(building)
         structures.setdefault(concrete(building), []).append(structure)
         windows.setdefault(glass(building), []).append(bays)
-    soil, asphalt = _ground()
+    soil, asphalt = _ground(layout)
     return [
         *_by_material("structures", structures),
         *_by_material("windows", windows),
@@ -261,10 +292,10 @@ def _quads(here: NDArray[np.int64], there: NDArray[np.int64], rise: int) -> NDAr
     return np.stack([first, second], axis=1)
 
 
-def _ground() -> tuple[Mesh, Mesh]:
+def _ground(layout: Layout) -> tuple[Mesh, Mesh]:
     """The plane z = 0 over the whole extent: soil, and the asphalt of the roadways."""
-    x = _edges(AVENUES, ROADWAY_HALF_WIDTH, EXTENT[0])
-    y = _edges(STREETS, ROADWAY_HALF_WIDTH, EXTENT[1])
+    x = _edges(layout.avenues, ROADWAY_HALF_WIDTH, layout.extent[0])
+    y = _edges(layout.streets, ROADWAY_HALF_WIDTH, layout.extent[1])
     vertices = np.array([[east, north, 0.0] for north in y for east in x])
     column, row = (index.ravel() for index in np.meshgrid(np.arange(len(x) - 1), np.arange(len(y) - 1)))
     corner = row * len(x) + column
