@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calibray.errors import InputError
+from calibray.files import exists
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Runs:
     def __init__(self, path: Path, problem: str) -> None:
         self._path, self._problem = path, problem
         self._runs: dict[tuple[str, int, int], MethodRun] = {}
-        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        text = path.read_text(encoding="utf-8") if exists(path) else ""
         self._torn = bool(text) and not text.endswith("\n")
         for line in text.splitlines():
             try:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
+from calibray.files import exists
 
 LINKS: Final = {
     "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",
@@ -40,8 +41,10 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         InputError: The file does not exist, or lacks a column, or holds something else in it.
     """
     file = folder / name
-    if not file.exists():
+    if not exists(file):
         file = folder / FIRST_NAMES[name]
+    if not exists(file):
+        raise InputError(f"{folder / name}: is no file; name the --out folder of `calibray run`")
     try:
         # A group may be called 7, or NA.
         table = pd.read_csv(file, converters={"group": str})

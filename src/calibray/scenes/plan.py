@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.files import exists
 from calibray.spelling import did_you_mean
 
 OPENINGS: Final = frozenset({"door", "window"})
@@ -66,10 +67,12 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
     Raises:
         InputError: The file or a column is missing or malformed, a segment has no length or ends below its bottom.
     """
+    if not exists(path):
+        raise InputError(f"floor plan {path}: is no file; check the path")
     try:
         frame = pd.read_csv(path, skipinitialspace=True)
-    except FileNotFoundError:
-        raise InputError(f"floor plan {path}: does not exist; check the path") from None
+    except OSError as error:
+        raise InputError(f"floor plan {path}: cannot be read ({error.strerror}); check the file") from None
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise InputError(f"floor plan {path}: is not a table ({error}); give a CSV file") from None
     for column in (*_ENDS, "type"):

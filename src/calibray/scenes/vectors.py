@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
 from calibray.extras import library
+from calibray.files import exists
 from calibray.scenes.footprints import Footprints, HeightRule, HeightSource, cleaned, in_frame, parse_length
 from calibray.spelling import did_you_mean, shortened
 
@@ -76,7 +77,8 @@ def _source(text: str) -> HeightSource:
 def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArray[Any]], str]:
     """Polygons [n], the columns of their table, and the reference system."""
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
-    if not path.exists():
+    # A geodatabase is a folder; a device is neither.
+    if not (path.is_dir() or exists(path)):
         raise InputError(f"footprints {path}: does not exist; check the path")
     try:
         meta, _, geometry, fields = pyogrio.raw.read(path, layer=layer)
