@@ -16,6 +16,8 @@ SIGNATURES = {
     "path_loss": "paths, materials, combining, bandwidth",
     "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite",
     "report": "result, file, figures, overwrite, progress",
+    "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, anyway",
+    "save_map": "coverage, folder, inputs, overwrite",
     "validate": "study, blocks, by, progress, tracer",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",

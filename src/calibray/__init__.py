@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
     from calibray.fields.channel import power_delay_profile as power_delay_profile
+    from calibray.inference.coverage import coverage_map as coverage_map
     from calibray.materials import Material as Material
     from calibray.materials import itu_material as itu_material
     from calibray.measurements import Measurements as Measurements
     from calibray.measurements import read_measurements as read_measurements
     from calibray.paths import Paths as Paths
+    from calibray.reporting.coverage import save_map as save_map
     from calibray.reporting.page import report as report
     from calibray.result import Result as Result
     from calibray.study import Setup as Setup
@@ -44,6 +46,8 @@ _HOMES = {
     "validate": "calibray.calibration.validate",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
+    "coverage_map": "calibray.inference.coverage",
+    "save_map": "calibray.reporting.coverage",
     "report": "calibray.reporting.page",
 }
 

@@ -19,6 +19,7 @@ from calibray.cli.doctor import doctor
 from calibray.cli.export import export
 from calibray.cli.init import init
 from calibray.cli.ledger import ledger
+from calibray.cli.map import map
 from calibray.cli.predict import predict
 from calibray.cli.report import report
 from calibray.cli.run import run
@@ -127,6 +128,7 @@ COMMANDS = (  # one after the other, as `--help` lists them
     validate,
     trace,
     predict,
+    map,
     export,
     ledger,
     cache,

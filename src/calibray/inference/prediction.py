@@ -47,13 +47,33 @@ def predict(
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
             scene or an antenna changed since the calibration.
     """
-    links = _links(result, links)
-    shift = _shift(result, links, {}).value[0]
+    return _path_loss(result, opened(result, as_links(result, links), anyway=anyway), progress)
+
+
+def opened(result: Result, links: Measurements, *, anyway: bool = False) -> Setup:
+    """The study of a calibration, opened for links that were never measured.
+
+    Args:
+        result: The calibration.
+        links: The links.
+        anyway: Open it although a file of the scene or an antenna changed since the calibration.
+
+    Returns:
+        The opened study.
+
+    Raises:
+        InputError: The scene or the parameters cannot be used, or such a file changed.
+    """
     setup = Setup.open(result.study, links=links)
     if not anyway:
         _check_files(result, setup)
+    return setup
+
+
+def _path_loss(result: Result, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
+    links, study = setup.links, result.study
+    shift = _shift(result, links, {}).value[0]
     paths = setup.trace(result.materials, progress)
-    study = result.study
     if links.frequency is None:
         return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + shift
     values = np.array([[result.parameters[name] for name in setup.parameters.names]])
@@ -89,13 +109,32 @@ def predict_interval(
         InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had too
             few links to tell the size of errors.
     """
+    return interval(result, opened(result, as_links(result, links), anyway=anyway), level, progress)
+
+
+def interval(
+    result: Result, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
+) -> pd.DataFrame:
+    """What `predict_interval` gives, of links that are opened already.
+
+    Args:
+        result: The calibration.
+        setup: Its study, opened for the links.
+        level: Probability that a measurement lies within; None for path loss alone.
+        progress: Called with the stage "tracing" after every launch.
+
+    Returns:
+        One row per link: path_loss_db and, with a level, lower_db, upper_db and basis.
+
+    Raises:
+        InputError: The level is not between 0 and 1, or the calibration had too few links to tell the size of errors.
+    """
+    links = setup.links
+    if level is None:
+        return pd.DataFrame({"path_loss_db": _path_loss(result, setup, progress)})
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must lie between 0 and 1, as 0.9")
-    links = _links(result, links)
     size, basis = _residual(result)
-    setup = Setup.open(result.study, links=links)
-    if not anyway:
-        _check_files(result, setup)
     shift = _shift(result, links, result.draws, strangers=True)
     names = setup.parameters.names
     values = np.array([[result.parameters[name] for name in names]])
@@ -119,7 +158,19 @@ def predict_interval(
     )
 
 
-def _links(result: Result, links: Measurements | pd.DataFrame) -> Measurements:
+def as_links(result: Result, links: Measurements | pd.DataFrame) -> Measurements:
+    """Links to predict at, of a table.
+
+    Args:
+        result: The calibration.
+        links: The links, or a table as `predict` takes it.
+
+    Returns:
+        The links, grouped as the study's offset is, with carriers if it has a column of them.
+
+    Raises:
+        InputError: A column is missing, or a position is not finite.
+    """
     if isinstance(links, Measurements):
         return links
     study = result.study

@@ -127,24 +127,42 @@ def _nice(value: float, up: bool = False) -> float:
     return float(steps[steps >= value * 0.999].min() if up else steps[steps <= value * 1.001].max())
 
 
-def _buildings(triangles: Triangles, shown: Plan) -> str:
-    """Outlines of all that lies, the ground apart, within the map."""
+def footprints(
+    triangles: Triangles, west: float, south: float, east: float, north: float
+) -> list[NDArray[np.float64]]:
+    """Outlines of all that lies within an area, the ground apart.
+
+    Args:
+        triangles: The scene.
+        west: Least x of the area [m].
+        south: Least y [m].
+        east: Largest x [m].
+        north: Largest y [m].
+
+    Returns:
+        Closed lines, the first corner not repeated, each [n, 2], [m].
+    """
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)
     corners = triangles.corners
-    at = shown.place(corners.reshape(-1, 3)).reshape(-1, 3, 2)
-    low, high = at.min(axis=1), at.max(axis=1)
-    inside = (high > 0).all(axis=1) & (low < [WIDTH, shown.height]).all(axis=1)
+    low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
+    inside = (high > [west, south]).all(axis=1) & (low < [east, north]).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
     _, index = np.unique(face.reshape(-1, 3).round(3), axis=0, return_inverse=True)
-    point = dict(zip(index.reshape(-1).tolist(), face.reshape(-1, 3).tolist(), strict=True))
-    loops = _loops(index.reshape(-1, 3).tolist())
-    outlines = {}
+    point = dict(zip(index.reshape(-1).tolist(), face.reshape(-1, 3)[:, :2].tolist(), strict=True))
+    return [np.array([point[each] for each in loop]) for loop in _loops(index.reshape(-1, 3).tolist())]
+
+
+def _buildings(triangles: Triangles, shown: Plan) -> str:
+    """Outlines of all that lies, the ground apart, within the map; those that look alike once."""
+    south = shown.north - shown.height / shown.scale
+    loops = footprints(triangles, shown.west, south, shown.west + WIDTH / shown.scale, shown.north)
+    outlines: dict[frozenset[tuple[float, ...]], list[list[float]]] = {}
     for loop in loops:
-        line = shown.place(np.array([point[each] for each in loop])).round(1)
+        line = shown.place(loop).round(1)
         outlines.setdefault(frozenset(map(tuple, line.tolist())), line.tolist())
     return "".join(f"M{'L'.join(f'{x:g},{y:g}' for x, y in line)}Z" for line in outlines.values())
 

@@ -60,6 +60,27 @@ def scene_frame(study: Study) -> Frame:
     Raises:
         InputError: Neither says it, or the projection is not known.
     """
+    frame = known_frame(study)
+    if frame is None:
+        raise InputError(
+            f"{study.path}: links.position = 'geographic': nothing tells where the scene lies; give "
+            "scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
+        )
+    return frame
+
+
+def known_frame(study: Study) -> Frame | None:
+    """Where a study's scene lies on the globe, if anything tells.
+
+    Args:
+        study: The study.
+
+    Returns:
+        The frame; None if neither the study nor the scene's file says it.
+
+    Raises:
+        InputError: The projection is not known.
+    """
     origin, crs = study.scene.origin, study.scene.crs
     if crs is not None:
         if origin is None:
@@ -71,10 +92,4 @@ def scene_frame(study: Study) -> Frame:
     # What makes scenes takes SciPy along; only studies that need a frame load it.
     from calibray.scenes.making import read_frame
 
-    frame = read_frame(find_scene(study.scene_source)[0])
-    if frame is None:
-        raise InputError(
-            f"{study.path}: links.position = 'geographic': nothing tells where the scene lies; give "
-            "scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
-        )
-    return frame
+    return read_frame(find_scene(study.scene_source)[0])

@@ -90,11 +90,18 @@ class Setup:
         Raises:
             InputError: A value is impossible.
         """
-        changed = replace(self, study=self.study.replace(method, seed, engine))
-        # A tracer that is loaded serves on: none of the three has a say in it.
-        if "tracer" in self.__dict__:
-            changed.__dict__["tracer"] = self.tracer
-        return changed
+        return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
+
+    def at(self, links: Measurements) -> Setup:
+        """The same for other links, none of them held out; nothing is read or loaded again.
+
+        Args:
+            links: The links.
+
+        Returns:
+            The changed setup.
+        """
+        return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
 
     @cached_property
     def tracer(self) -> Tracer:
@@ -179,6 +186,12 @@ class Setup:
             paths = self.tracer.trace(links, progress, scene.materials)
             cache.keep(digest, paths)
         return paths
+
+    def _with_tracer(self, changed: Setup) -> Setup:
+        """A tracer that is loaded serves on: neither links nor methods have a say in it."""
+        if "tracer" in self.__dict__:
+            changed.__dict__["tracer"] = self.tracer
+        return changed
 
     def _scene_at(self, frequency: float) -> Scene:
         study, parameters = self.study, self.parameters

@@ -1,0 +1,118 @@
+"""`calibray map`: path loss over an area, with the calibrated scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import Overwrite, log
+from calibray.errors import InputError
+
+
+def map(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+    ],
+    tx: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z", help="Transmitter position [m]; that of the calibration, if it had only one."
+        ),
+    ] = None,
+    height: Annotated[
+        float, typer.Option(metavar="M", help="Height of the receivers over the ground [m].")
+    ] = 1.5,
+    cell: Annotated[float, typer.Option(metavar="M", help="Width of the cells [m].")] = 5.0,
+    bounds: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            metavar="W S E N", help="West, south, east and north of the area [m]; the whole scene if absent."
+        ),
+    ] = None,
+    level: Annotated[
+        float,
+        typer.Option(
+            metavar="P", help="Probability that a measurement lies within the interval; 0 for no interval."
+        ),
+    ] = 0.9,
+    power: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DBM", help="Transmitted power [dBm], for received power in place of path loss."
+        ),
+    ] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Rays in place of the study's: the time goes with them, and with too few paths are missed.",
+        ),
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="What a column of the study's links, of groups or carriers, holds for this transmitter; repeatable.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into instead of DIR."),
+    ] = None,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway", help="Predict although a file of the result, the scene or an antenna changed since."
+        ),
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""
+    import numpy as np
+
+    from calibray.cli.progress import progress_bars
+    from calibray.files import check_outputs
+    from calibray.inference.coverage import coverage_map
+    from calibray.reporting.coverage import FILES, save_map
+    from calibray.result import Result
+
+    result, target = Result.load(folder, anyway=anyway), out or folder
+    inputs = result.study.files()
+    # Before anything is traced.
+    check_outputs(target, FILES, inputs, overwrite)
+    with progress_bars(log) as progress:
+        coverage = coverage_map(
+            result,
+            tx,
+            height=height,
+            cell=cell,
+            bounds=bounds,
+            level=level or None,
+            power_dbm=power,
+            samples=samples,
+            columns=_columns(column or []),
+            progress=progress,
+            anyway=anyway,
+        )
+    names = save_map(coverage, target, inputs, overwrite)
+    reached = np.isfinite(coverage.path_loss_db)
+    typer.echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
+    if len(names) < len(FILES):
+        typer.echo("No GeoTIFF without rasterio; install it with: pip install 'calibray[scenes]'", err=True)
+    typer.echo(f"Written to {target}: {', '.join(names)}", err=True)
+
+
+def _columns(given: list[str]) -> dict[str, object]:
+    """Columns by name; numbers as numbers."""
+    columns: dict[str, object] = {}
+    for entry in given:
+        name, equals, value = entry.partition("=")
+        if not equals or not name:
+            raise InputError(f"--column {entry}: must be NAME=VALUE, as sector=north")
+        try:
+            columns[name] = float(value)
+        except ValueError:
+            columns[name] = value
+    return columns
