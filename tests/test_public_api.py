@@ -19,6 +19,7 @@ SIGNATURES = {
     "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, anyway",
     "save_map": "coverage, folder, inputs, overwrite",
     "validate": "study, blocks, by, progress, tracer",
+    "suggest": "result, candidates, count, progress, anyway",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from calibray import engines as engines
     from calibray import optimizers as optimizers
     from calibray.calibration.calibrate import calibrate as calibrate
+    from calibray.calibration.suggest import suggest as suggest
     from calibray.fields import path_gains as path_gains
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
@@ -44,6 +45,7 @@ _HOMES = {
     "Result": "calibray.result",
     "calibrate": "calibray.calibration.calibrate",
     "validate": "calibray.calibration.validate",
+    "suggest": "calibray.calibration.suggest",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
     "coverage_map": "calibray.inference.coverage",

@@ -25,6 +25,7 @@ from calibray.cli.report import report
 from calibray.cli.run import run
 from calibray.cli.scene import scene
 from calibray.cli.schema import schema
+from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
@@ -129,6 +130,7 @@ COMMANDS = (  # one after the other, as `--help` lists them
     trace,
     predict,
     map,
+    suggest,
     export,
     ledger,
     cache,

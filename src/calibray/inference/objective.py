@@ -69,6 +69,22 @@ class Objective:
             found[mine] = fewer.coefficients(gap[mine][:, pattern])
         return found
 
+    def following(
+        self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """How the best coefficients of the nuisance follow the parameters.
+
+        Args:
+            path_loss: Modelled path loss [n, L], [dB].
+            derivative: Its derivatives [n, L, d], [dB] per unit.
+
+        Returns:
+            Derivatives of the coefficients [n, q, d].
+        """
+        if not self.nuisance.terms:
+            return np.zeros((len(path_loss), 0, derivative.shape[2]))
+        return -self._elimination.taken_up(self._sloped(path_loss, derivative), self.coefficients(path_loss))
+
     @property
     def determined(self) -> NDArray[np.bool_]:
         """Which columns the links that count determine [q].
@@ -121,10 +137,7 @@ class Objective:
         Returns:
             Derivatives of the residuals [n, counted links + priors, d].
         """
-        flat = (path_loss >= (np.inf if self.ceiling_db is None else self.ceiling_db))[:, self._counted]
-        slope = np.array(derivative[:, self._counted])
-        slope[flat] = 0.0
-        rows = []
+        slope, rows = self._sloped(path_loss, derivative), []
         if self.nuisance.terms:
             taken = self._elimination.taken_up(slope, self.coefficients(path_loss))
             self._elimination.remove(slope, taken)
@@ -170,6 +183,13 @@ class Objective:
     ) -> NDArray[np.float64]:
         model = self.capped(path_loss)
         return model + self.nuisance.contribution(coefficients) if self.nuisance.terms else model
+
+    def _sloped(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives at the links that count; none where the path loss stands at the ceiling."""
+        flat = (path_loss >= (np.inf if self.ceiling_db is None else self.ceiling_db))[:, self._counted]
+        slope = np.array(derivative[:, self._counted])
+        slope[flat] = 0.0
+        return slope
 
     @cached_property
     def _counted(self) -> NDArray[np.int64] | slice:

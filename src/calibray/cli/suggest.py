@@ -1,0 +1,59 @@
+"""`calibray suggest`: where to measure next."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibray.cli.console import Overwrite, log
+
+
+def suggest(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder that `calibray run` wrote.", show_default=False)
+    ],
+    candidates_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CANDIDATES",
+            help="CSV or Parquet file of where one could measure, with the columns that `calibray predict` takes.",
+            show_default=False,
+        ),
+    ],
+    count: Annotated[int, typer.Option(metavar="N", min=1, help="How many points to suggest.")] = 5,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="CSV or Parquet file to write as well.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway", help="Go on although a file of the result, the scene or an antenna changed since."
+        ),
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
+    from calibray.calibration.suggest import shown
+    from calibray.calibration.suggest import suggest as find
+    from calibray.cli.progress import progress_bars
+    from calibray.files import check_table, write_table
+    from calibray.measurements import read_links
+    from calibray.result import Result
+    from calibray.tables.text import render
+
+    result = Result.load(folder, anyway=anyway)
+    study = result.study
+    links = read_links(
+        candidates_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
+    )
+    if out is not None:
+        check_table(out, [candidates_file, *study.files()], overwrite)
+    with progress_bars(log) as progress:
+        found = find(result, links, count, progress, anyway=anyway)
+    typer.echo(json.dumps(found.to_dict("records"), indent=2) if as_json else render(*shown(found)))
+    if out is not None:
+        write_table(out, found)
