@@ -20,6 +20,7 @@ _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 # At the start of a line of code; settings such as PYTHON=python3.12 may stand between.
+_OPTIONS = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?calibray ([a-z][\w-]*)((?: (?!#).*)?)$", re.MULTILINE)
 _COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([a-z][\w-]*)", re.MULTILINE)
 
 
@@ -72,11 +73,49 @@ def missing_commands(text: str, known: dict[str, set[str]]) -> Iterator[str]:
                 yield f"{program} {command}"
 
 
+def missing_options(text: str, known: dict[str, dict[str, set[str]]]) -> Iterator[str]:
+    """Find options that commands do not have, in blocks of code.
+
+    Args:
+        text: The Markdown text.
+        known: Options by command and, where it has such, by command of its own; "" for the command itself.
+
+    Yields:
+        Each command with such an option.
+    """
+    for block in _FENCE.findall(text):
+        for command, rest in _OPTIONS.findall(re.sub(r"\\\n\s*", "", block)):
+            words = rest.partition(" #")[0].split()
+            options = known.get(command, {})
+            own = options.get(words[0] if words else "", options.get("", set()))
+            for option in words:
+                name = option.partition("=")[0]
+                if re.fullmatch(r"--[a-z][\w-]*|-[a-z]", name) and name not in own:
+                    yield f"calibray {command} {name}"
+
+
+def options_of(command: object) -> set[str]:
+    """The options of a command, as they are written.
+
+    Args:
+        command: The command.
+
+    Returns:
+        All names of each.
+    """
+    return {name for each in command.params for name in [*each.opts, *each.secondary_opts]} | {"--help", "-h"}
+
+
 if __name__ == "__main__":
     targets = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    commands = {
-        "make": set(targets[1].split()) if targets else set(),
-        "calibray": set(typer.main.get_command(app).commands),
+    group = typer.main.get_command(app).commands
+    commands = {"make": set(targets[1].split()) if targets else set(), "calibray": set(group)}
+    options = {
+        name: {
+            "": options_of(each),
+            **{k: options_of(own) for k, own in getattr(each, "commands", {}).items()},
+        }
+        for name, each in group.items()
     }
     folders = [folder for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
     documents = sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in folder.rglob("*.md"))])
@@ -86,6 +125,7 @@ if __name__ == "__main__":
         for fault in [
             *missing_links(document, document.read_text()),
             *missing_commands(document.read_text(), commands),
+            *missing_options(document.read_text(), options),
         ]
     ]
     sys.stdout.write("\n".join([*faults, f"{len(documents)} documents, {len(faults)} faults"]) + "\n")

@@ -1,8 +1,8 @@
 """Coverage: path loss over an area with the calibrated scene, and how sure it is.
 
 Every cell is a link to its middle, predicted as any other link is. Sionna's radio map solver would be another way: it
-counts the rays that cross a cell and so averages over the cell, which differs from a sum of paths to its middle by
-decibels (`python benchmarks/coverage_map.py --solver`).
+counts the rays that cross a cell and so averages over the cell. In the demo district 70 % of the cells then differ from
+a sum of paths by more than 0.05 dB, 10 % by more than 0.7 dB (`python benchmarks/coverage_map.py --solver`).
 """
 
 from __future__ import annotations

@@ -31,12 +31,12 @@ class Measurements:
     """Links, each with one measured path loss; arrays are copies and read-only.
 
     Attributes:
-        tx: Transmitter positions [links, 3] [m].
-        rx: Receiver positions [links, 3] [m].
-        path_loss_db: Measured path losses [links] [dB]; all NaN for links that were not measured.
-        weight: Relative weights [links] [1], greater than 0; 1 unless given.
+        tx: Transmitter positions [links, 3], [m].
+        rx: Receiver positions [links, 3], [m].
+        path_loss_db: Measured path losses [links], [dB]; all NaN for links that were not measured.
+        weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Labels [links] of the group each link belongs to, or None.
-        frequency: Carrier of each link [links] [Hz], or None where all have the study's.
+        frequency: Carrier of each link [links], [Hz], or None where all have the study's.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
         prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
@@ -116,7 +116,7 @@ class Measurements:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """The straight distance [links] [m] from transmitter to receiver."""
+        """The straight distance [links], [m] from transmitter to receiver."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
