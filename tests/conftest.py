@@ -6,11 +6,20 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from calibray import caching
 from calibray.cli import progress
 
 # Every run draws the same examples, and a busy machine fails no test.
 settings.register_profile("calibray", derandomize=True, deadline=None)
 settings.load_profile("calibray")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What XLA compiles is kept in pytest's cache: workers share it, and the next run takes it from there."""
+    if config.cache is not None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(caching.VARIABLE, str(config.cache.mkdir("calibray")))
+            import calibray.fields  # noqa: F401
 
 
 @pytest.fixture(scope="session")

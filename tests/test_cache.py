@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import synthetic
+from calibray import caching
 from calibray.tracing import cache
 
 
 @pytest.fixture
 def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A kept trace with the fingerprint "d"."""
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
     cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
     return tmp_path / "d.h5"
 
@@ -54,9 +55,9 @@ def test_a_folder_that_cannot_be_written_is_done_without(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "file"))
     cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
     assert cache.find("d") is None
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(caching.VARIABLE, "")
     cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
     assert cache.find("d") is None

@@ -319,7 +319,7 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     (tmp_path / f"{'a' * 64}.h5").write_bytes(b"0" * 2_000_000)
     (tmp_path / "mine.h5").write_bytes(b"0")
     listed = calibray("cache")
-    assert re.search(rf"folder +{tmp_path}\ntraces +1\nsize +2.0 MB", listed.stdout)
+    assert re.search(rf"folder +{tmp_path}\ntraces +1, 2.0 MB", listed.stdout)
     assert "Removed 1 traces" in calibray("cache", "--clear").stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
     monkeypatch.setenv("CALIBRAY_CACHE", "")

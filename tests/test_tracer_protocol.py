@@ -16,12 +16,13 @@ from scipy.constants import epsilon_0, speed_of_light
 
 import calibray as cb
 import planted
+from calibray import caching
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import links_from_frame
 from calibray.scenes import Scene, read_scene
 from calibray.study import Setup
-from calibray.tracing import cache, convergence
+from calibray.tracing import convergence
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.enclosed import Enclosed
 from calibray.tracing.factory import SIONNA
@@ -180,7 +181,7 @@ def test_lossless_antennas_radiate_the_power_they_take(pattern: str, mean: float
 def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one(
     plane: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "cache"))
     sections = {
         "scene": {"file": str(plane.path), "frequency": FREQUENCY},
         "parameters": {"ground.relative_permittivity": {"bounds": [1.5, 12.0]}},
@@ -207,7 +208,7 @@ def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one
 
 
 def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(caching.VARIABLE, "")
     study = planted.study(tmp_path, planted.campaign())
     told: list[tuple] = []
     paths = cb.trace(study, progress=lambda *step: told.append(step))

@@ -1,4 +1,4 @@
-"""`calibray cache`: the traces kept between runs."""
+"""`calibray cache`: traces and compiled programs kept between runs."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ import typer
 
 
 def cache(
-    clear: Annotated[bool, typer.Option("--clear", help="Remove all traces that are kept.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all that is kept.")] = False,
 ) -> None:
-    """Tell where traces are kept between runs and how large they are, or remove them.
+    """Tell where traces and compiled programs are kept between runs and how large they are, or remove them.
 
     The folder is named by CALIBRAY_CACHE; where that is empty, none are kept.
     """
+    from calibray import caching
+    from calibray.caching import compiled
     from calibray.tables import Column, Table, numbers
     from calibray.tables.text import render
     from calibray.tracing import cache as traces
 
-    folder, kept = traces.folder(), traces.kept()
-    size = sum(path.stat().st_size for path in kept)
+    folder, programs = caching.folder(), compiled()
+    kept = {"traces": traces.kept(), "compiled programs": [] if programs is None else programs.kept()}
+    size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:
-        for path in kept:
+        for path in (path for paths in kept.values() for path in paths):
             path.unlink(missing_ok=True)
-        typer.echo(f"Removed {len(kept)} traces, {size / 1e6:.1f} MB", err=True)
+        told = " and ".join(f"{len(paths)} {name}" for name, paths in kept.items())
+        typer.echo(f"Removed {told}, {sum(size.values()):.1f} MB", err=True)
         return
     rows = [
         ("folder", "none: CALIBRAY_CACHE is empty" if folder is None else str(folder)),
-        ("traces", str(len(kept))),
-        ("size", f"{size / 1e6:.1f} MB"),
+        *((name, f"{len(paths)}, {size[name]:.1f} MB") for name, paths in kept.items()),
     ]
     typer.echo(render(Table("", (Column(), numbers()), tuple(rows))))

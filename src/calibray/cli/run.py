@@ -75,6 +75,7 @@ def _kept(out: Path) -> str:
     """What an interrupted run left, and how to go on."""
     from contextlib import closing
 
+    from calibray import caching
     from calibray.engines import open_ledger
     from calibray.engines.ledger import LEDGER_FILE
     from calibray.tracing import cache
@@ -84,7 +85,7 @@ def _kept(out: Path) -> str:
         with closing(open_ledger(out)) as ledger:
             parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
     if cache.kept():
-        parts.append(f"finished traces in {cache.folder()}")
+        parts.append(f"finished traces in {caching.folder()}")
     kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished that could be kept."
     return f"{kept} Start the same command again to go on; what is kept is not computed twice."
 

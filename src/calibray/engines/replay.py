@@ -16,8 +16,8 @@ from calibray.fields.tabulation import Lookup
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
-BLOCK_INTERACTIONS: Final = 2_000_000
-"""Interactions times candidates evaluated at once, which bounds the memory."""
+BLOCK_INTERACTIONS: Final = 50_000
+"""Interactions times candidates evaluated at once, whose numbers fit into a core's cache."""
 
 TABULATED: Final = 50_000
 """Interactions beyond which coefficients come from tables."""
@@ -32,8 +32,8 @@ NODE_COST: Final = 4
 TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
-BLOCK_SIZES: Final = (1, 8, 30)
-"""Candidates a call, each size compiled once; the paper has thirty wolves."""
+LARGEST_BLOCK: Final = 16
+"""Candidates a call, at most; fewer are filled up, so that a program is compiled for one number of candidates."""
 
 
 class Replay:
@@ -125,15 +125,13 @@ class Replay:
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._fields, self._combining, self._offsets
         )
-        return loss, slope[:, :, self._rows, self._places], error
+        return loss, _chosen(slope, self._rows, self._places), error
 
     def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
         parts, start = [], 0
         while start < len(values):
-            left = len(values) - start
-            sizes = self._sizes()
-            size = next((size for size in sizes if size >= left), sizes[-1])
+            size = self._size()
             block = values[start : start + size]
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
             tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
@@ -163,11 +161,17 @@ class Replay:
             return fields.layout(self.paths, self._dtype, None, phases).program
         return program
 
-    def _sizes(self) -> list[int]:
-        """Candidates that a call may take: one where tables are filled for each, else what memory allows."""
-        tabulated = self._intervals is not None
-        room = 1 if tabulated else max(1, BLOCK_INTERACTIONS // max(self.paths.num_interactions, 1))
-        return [size for size in BLOCK_SIZES if size <= room]
+    def _size(self) -> int:
+        """Candidates that a call takes: one where tables are filled for each."""
+        if self._intervals is not None:
+            return 1
+        room = BLOCK_INTERACTIONS // max(self.paths.num_interactions, 1)
+        return min(LARGEST_BLOCK, 1 << max(room, 1).bit_length() - 1)
+
+
+@jax.jit
+def _chosen(slope: jax.Array, rows: NDArray[np.int64], places: NDArray[np.int64]) -> jax.Array:
+    return slope[:, :, rows, places]
 
 
 @jax.jit

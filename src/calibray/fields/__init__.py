@@ -8,6 +8,10 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from calibray.fields.compiled import keep_compiled  # noqa: E402
+
+keep_compiled()
+
 from calibray.fields.combining import (  # noqa: E402
     COMBINING,
     band_quadrature,

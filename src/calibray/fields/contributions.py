@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,8 @@ class Contributions:
     """All that the fields take from the materials.
 
     Attributes:
-        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [J]; or their tables.
+        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [J + 1], the last of which
+            changes nothing; or their tables.
         straight: S sqrt(f_s dOmega (1 - K_x)) of the diffuse interactions, which keep the polarization [D].
         crossed: S sqrt(f_s dOmega K_x), which turns it [D].
     """
@@ -55,7 +56,7 @@ def contributions(program: GroupedProgram, table: jax.Array) -> Contributions:
     """
     source = program.coefficients
     if isinstance(source, Formula):
-        coefficients = tabulation.evaluate(
+        found = tabulation.evaluate(
             source.cosine,
             table,
             source.material,
@@ -63,6 +64,7 @@ def contributions(program: GroupedProgram, table: jax.Array) -> Contributions:
             source.transmitted if source.any_transmitted else False,
             source.transmitted | source.raw,
         )
+        coefficients = _followed_by_one(*found)
     else:
         coefficients = tabulation.nodes(source, table, program.wavelength)
     material, solid_angle, scattered, cosine, specular, backward = program.diffuse
@@ -127,8 +129,15 @@ def _coefficients(program: GroupedProgram, found: Contributions) -> Iterator[tup
             yield tabulation.interpolate(found.coefficients, cell, fraction)
     elif not isinstance(found.coefficients, tabulation.Nodes):
         (te_real, te_imag), (tm_real, tm_imag) = found.coefficients
-        at = 0
-        for size in program.positions:
-            where = slice(at, at + size)
-            yield (te_real[where], te_imag[where]), (tm_real[where], tm_imag[where])
-            at += size
+        for place in cast(Formula, source).place:
+            te_at, tm_at = (
+                tuple(part.at[place].get(mode="promise_in_bounds") for part in parts)
+                for parts in ((te_real, te_imag), (tm_real, tm_imag))
+            )
+            yield cast(slab.Pair, te_at), cast(slab.Pair, tm_at)
+
+
+def _followed_by_one(te: slab.Pair, tm: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
+    one, zero = jnp.ones(1, te[0].dtype), jnp.zeros(1, te[0].dtype)
+    whole = [(jnp.append(real, one), jnp.append(imaginary, zero)) for real, imaginary in (te, tm)]
+    return whole[0], whole[1]

@@ -214,7 +214,7 @@ def _contract(
         rises = [[], []]
         for group, rate_of_group in zip(slope, pieces(program, rate), strict=True):
             for rise, outer, inner in zip(rises, group, rate_of_group, strict=True):
-                rise += [_dot(a, b) for a, b in zip(outer, inner, strict=True)]
+                rise += [_dot(a, b).ravel() for a, b in zip(outer, inner, strict=True)]
         sums = [
             total(segments, slab.keep(jnp.concatenate(rise), program.wavelength))
             for segments, rise in zip(program.by_material, rises, strict=True)

@@ -1,7 +1,11 @@
 """A path program laid out for evaluation.
 
-Paths are grouped by the kinds of their interactions, so that each group is a dense array without padding and each
-kind costs only where it occurs. What the materials act through lies flat, over all interactions of all groups.
+Paths are grouped by the kinds of their interactions, so that each group is a dense array and each kind costs only where
+it occurs. What the materials act through lies flat, over all interactions of all groups.
+
+A large program is laid out without padding. In a small one, whose evaluation takes less time than compiling it, paths
+that differ only in how many reflections or transmissions stand in a row are one group: the shorter rows are filled up
+with interactions that change nothing, and one compiled body serves the whole row.
 """
 
 from __future__ import annotations
@@ -21,10 +25,10 @@ from calibray.errors import InputError
 from calibray.fields import tabulation
 from calibray.fields.diffraction import affine_form
 from calibray.fields.segments import Segments, make_segments
+from calibray.fields.steps import Step, Steps
 from calibray.materials import Material, constants_matrix
 from calibray.paths import Kind, Paths
 
-_LETTER: Final = {Kind.SPECULAR: "c", Kind.REFRACTION: "c", Kind.DIFFUSE: "s", Kind.DIFFRACTION: "d"}
 _MODE: Final = {Kind.REFRACTION: tabulation.TRANSMITTED, Kind.DIFFUSE: tabulation.RAW}
 
 
@@ -35,21 +39,22 @@ _MODE: Final = {Kind.REFRACTION: tabulation.TRANSMITTED, Kind.DIFFUSE: tabulatio
 )
 @dataclass(frozen=True)
 class Group:
-    """Paths with the same sequence of interactions: n paths of depth k, T transmit and R receive ports.
+    """Paths with the same sequence of interactions: n paths, T transmit and R receive ports.
 
     Attributes:
         tx: Transmit field, real and imaginary part [2, T, 2, n]; the real part alone if all are real [1, T, 2, n].
         rx: Receive field times A lambda / 4 pi, likewise [2 or 1, R, 2, n].
-        rotation: (cos, sin) into the frame of each interaction [k, 2, n].
-        turn: Per position (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
-        wedge: Per position the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
-        signature: One letter an interaction: c coefficient (reflection or transmission), s scattering, d diffraction.
+        rotation: Per step (cos, sin) into the frame of the interaction [2, n], of each of a row [k, 2, n].
+        turn: Per step (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
+        wedge: Per step the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
+        signature: One letter a step: c coefficient (reflection or transmission), r several of them in a row,
+            s scattering, d diffraction.
         size: Number of paths n.
     """
 
     tx: jax.Array
     rx: jax.Array
-    rotation: jax.Array
+    rotation: tuple[jax.Array, ...]
     turn: tuple
     wedge: tuple
     signature: str
@@ -58,7 +63,7 @@ class Group:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["material", "cosine", "transmitted", "raw"],
+    data_fields=["material", "cosine", "transmitted", "raw", "place"],
     meta_fields=["any_transmitted"],
 )
 @dataclass(frozen=True)
@@ -70,6 +75,7 @@ class Formula:
         cosine: Cosine of the angle of incidence [J].
         transmitted: Whether it is a transmission [J].
         raw: Whether it is a reflection that keeps the scattered energy, as a diffuse one does [J].
+        place: The coefficients that stand at each step of each group, [n] or [k, n]; J where none does.
         any_transmitted: Whether any coefficient is a transmission.
     """
 
@@ -77,6 +83,7 @@ class Formula:
     cosine: jax.Array
     transmitted: jax.Array
     raw: jax.Array
+    place: tuple[jax.Array, ...]
     any_transmitted: bool
 
 
@@ -140,11 +147,6 @@ class GroupedProgram:
         return self.link, self.delay
 
     @property
-    def positions(self) -> list[int]:
-        """How many coefficients stand at each position of each group, in order."""
-        return _positions(self.groups)
-
-    @property
     def nbytes(self) -> int:
         """Bytes that the arrays take."""
         return sum(array.nbytes for array in jax.tree.leaves(self))
@@ -178,30 +180,29 @@ def layout(
     Returns:
         The grouped program, on JAX's default device.
     """
-    depth = np.diff(paths.first)
-    letter = np.select([paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], 1).astype(
-        np.int64
-    )
-    code = np.zeros(paths.num_paths, dtype=np.int64)
-    for step in range(int(depth.max(initial=0))):
-        deep = depth > step
-        code[deep] = code[deep] * 4 + letter[paths.first[:-1][deep] + step]
-    index = [np.flatnonzero(code == value) for value in np.unique(code)]
+    steps = Steps.padded(paths) if intervals is None else Steps.exact(paths)
+    index = steps.index
     order = np.concatenate(index) if index else np.zeros(0, dtype=np.int64)
     flat = _Flat(paths)
-    groups = tuple(_group(paths, some, int(depth[some[0]]), flat, dtype) for some in index)
-    rows, (interaction, cosine) = flat.scattered(), flat.coefficients()
-    segment = np.repeat(paths.link, depth).astype(np.int64) * len(paths.materials) + paths.material
-    count = paths.num_links * len(paths.materials)
+    groups = tuple(_group(paths, some, each, flat, dtype) for some, each in zip(index, steps.of, strict=True))
+    places, rows = flat.places, _joined(flat.scattered, np.int64)
+    depth, materials = np.diff(paths.first), len(paths.materials)
+    segment = np.repeat(paths.link, depth).astype(np.int64) * materials + paths.material
+    # What fills a row up changes nothing, and adds nothing to the segment that it is counted with.
+    of_coefficient = np.concatenate([segment, segment[flat.faces], [0]])
+    count = paths.num_links * materials
     program = GroupedProgram(
         groups=groups,
         by_link=make_segments(paths.link[order], paths.num_links),
         link=jnp.asarray(paths.link[order]) if phases else None,
         delay=jnp.asarray(paths.delay[order]) if phases else None,
         wavelength=jnp.asarray(speed_of_light / paths.frequency, dtype=dtype),
-        coefficients=_coefficients(paths, interaction, cosine, _positions(groups), dtype, intervals),
+        coefficients=_coefficients(paths, flat, dtype, intervals),
         diffuse=_diffuse(paths, rows, flat.table_row[rows], dtype),
-        by_material=(make_segments(segment[interaction], count), make_segments(segment[rows], count)),
+        by_material=(
+            make_segments(of_coefficient[_joined([place.ravel() for place in places], np.int64)], count),
+            make_segments(segment[rows], count),
+        ),
         patterns=tuple(material.scattering_pattern for material in paths.materials.values()),
     )
     return Layout(program, order)
@@ -237,31 +238,26 @@ def material_table(paths: Paths, materials: Mapping[str, Material] | None = None
 
 
 class _Flat:
-    """Which interactions the flat arrays hold, collected position by position; a diffraction twice, face after face."""
+    """Which coefficients and diffuse rows stand where, collected step by step.
+
+    Coefficients are numbered by interaction; those of the other faces of diffracting wedges follow.
+    """
 
     def __init__(self, paths: Paths) -> None:
-        self._paths, self._interactions, self._cosines, self._scattered = paths, [], [], []
+        self.faces = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
+        self.count = paths.num_interactions + len(self.faces)
+        self.places: list[NDArray[np.int64]] = []
+        self.scattered: list[NDArray[np.int64]] = []
+        self._interactions = paths.num_interactions
         self.table_row = np.maximum(_row_of(paths.kind, Kind.DIFFUSE), _row_of(paths.kind, Kind.DIFFRACTION))
 
-    def add(self, interaction: NDArray[np.int64], kind: int) -> None:
-        """Append one position's interactions."""
-        self._append(interaction, self._paths.cos_incidence[interaction])
-        if kind == Kind.DIFFRACTION:
-            self._append(interaction, self._paths.diffraction.cos_incidence_n[self.table_row[interaction]])
-        if kind == Kind.DIFFUSE:
-            self._scattered.append(interaction)
-
-    def _append(self, interaction: NDArray[np.int64], cosine: NDArray[np.float64]) -> None:
-        self._interactions.append(interaction)
-        self._cosines.append(cosine)
-
-    def coefficients(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Interaction and cosine of every coefficient [J]."""
-        return _joined(self._interactions, np.int64), _joined(self._cosines, float)
-
-    def scattered(self) -> NDArray[np.int64]:
-        """Interaction of every diffuse row [D]."""
-        return _joined(self._scattered, np.int64)
+    def add(self, interaction: NDArray[np.int64], letter: str) -> None:
+        """Append one step's interactions, -1 where there is none."""
+        self.places.append(np.where(interaction < 0, self.count, interaction))
+        if letter == "d":
+            self.places.append(self._interactions + self.table_row[interaction])
+        if letter == "s":
+            self.scattered.append(interaction)
 
 
 def _joined(parts: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
@@ -273,29 +269,21 @@ def _row_of(kind: NDArray[np.integer], which: Kind) -> NDArray[np.int64]:
     return np.where(chosen, np.cumsum(chosen) - 1, -1)
 
 
-def _positions(groups: tuple[Group, ...]) -> list[int]:
-    return [
-        group.size for group in groups for letter in group.signature for _ in range(2 if letter == "d" else 1)
-    ]
-
-
 def _coefficients(
-    paths: Paths,
-    interaction: NDArray[np.int64],
-    cosine: NDArray[np.float64],
-    sizes: list[int],
-    dtype: type,
-    intervals: int | None,
+    paths: Paths, flat: _Flat, dtype: type, intervals: int | None
 ) -> Formula | tabulation.Lookup:
-    kind, material = paths.kind[interaction], paths.material[interaction]
+    kind, material = (np.concatenate([column, column[flat.faces]]) for column in (paths.kind, paths.material))
+    cosine = np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
     if intervals is not None:
         mode = np.select([kind == one for one in _MODE], list(_MODE.values()), 0)
-        return tabulation.make_lookup(material, mode, cosine, sizes, intervals, dtype)
+        at, sizes = _joined(flat.places, np.int64), [len(place) for place in flat.places]
+        return tabulation.make_lookup(material[at], mode[at], cosine[at], sizes, intervals, dtype)
     return Formula(
         material=jnp.asarray(material),
         cosine=jnp.asarray(cosine.astype(dtype)),
         transmitted=jnp.asarray(kind == Kind.REFRACTION),
         raw=jnp.asarray(kind == Kind.DIFFUSE),
+        place=tuple(jnp.asarray(place.astype(np.int32)) for place in flat.places),
         any_transmitted=bool((kind == Kind.REFRACTION).any()),
     )
 
@@ -318,28 +306,30 @@ def _diffuse(
     return jnp.asarray(index), *(jnp.asarray(column.astype(dtype)) for column in columns)
 
 
-def _group(paths: Paths, index: NDArray[np.int64], depth: int, flat: _Flat, dtype: type) -> Group:
-    at = paths.first[index] + np.arange(depth)[:, None]  # interactions [k, n]
-    kinds = [int(kind) for kind in paths.kind[at[:, 0]]] if depth else []
-    turn, wedge = [], []
-    for kind, interaction in zip(kinds, at, strict=True):
-        flat.add(interaction, kind)
-        rows = flat.table_row[interaction]
-        turn.append(
-            jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if kind == Kind.DIFFUSE else None
-        )
-        form = affine_form(paths.diffraction, rows, paths.frequency) if kind == Kind.DIFFRACTION else None
+def _group(
+    paths: Paths, index: NDArray[np.int64], steps: tuple[Step, ...], flat: _Flat, dtype: type
+) -> Group:
+    rotation, turn, wedge = [], [], []
+    for letter, at in steps:  # interactions [n] or [k, n]
+        flat.add(at, letter)
+        rows = flat.table_row[at]
+        straight = np.where((at < 0)[..., None], [1.0, 0.0], paths.rotation[at])
+        rotation.append(jnp.asarray(np.moveaxis(straight, -1, -2).astype(dtype)))
+        turn.append(jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if letter == "s" else None)
+        form = affine_form(paths.diffraction, rows, paths.frequency) if letter == "d" else None
         wedge.append(None if form is None else _parts(form, dtype))
     scale = paths.spreading[index] * speed_of_light / paths.frequency / (4 * np.pi)
     return Group(
-        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype)[: _parts_needed(paths.tx_field)],
-        rx=_parts(np.moveaxis(paths.rx_field[index] * scale[:, None, None], 0, -1), dtype)[
-            : _parts_needed(paths.rx_field)
-        ],
-        rotation=jnp.asarray(np.moveaxis(paths.rotation[at], -1, 1).astype(dtype)),
+        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype, _parts_needed(paths.tx_field)),
+        rx=_parts(
+            np.moveaxis(paths.rx_field[index] * scale[:, None, None], 0, -1),
+            dtype,
+            _parts_needed(paths.rx_field),
+        ),
+        rotation=tuple(rotation),
         turn=tuple(turn),
         wedge=tuple(wedge),
-        signature="".join(_LETTER[Kind(kind)] for kind in kinds),
+        signature="".join(letter for letter, _ in steps),
         size=len(index),
     )
 
@@ -349,5 +339,5 @@ def _parts_needed(field: NDArray[np.complex128]) -> int:
     return 2 if field.imag.any() else 1
 
 
-def _parts(value: NDArray[np.complex128], dtype: type) -> jax.Array:
-    return jnp.asarray(np.stack([value.real, value.imag]).astype(dtype))
+def _parts(value: NDArray[np.complex128], dtype: type, needed: int = 2) -> jax.Array:
+    return jnp.asarray(np.stack([value.real, value.imag][:needed]).astype(dtype))

@@ -51,8 +51,11 @@ def _group_gains(group: Group, pieces: Pieces, keep: Keep) -> slab.Pair:
     te, tm = (_complex(group.tx, component) for component in range(2))  # [T, n]
     coefficients, diffuse = iter(pieces[0]), iter(pieces[1])
     for step, letter in enumerate(group.signature):
-        te, tm = _turn(group.rotation[step], te, tm)
         c_te, c_tm = next(coefficients)
+        if letter == "r":
+            te, tm = _row(te, tm, c_te, c_tm, group.rotation[step])
+            continue
+        te, tm = _turn(group.rotation[step], te, tm)
         if letter == "c":
             te, tm = slab.multiply(c_te, te), slab.multiply(c_tm, tm)
         elif letter == "s":
@@ -80,6 +83,19 @@ def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, s
         cos * b[0] - sin * a[0],
         cos * b[1] - sin * a[1],
     )
+
+
+def _row(
+    te: slab.Pair, tm: slab.Pair, c_te: slab.Pair, c_tm: slab.Pair, rotation: jax.Array
+) -> tuple[slab.Pair, slab.Pair]:
+    """Reflections and transmissions in a row, by one body that is compiled once."""
+
+    def meet(field: tuple, given: tuple) -> tuple[tuple, None]:
+        turn, one, other = given
+        a, b = _turn(turn, *field)
+        return (slab.multiply(one, a), slab.multiply(other, b)), None
+
+    return jax.lax.scan(meet, (te, tm), (rotation, c_te, c_tm))[0]
 
 
 def _scatter(

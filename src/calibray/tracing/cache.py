@@ -1,7 +1,7 @@
 """Traces kept between runs: the same scene, links, antennas, settings and versions are traced once.
 
-The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` switches it off.
-An entry that is damaged is dropped with a line in the log, which Python writes to stderr unless told otherwise.
+They lie in Calibray's cache folder (`calibray.caching`). An entry that is damaged is dropped with a line in the log,
+which Python writes to stderr unless told otherwise.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -22,12 +21,12 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.caching import folder
 from calibray.errors import InputError
 from calibray.paths import SCHEMA_VERSION, Paths
 from calibray.scenes import Scene
 from calibray.tracing.settings import Antenna, TraceSettings
 
-VARIABLE: Final = "CALIBRAY_CACHE"
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}\.h5")
 _LOG: Final = logging.getLogger(__name__)
 
@@ -110,17 +109,6 @@ def keep(digest: str, paths: Paths) -> None:
         paths.save(path)
     except (OSError, InputError):
         return
-
-
-def folder() -> Path | None:
-    """Where traces are kept, whether it is there yet or not; None where they are not."""
-    named = os.environ.get(VARIABLE)
-    if named == "":
-        return None
-    if named is None:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        return Path(home) / "calibray"
-    return Path(named)
 
 
 def kept() -> list[Path]:
