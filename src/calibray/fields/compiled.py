@@ -1,9 +1,9 @@
 """Programs that XLA compiled, kept between runs.
 
 A compiled program is machine code, so that it is taken only from a folder that nobody but the user can write
-(`calibray.caching.Store`). JAX has a cache of its own, which writes entries in place and checks nothing. Its keys, which
-tell all that a program depends on, are used here; what it reads and writes goes through the store. Where the user has
-named a folder for JAX's own in JAX_COMPILATION_CACHE_DIR, it is left alone.
+(`calibray.caching.Store`). JAX has a cache of its own, which writes entries in place and checks nothing. Its keys,
+which tell all that a program depends on, are used here; what it reads and writes goes through the store. Where the user
+has named a folder for JAX's own in JAX_COMPILATION_CACHE_DIR, it is left alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def keep_compiled() -> bool:
         Whether it does: there is a folder for it that can be trusted, and JAX can be told of it.
     """
     kept = caching.compiled()
-    if kept is None or jax.config.jax_compilation_cache_dir is not None or not kept.trusted:
+    if kept is None or jax.config.values["jax_compilation_cache_dir"] is not None or not kept.trusted:
         return False
     try:
         # JAX offers no other way to bring one's own storage.
@@ -38,7 +38,7 @@ def keep_compiled() -> bool:
     class Kept(CacheInterface):
         _path = kept.path
 
-        def get(self, key: str) -> bytes | None:
+        def get(self, key: str) -> bytes | None:  # pyright: ignore[reportIncompatibleMethodOverride]
             return kept.get(_name(key))
 
         def put(self, key: str, value: bytes) -> None:

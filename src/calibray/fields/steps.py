@@ -94,7 +94,8 @@ def _rows(
 
 
 def _one_by_one(paths: Paths, some: NDArray[np.int64]) -> tuple[Step, ...]:
-    at = paths.first[some] + np.arange(paths.first[some[0] + 1] - paths.first[some[0]])[:, None]
+    depth = int(np.diff(paths.first)[some[0]])
+    at = paths.first[some] + np.arange(depth)[:, None]
     numbers = _numbers(paths)[at[:, 0]]
     return tuple((_LETTERS[number], one) for number, one in zip(numbers, at, strict=True))
 
