@@ -93,6 +93,7 @@ def test_the_twin_problem_tells_a_likelihood_from_a_mean_square():
         ("random", 20.0),
         ("latin-hypercube", 20.0),
         ("sobol", 20.0),
+        ("sgwo-im-screened", 0.5),
     ],
 )
 def test_every_method_minimises_a_likelihood(name, excess):

@@ -1,4 +1,4 @@
-"""What methods are compared on: a study on its stored paths, or a landscape in closed form."""
+"""What methods are compared on: a study on its stored paths, a landscape in closed form, or a planted problem."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from calibray.calibration.weighing import weighed
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.optimizers import landscapes
+from calibray.optimizers.screened import Screen
+from calibray.scenarios.family import problem
 from calibray.study import Setup, Study
 
 
@@ -35,6 +37,7 @@ class Arena:
         large: Whether an evaluation is so dear that searches from few starts have to do.
         minimum: Lowest objective known beforehand; +inf if none is.
         evaluate: What is searched.
+        screen: The objective of a cheap model of it; None where there is none.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Arena:
     large: bool
     minimum: float
     evaluate: Evaluate
+    screen: Screen | None = None
 
 
 def study_arena(path: str | Path) -> Arena:
@@ -115,3 +119,36 @@ def landscape_arena(name: str) -> Arena:
     for part in (land.lower, land.upper, *land.evaluate(middle[None])):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
     return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)
+
+
+def family_arena(kind: str, seed: int) -> Arena:
+    """A planted problem of `calibray.scenarios.family`, whose lowest objective is known.
+
+    Args:
+        kind: "district" or "office".
+        seed: Its seed.
+
+    Returns:
+        The arena.
+
+    Raises:
+        InputError: There is no such family.
+    """
+    planted = problem(seed, kind)
+
+    def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
+        told = planted.told(points, derivatives)
+        return Evaluation(*told, told.residuals, told.value)
+
+    return Arena(
+        f"{kind}-{seed}",
+        planted.fingerprint,
+        planted.lower,
+        planted.upper,
+        planted.parameters.to_search(planted.parameters.start),
+        None,
+        False,
+        planted.minimum_rmse_db,
+        evaluate,
+        planted.cheap_rmse_db,
+    )

@@ -7,6 +7,7 @@ least squares from very many starts, or of any run that found a lower one.
 from __future__ import annotations
 
 import hashlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -115,6 +116,7 @@ class Contender:
             budget=self.budget,
             start=arena.start,
             starts=arena.starts,
+            screen=arena.screen,
         )
 
 
@@ -310,7 +312,7 @@ def compare(
     arena = open_arena()
     for contender in contenders:
         contender.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
-    store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{_code()}")
+    store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{code()}")
     tasks = [(contender, seed) for seed in range(seeds) for contender in contenders]
     missing = [task for task in tasks if store.find(*_key(*task)) is None]
     done = len(tasks) - len(missing)
@@ -414,9 +416,29 @@ def _work(contender: Contender, seed: int) -> MethodRun:
 
 
 @cache
-def _code() -> str:
-    """Fingerprint of the optimizers' code: a run of other code says nothing about this one."""
+def code(method: str | None = None) -> str:
+    """Fingerprint of the optimizers' code: a run of other code says nothing about this one.
+
+    Args:
+        method: The method whose code alone matters, with all that it imports; None for all methods.
+
+    Returns:
+        The first digits of a SHA-256 in hexadecimal.
+    """
+    folder = Path(optimizers.__file__).parent
+    found = set(folder.glob("*.py")) if method is None else set()
+    waiting = [] if method is None else [METHODS[method].__module__.rpartition(".")[2]]
+    while waiting:
+        file = folder / f"{waiting.pop()}.py"
+        if file.is_file() and file not in found:
+            found.add(file)
+            waiting += re.findall(
+                r"^from calibray\.optimizers\.(\w+) import", file.read_text("utf-8"), re.MULTILINE
+            )
+            waiting += re.findall(
+                r"^from calibray\.optimizers import (\w+)$", file.read_text("utf-8"), re.MULTILINE
+            )
     digest = hashlib.sha256()
-    for path in sorted(Path(optimizers.__file__).parent.glob("*.py")):
+    for path in sorted(found):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-_KNOWN: Final = {"gwo": "GWO", "sgwo-im": "SGWO-IM", "auto": "auto (least squares)"}
+_KNOWN: Final = {
+    "gwo": "GWO",
+    "sgwo-im": "SGWO-IM",
+    "sgwo-im-screened": "SGWO-IM, screened",
+    "auto": "auto (least squares)",
+}
 
 
 def label(method: str) -> str:

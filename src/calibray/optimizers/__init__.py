@@ -15,6 +15,7 @@ from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.methods import METHODS, make, method
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
+from calibray.optimizers.screened import ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 
@@ -31,6 +32,7 @@ __all__ = [
     "LeastSquares",
     "Optimizer",
     "RandomSearch",
+    "ScreenedSGWOIM",
     "Sobol",
     "VectorSurrogate",
     "make",

@@ -19,6 +19,7 @@ from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
+from calibray.optimizers.screened import Screen, ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 from calibray.spelling import did_you_mean
@@ -26,6 +27,7 @@ from calibray.spelling import did_you_mean
 METHODS: Final[dict[str, type[Optimizer]]] = {
     "gwo": GWO,
     "sgwo-im": SGWOIM,
+    "sgwo-im-screened": ScreenedSGWOIM,
     "vector-surrogate": VectorSurrogate,
     "least-squares": LeastSquares,
     "cma-es": CMAES,
@@ -69,6 +71,7 @@ def make(
     start: ArrayLike | None = None,
     starts: int | None = None,
     objective: Objective | None = None,
+    screen: Screen | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
     """Make an optimizer by its method's name; every method takes of this what it declares to take.
@@ -82,6 +85,7 @@ def make(
         start: Points to start from, [d] or [k, d], for methods that take them.
         starts: Starting points of its own, for the same methods; its default if None.
         objective: The value of residuals, for methods that use them; their root mean square if None.
+        screen: The objective of a cheap model, for methods that screen by one.
         options: Settings of the method, which go before all of these.
 
     Returns:
@@ -101,8 +105,10 @@ def make(
         settings |= {key: value for key, value in (("x0", start), ("starts", starts)) if value is not None}
     if objective is not None and "residuals" in kind.uses:
         settings["objective"] = objective
+    if screen is not None and "screen" in signature(kind).parameters:
+        settings["screen"] = screen
     given = dict(options or {})
-    known = sorted(set(signature(kind).parameters) - {"lower", "upper", "seed", "objective"})
+    known = sorted(set(signature(kind).parameters) - {"lower", "upper", "seed", "objective", "screen"})
     for key in sorted(given.keys() - set(known)):
         raise InputError(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, known)}"

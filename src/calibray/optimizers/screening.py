@@ -18,6 +18,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
 
 from calibray.optimizers.archive import Archive, merged
+from calibray.optimizers.box import Box
 
 KERNELS = ("cubic", "gaussian")
 SMOOTHING = 1e-6
@@ -37,10 +38,32 @@ def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cu
     if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))
     told = archive.imputed(archive.all())
-    x, y = merged(archive.box.to_unit(told.x), told.y)
+    return interpolated(archive.box, told.x, told.y, candidates, kernel)
+
+
+def interpolated(
+    box: Box,
+    points: NDArray[np.float64],
+    values: NDArray[np.float64],
+    candidates: NDArray[np.float64],
+    kernel: str = "cubic",
+) -> NDArray[np.float64]:
+    """Radial basis functions of values at points.
+
+    Args:
+        box: The box.
+        points: More than d distinct points that span it [k, d].
+        values: Values there [k].
+        candidates: Points [n, d].
+        kernel: "cubic" or "gaussian".
+
+    Returns:
+        Values at the candidates [n].
+    """
+    x, y = merged(box.to_unit(points), values)
     if kernel == "gaussian":
         # phi(r) = exp(-(epsilon r)^2) with epsilon = 1 / (sqrt(2) sigma)
         settings = {"kernel": "gaussian", "epsilon": sqrt(len(x)) / pdist(x).max(), "degree": 0}
     else:
         settings = {"kernel": "cubic", "degree": 1}
-    return RBFInterpolator(x, y, smoothing=SMOOTHING, **settings)(archive.box.to_unit(candidates))
+    return RBFInterpolator(x, y, smoothing=SMOOTHING, **settings)(box.to_unit(candidates))

@@ -196,7 +196,7 @@ class SGWOIM(Optimizer):
         for iteration in range(1, total + 1):
             wolves = self._screen(archive, positions, iteration)
             told = yield positions[wolves]
-            self._memory = memory = _remember(memory, wolves, told)
+            self._memory = memory = remember(memory, wolves, told)
             a = CONVERGENCE[self.convergence](iteration, total)  # eq. 2
             w = memory_weight(iteration, total, self.w_min, self.w_max)  # eq. 4
             r1, r2 = self._rng.random((2, self.population, LEADERS, self.box.dimension))
@@ -211,8 +211,17 @@ class SGWOIM(Optimizer):
         return np.argsort(predicted, kind="stable")[: self.elites]
 
 
-def _remember(memory: Evaluations, wolves: NDArray[np.intp], told: Evaluations) -> Evaluations:
-    """Memory after the evaluations of some wolves, by strict improvement."""
+def remember(memory: Evaluations, wolves: NDArray[np.intp], told: Evaluations) -> Evaluations:
+    """Update the pack's memory, by strict improvement.
+
+    Args:
+        memory: The best evaluation of each wolf.
+        wolves: Wolves that were evaluated.
+        told: Their evaluations.
+
+    Returns:
+        The memory after.
+    """
     x, y = memory.x.copy(), memory.y.copy()
     better = told.y < y[wolves]
     x[wolves[better]], y[wolves[better]] = told.x[better], told.y[better]

@@ -153,6 +153,20 @@ class PlantedProblem:
         """
         return self.engine.path_loss(candidates)
 
+    def cheap_rmse_db(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """RMSE of the cheap model at points of the search space, over the links that it reaches.
+
+        Args:
+            points: Points of the search space [n, d].
+
+        Returns:
+            RMSE [n], [dB].
+        """
+        loss = self.cheap.path_loss(self.parameters.from_search(points))
+        reached = np.isfinite(loss)
+        residuals = self.residuals(np.where(reached, loss, self.measured))
+        return np.sqrt(np.sum(residuals**2 * reached, axis=1) / np.maximum(reached.sum(axis=1), 1))
+
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss less the measurements, each transmitter's best offset taken out where there are offsets.
 
