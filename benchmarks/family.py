@@ -29,8 +29,8 @@ from calibray.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (
-    "vector-surrogate", "sgwo-im", "sgwo-im-screened", "gwo", "gaussian-process", "cma-es", "differential-evolution", "dfo-ls", "random",
-    "latin-hypercube", "sobol",
+    "space-mapping", "vector-surrogate", "sgwo-im", "sgwo-im-screened", "gwo", "gaussian-process", "cma-es",
+    "differential-evolution", "dfo-ls", "random", "latin-hypercube", "sobol",
 )  # fmt: skip
 
 

@@ -221,12 +221,12 @@ def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
     assert result.parameters == undisturbed.parameters
 
 
-def test_auto_is_the_vector_surrogate(tmp_path):
+def test_auto_without_a_cheap_model_is_the_vector_surrogate(tmp_path):
     """Eighteen calls bring it near the planted materials; the ledger shows that the named method asks for the same."""
     content = programs.content(tmp_path)
     results = []
     for name in ("auto", "vector-surrogate"):
-        method = {"name": name, "options": {"budget": 18}}
+        method = {"name": name, "model": "none", "options": {"budget": 18}}
         study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
         results.append(calibrate(study, out=tmp_path / "out"))
     assert [(result.rt_calls, result.ledger_hits) for result in results] == [(18, 0), (18, 18)]

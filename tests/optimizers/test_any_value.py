@@ -84,6 +84,7 @@ def test_the_twin_problem_tells_a_likelihood_from_a_mean_square():
     [
         ("least-squares", 1e-8),
         ("vector-surrogate", 1e-3),
+        ("space-mapping", 1e-3),
         ("dfo-ls", 1e-3),
         ("gaussian-process", 0.1),
         ("cma-es", 0.1),
@@ -97,7 +98,7 @@ def test_the_twin_problem_tells_a_likelihood_from_a_mean_square():
     ],
 )
 def test_every_method_minimises_a_likelihood(name, excess):
-    budget = 60 if name in ("vector-surrogate", "gaussian-process") else 225
+    budget = 60 if name in ("vector-surrogate", "space-mapping", "gaussian-process") else 225
     optimizer = make(name, LOWER, UPPER, seed=1, budget=budget, starts=32, objective=deviance)
     best = minimised(optimizer)
     low = likelihood(BEST[None])[0]

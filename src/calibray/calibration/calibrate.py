@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calibray import engines
 from calibray.calibration.certainty import certainty
+from calibray.calibration.cheap import aid
 from calibray.calibration.methods import check_fit, check_method, choose
 from calibray.calibration.outcome import outcome
 from calibray.calibration.problem import Problem
@@ -81,12 +82,15 @@ def calibrate(
     enclosed = setup.enclosed if looked_for else None
     traced = time.perf_counter()
     problem = weighed(problem, progress)
-    trail = search(problem, choose(problem), progress)
+    paused = time.perf_counter()
+    helper = aid(problem, progress)
+    traced += time.perf_counter() - paused
+    trail = search(problem, choose(problem, helper.model), progress)
     problem, trail, gap = settle(problem, trail, progress)
     seconds = time.perf_counter() - traced
     told = certainty(problem, trail, progress)
     judged = validated(problem, progress=progress) if in_turn else None
-    result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started)
+    result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started, helper)
     if out is not None:
         # Asked before the work: what was computed is not lost to a file that came in the meantime.
         result.save(out, overwrite=True)

@@ -11,6 +11,7 @@ from calibray.calibration.problem import Problem
 from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, Optimizer
+from calibray.optimizers.cheap_model import CheapModel
 from calibray.parameters import Parameters
 from calibray.spelling import did_you_mean
 from calibray.study import Setup, Study
@@ -38,11 +39,12 @@ def check_method(name: str) -> None:
         raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, known)}")
 
 
-def choose(problem: Problem) -> Optimizer:
+def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
     """The optimizer of a study's problem: the one it names, or for "auto" the one that serves it best.
 
     Args:
         problem: The problem.
+        model: A cheap model of it, if there is one.
 
     Returns:
         The optimizer.
@@ -52,7 +54,7 @@ def choose(problem: Problem) -> Optimizer:
     """
     engine = problem.engine
     interactions = engine.interactions if isinstance(engine, Differentiable) else None
-    return _make(problem.setup.study, problem.parameters, problem.differentiable, interactions)
+    return _make(problem.setup.study, problem.parameters, problem.differentiable, interactions, model)
 
 
 def check_fit(setup: Setup) -> None:
@@ -70,10 +72,16 @@ def check_fit(setup: Setup) -> None:
     _make(setup.study, setup.parameters, differentiable, 1 if differentiable else None)
 
 
-def _make(study: Study, parameters: Parameters, differentiable: bool, interactions: int | None) -> Optimizer:
+def _make(
+    study: Study,
+    parameters: Parameters,
+    differentiable: bool,
+    interactions: int | None,
+    model: CheapModel | None = None,
+) -> Optimizer:
     section, name = study.method, study.method.name
     if name == AUTO:
-        name = "least-squares" if differentiable else "vector-surrogate"
+        name = "least-squares" if differentiable else "space-mapping"
     if METHODS[name].needs_derivatives() and not differentiable:
         raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
     try:
@@ -83,6 +91,7 @@ def _make(study: Study, parameters: Parameters, differentiable: bool, interactio
             section.seed,
             start=parameters.to_search(parameters.start),
             starts=None if interactions is None else local_searches(interactions),
+            model=model,
             options=section.options,
         )
     except InputError as error:

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.calibration.certainty import Certainty
+from calibray.calibration.cheap import Aid
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
@@ -55,6 +56,7 @@ def outcome(
     enclosed: Enclosed | None,
     seconds: float,
     trace_seconds: float,
+    helper: Aid,
 ) -> Result:
     """What a calibration found.
 
@@ -67,6 +69,7 @@ def outcome(
         enclosed: Antennas inside closed bodies; None where nothing was looked for.
         seconds: Time that the method took [s].
         trace_seconds: Time that tracing and loading took before [s].
+        helper: The cheap model that the method had, if any.
 
     Returns:
         The result.
@@ -134,9 +137,11 @@ def outcome(
         draws=certainty.draws,
         free_offset_db=certainty.free_offset_db,
         free_offset_error_db=certainty.free_offset_error_db,
-        remarks=(*certainty.remarks, *judgement),
+        remarks=(*([helper.remark] if helper.remark else []), *certainty.remarks, *judgement),
         profile_calls=certainty.calls,
         profile_seconds=certainty.seconds,
+        cheap_calls=0 if helper.model is None else helper.model.calls,
+        cheap_seconds=0.0 if helper.model is None else helper.model.seconds,
     )
 
 

@@ -121,25 +121,61 @@ class Problem:
         Returns:
             What an optimizer is told, and what the engine answered.
         """
-        parameters, objective = self.parameters, self.objective
+        parameters, objective, jacobian = self.parameters, self.objective, None
         candidates = parameters.from_search(points)
-        jacobian, unit = None, parameters.search_slope(candidates)
         with_slopes = self.observable.derivatives
         if derivatives and with_slopes is not None and isinstance(self.engine, Differentiable):
             modelled, slope = with_slopes(self.engine, candidates)
-            jacobian = objective.jacobian(modelled, slope * unit[:, None, :])
+            slope = slope * parameters.search_slope(candidates)[:, None, :]
+            jacobian = self.slopes(candidates, modelled, slope)
         else:
             modelled = self.observable.modelled(self.engine, candidates)
-        residuals = objective.residuals(modelled)
+        residuals = self.residuals(candidates, modelled)
         rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
-        if len(self.priors):
-            rows = objective.noise_db * self.priors.rows(candidates)
-            residuals = np.concatenate([residuals, rows], axis=1)
-        if len(self.priors) and jacobian is not None:
-            slopes = objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :]
-            jacobian = np.concatenate([jacobian, slopes], axis=1)
         value = np.sqrt(np.mean(residuals**2, axis=1))
         return Evaluation(value, residuals, jacobian, modelled, rmse_db)
+
+    def residuals(
+        self, candidates: NDArray[np.float64], modelled: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Weighted residuals of what is modelled, and a row for every prior.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+            modelled: What is modelled for them [n, L].
+
+        Returns:
+            The rows [n, m].
+        """
+        residuals = self.objective.residuals(modelled)
+        if not len(self.priors):
+            return residuals
+        rows = self.objective.noise_db * self.priors.rows(candidates)
+        return np.concatenate([residuals, rows], axis=1)
+
+    def slopes(
+        self,
+        candidates: NDArray[np.float64],
+        modelled: NDArray[np.float64],
+        slope: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Derivatives of `residuals`.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+            modelled: What is modelled for them [n, L].
+            slope: Its derivatives by the search coordinates [n, L, k], and after these d by any others.
+
+        Returns:
+            Derivatives of the rows by the same [n, m, k].
+        """
+        jacobian = self.objective.jacobian(modelled, slope)
+        if not len(self.priors):
+            return jacobian
+        unit = self.parameters.search_slope(candidates)
+        rows = self.objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :]
+        others = np.zeros((*rows.shape[:2], slope.shape[2] - rows.shape[2]))
+        return np.concatenate([jacobian, np.concatenate([rows, others], axis=2)], axis=1)
 
 
 def study_nuisance(study: Study, links: Measurements) -> Nuisance:

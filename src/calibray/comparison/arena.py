@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray import engines
+from calibray.calibration.cheap import ReplayedModel, with_constants
 from calibray.calibration.methods import local_searches
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Evaluate
@@ -18,8 +20,10 @@ from calibray.calibration.weighing import weighed
 from calibray.engines.fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.optimizers import landscapes
+from calibray.optimizers.cheap_model import CheapModel
 from calibray.optimizers.screened import Screen
-from calibray.scenarios.family import problem
+from calibray.scenarios.direct import Direct
+from calibray.scenarios.family import PlantedProblem, problem
 from calibray.study import Setup, Study
 
 
@@ -38,6 +42,7 @@ class Arena:
         minimum: Lowest objective known beforehand; +inf if none is.
         evaluate: What is searched.
         screen: The objective of a cheap model of it; None where there is none.
+        model: Makes that cheap model anew, for methods that correct it; None where there is none.
     """
 
     name: str
@@ -50,6 +55,7 @@ class Arena:
     minimum: float
     evaluate: Evaluate
     screen: Screen | None = None
+    model: Callable[[], CheapModel] | None = None
 
 
 def study_arena(path: str | Path) -> Arena:
@@ -151,4 +157,52 @@ def family_arena(kind: str, seed: int) -> Arena:
         planted.minimum_rmse_db,
         evaluate,
         planted.cheap_rmse_db,
+        lambda: planted_model(planted),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PlantedRows:
+    """The residuals of a planted problem, each transmitter's offset taken out.
+
+    Attributes:
+        planted: The problem.
+    """
+
+    planted: PlantedProblem
+
+    @property
+    def filling(self) -> NDArray[np.float64]:
+        """The measured path loss [L], [dB]."""
+        return self.planted.measured
+
+    def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """See `Rows.known`."""
+        return reached
+
+    def residuals(
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """See `Rows.residuals`."""
+        return self.planted.residuals(path_loss)
+
+    def slopes(
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """See `Rows.slopes`; residuals are linear in what path loss has beyond the measurements."""
+        rows = np.moveaxis(slope, 1, -1)
+        return np.moveaxis(self.planted.residuals(self.planted.measured + rows), -1, 1)
+
+
+def planted_model(planted: PlantedProblem) -> ReplayedModel:
+    """The cheap model of a planted problem, with the constants that it was told.
+
+    Args:
+        planted: The problem.
+
+    Returns:
+        The model.
+    """
+    paths = planted.cheap.paths
+    engine = Direct(paths, with_constants(planted.parameters, paths.materials))
+    return ReplayedModel(engine, len(planted.parameters), PlantedRows(planted))

@@ -117,6 +117,7 @@ class Contender:
             start=arena.start,
             starts=arena.starts,
             screen=arena.screen,
+            model=None if arena.model is None else arena.model(),
         )
 
 

@@ -8,6 +8,7 @@ _KNOWN: Final = {
     "gwo": "GWO",
     "sgwo-im": "SGWO-IM",
     "sgwo-im-screened": "SGWO-IM, screened",
+    "space-mapping": "space mapping",
     "auto": "auto (least squares)",
 }
 

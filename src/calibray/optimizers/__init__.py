@@ -17,6 +17,7 @@ from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.screened import ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.space_mapping import SpaceMapping
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "RandomSearch",
     "ScreenedSGWOIM",
     "Sobol",
+    "SpaceMapping",
     "VectorSurrogate",
     "make",
     "method",

@@ -14,6 +14,7 @@ Formulas: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Lea
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,19 @@ NOISE_PRIOR = (np.log(1e-4), 3.0)
 """Mean and standard deviation of the logarithm of the nugget where it is learned."""
 
 NOISE_BOUNDS = (np.log(NUGGET), 0.0)
+
+
+class Predictor(Protocol):
+    """A model of residuals that knows how far it may be off."""
+
+    @property
+    def root(self) -> NDArray[np.float64]:
+        """Factor B of the prior covariance of the residuals, B^T B [k, m]."""
+        ...
+
+    def predict(self, x: NDArray[np.float64], /) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean [k, m] at points of the unit cube [k, d], and the variance as a share of the prior's [k]."""
+        ...
 
 
 @dataclass(frozen=True)

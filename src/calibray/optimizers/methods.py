@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from calibray.errors import InputError
 from calibray.optimizers.archive import Objective
+from calibray.optimizers.cheap_model import CheapModel
 from calibray.optimizers.cma_es import CMAES
 from calibray.optimizers.dfo_ls import DFOLS
 from calibray.optimizers.differential_evolution import DifferentialEvolution
@@ -21,6 +22,7 @@ from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.screened import Screen, ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.space_mapping import SpaceMapping
 from calibray.optimizers.vector_surrogate import VectorSurrogate
 from calibray.spelling import did_you_mean
 
@@ -28,6 +30,7 @@ METHODS: Final[dict[str, type[Optimizer]]] = {
     "gwo": GWO,
     "sgwo-im": SGWOIM,
     "sgwo-im-screened": ScreenedSGWOIM,
+    "space-mapping": SpaceMapping,
     "vector-surrogate": VectorSurrogate,
     "least-squares": LeastSquares,
     "cma-es": CMAES,
@@ -72,6 +75,7 @@ def make(
     starts: int | None = None,
     objective: Objective | None = None,
     screen: Screen | None = None,
+    model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
     """Make an optimizer by its method's name; every method takes of this what it declares to take.
@@ -86,6 +90,7 @@ def make(
         starts: Starting points of its own, for the same methods; its default if None.
         objective: The value of residuals, for methods that use them; their root mean square if None.
         screen: The objective of a cheap model, for methods that screen by one.
+        model: A cheap model of what is minimised, for methods that take one.
         options: Settings of the method, which go before all of these.
 
     Returns:
@@ -105,10 +110,13 @@ def make(
         settings |= {key: value for key, value in (("x0", start), ("starts", starts)) if value is not None}
     if objective is not None and "residuals" in kind.uses:
         settings["objective"] = objective
-    if screen is not None and "screen" in signature(kind).parameters:
-        settings["screen"] = screen
+    for key, value in (("screen", screen), ("model", model)):
+        if value is not None and key in signature(kind).parameters:
+            settings[key] = value
     given = dict(options or {})
-    known = sorted(set(signature(kind).parameters) - {"lower", "upper", "seed", "objective", "screen"})
+    known = sorted(
+        set(signature(kind).parameters) - {"lower", "upper", "seed", "objective", "screen", "model"}
+    )
     for key in sorted(given.keys() - set(known)):
         raise InputError(
             f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, known)}"

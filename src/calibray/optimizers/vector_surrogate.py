@@ -40,7 +40,7 @@ from calibray.optimizers.archive import Archive, Objective, merged, root_mean_sq
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import descend
-from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers.kriging import Kriging, Predictor, fit, solve
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
@@ -260,7 +260,7 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
 
 
 def expected_improvement(
-    model: Kriging, x: NDArray[np.float64], best: float, normal: NDArray[np.float64]
+    model: Predictor, x: NDArray[np.float64], best: float, normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Expected decrease of the mean square of the residuals below the best one, by Monte Carlo.
 

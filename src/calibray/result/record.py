@@ -78,6 +78,8 @@ class Result:
         remarks: What is to be said aloud of this calibration, a sentence each.
         profile_calls: Replays that intervals and draws took, beside the RT calls of the method.
         profile_seconds: Time that these took [s].
+        cheap_calls: Replays of the cheap model that the method had beside the engine; none of them is an RT call.
+        cheap_seconds: Time that these took [s].
         residual_db: Standard deviation of a link's error that predictions are given, [dB]; None where not known.
         residual_basis: What it was taken from.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
@@ -121,6 +123,8 @@ class Result:
     remarks: tuple[str, ...] = ()
     profile_calls: int = 0
     profile_seconds: float = 0.0
+    cheap_calls: int = 0
+    cheap_seconds: float = 0.0
     residual_db: float | None = None
     residual_basis: str = ""
 
@@ -215,6 +219,8 @@ class Result:
             "remarks": list(self.remarks),
             "profile_calls": self.profile_calls,
             "profile_seconds": self.profile_seconds,
+            "cheap_calls": self.cheap_calls,
+            "cheap_seconds": self.cheap_seconds,
             "residual_db": self.residual_db,
             "residual_basis": self.residual_basis,
         }

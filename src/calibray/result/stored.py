@@ -82,6 +82,8 @@ class Stored(Section):
     remarks: tuple[str, ...] = ()
     profile_calls: Count = 0
     profile_seconds: Seconds = 0.0
+    cheap_calls: Count = 0
+    cheap_seconds: Seconds = 0.0
     residual_db: Error | None = None
     residual_basis: str = ""
 

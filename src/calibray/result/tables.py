@@ -215,6 +215,9 @@ def costs(result: Result) -> Table:
     rows = [("RT calls", f"{result.rt_calls:,}")]
     if result.ledger_hits:
         rows.append(("answered by the ledger", f"{result.ledger_hits:,}"))
+    if result.cheap_calls:
+        took = f"{result.cheap_calls:,} in {result.cheap_seconds:.1f} s"
+        rows.append(("replays as cheap model", took))
     if result.retrace_gap_db is not None:
         rows.append(("change on tracing again", f"{result.retrace_gap_db:.2f} dB"))
     if result.profile_calls:

@@ -352,7 +352,7 @@ class Study(Section):
         """
         content = self.content()
         if method is not None and method != self.method.name:
-            content["method"] = {"name": method, "seed": self.method.seed}
+            content["method"] = {"name": method, "seed": self.method.seed, "model": self.method.model}
         if seed is not None:
             content["method"]["seed"] = seed
         if engine is not None:
@@ -366,6 +366,8 @@ class Study(Section):
             # Studies without them keep the fingerprint that they always had.
             if not content[name]:
                 del content[name]
+        if self.method.model == MethodSection().model:
+            del content["method"]["model"]
         content["engine"] |= self._other_engines
         return content
 

@@ -16,7 +16,7 @@ LARGEST: Final = 10**6
 LONGEST: Final = 10**4
 """The number of entries beyond which a list is refused."""
 
-_GIVEN: Final = ("lower", "upper", "seed", "objective")
+_GIVEN: Final = ("lower", "upper", "seed", "objective", "model")
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
     "int": ((int,), "a whole number"),

@@ -353,11 +353,13 @@ class MethodSection(Section):
     Attributes:
         name: "auto", "sgwo-im", "gwo" or another registered method.
         seed: Seed of its random numbers.
+        model: The cheap model of an engine that can only be called: "replay" of the study's own scene, or "none".
         options: Settings of the named method.
     """
 
     name: Text = "auto"
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    model: Literal["replay", "none"] = "replay"
     options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
