@@ -241,8 +241,8 @@ def test_of_a_parameter_on_a_logarithmic_scale_the_logarithm_is_uncertain(tmp_pa
     assert result.parameters == pytest.approx(linear.parameters, rel=1e-4)
     for name, value in result.parameters.items():
         interval, other = result.intervals[name], linear.intervals[name]
-        # The profile follows the sum of squares, which is the same on either scale.
-        assert (interval.lower, interval.upper) == pytest.approx((other.lower, other.upper), rel=1e-3)
+        # The likelihood is the same on either scale; what is flat beforehand is not.
+        assert (interval.lower, interval.upper) == pytest.approx((other.lower, other.upper), rel=0.02)
         assert interval.standard_error == pytest.approx(other.standard_error, rel=1e-2)
         assert interval.lower < value < interval.upper
 

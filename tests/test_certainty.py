@@ -45,7 +45,7 @@ def result(tmp_path_factory, noisy) -> Result:
         return run(tmp_path_factory.mktemp("plain"), noisy)
 
 
-def test_intervals_come_from_profiles_and_say_why(result):
+def test_intervals_come_from_draws_and_say_why(result):
     assert result.profile_calls > 100
     for name, found in result.intervals.items():
         assert (

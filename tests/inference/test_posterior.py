@@ -1,60 +1,107 @@
-"""Draws against the posterior of a linear model, between basins, and within bounds."""
+"""Draws against the posterior of a linear model, between basins, within bounds; their credible sets and verdicts."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm, t
 
-from calibray.inference.posterior import draws
+from calibray.inference.credible import credible
+from calibray.inference.posterior import Draws, sample
+from calibray.inference.verdicts import verdicts
 
-
-def linear(count=40, noise=1.0, seed=1):
-    """A linear model's mean square of residuals, its least squares and their covariance."""
-    random = np.random.default_rng(seed)
-    design = random.normal(size=(count, 2)) @ np.array([[1.0, 0.6], [0.0, 0.3]])
-    measured = design @ [4.0, 5.0] + noise * random.normal(size=count)
-    best = np.linalg.lstsq(design, measured, rcond=None)[0]
-    left = design @ best - measured
-    covariance = np.linalg.inv(design.T @ design) * (left @ left) / (count - 2)
-    return (lambda x: np.mean((x @ design.T - measured) ** 2, axis=1)), best, covariance
+NAMES = ("walls.relative_permittivity", "glass.relative_permittivity")
 
 
-def test_draws_of_a_linear_model_have_its_mean_and_covariance():
-    square, best, covariance = linear()
-    found = draws(square, best[None], np.full(2, -50.0), np.full(2, 50.0), 40, count=2000, steps=80)
-    errors = np.sqrt(np.diag(covariance))
-    assert found.mean(axis=0) == pytest.approx(best, abs=0.15 * errors.min())
-    # A flat prior and an unknown size of the noise make Student's t with n - 2 degrees of freedom.
-    assert np.cov(found.T) == pytest.approx(covariance * 38 / 36, rel=0.15)
+def gaussian(mean, size):
+    def density(points):
+        return -0.5 * np.sum(((points - mean) / size) ** 2, axis=1)
+
+    return density
 
 
-def test_a_wrong_number_of_links_makes_them_too_narrow():
-    square, best, covariance = linear()
-    found = draws(square, best[None], np.full(2, -50.0), np.full(2, 50.0), 160, count=2000, steps=80)
-    assert (np.diag(np.cov(found.T)) < 0.4 * np.diag(covariance)).all()
+def moments(found: Draws):
+    mean = found.weight @ found.point
+    return mean, np.sqrt(found.weight @ (found.point - mean) ** 2)
 
 
-def test_two_basins_that_fit_alike_are_both_drawn_from():
-    def square(x):
-        return 1.0 + 3.0 * ((x[:, 0] - 5.0) ** 2 - 9.0) ** 2
+def test_draws_have_the_mean_and_the_size_of_a_known_density():
+    mean, size = np.array([4.0, 5.0]), np.array([0.3, 0.002])
+    found = sample(gaussian(mean, size), np.zeros(2), np.full(2, 9.0), mean[None], np.diag(size**2)[None])
+    assert found.effective > 400
+    told = moments(found)
+    assert told[0] == pytest.approx(mean, abs=0.1 * size.max())
+    assert told[1] == pytest.approx(size, rel=0.08)
 
-    found = draws(square, np.array([[2.0], [8.0]]), np.zeros(1), np.full(1, 10.0), 30, count=400)
-    low = found[:, 0] < 5
-    assert 0.35 < low.mean() < 0.65
-    assert found[low].mean() == pytest.approx(2.0, abs=0.05)
-    assert found[~low].mean() == pytest.approx(8.0, abs=0.05)
+
+def test_a_wrong_density_makes_them_too_narrow():
+    mean, size = np.array([4.0, 5.0]), np.array([0.3, 0.2])
+    density = gaussian(mean, size)
+    found = sample(lambda x: 4 * density(x), np.zeros(2), np.full(2, 9.0), mean[None], np.diag(size**2)[None])
+    assert (moments(found)[1] < 0.6 * size).all()
+
+
+def test_a_basin_that_no_minimum_was_known_of_gets_its_share():
+    """Two Gaussians, of which the search knew one; the other holds two thirds."""
+
+    def density(points):
+        x = points[:, 0]
+        return np.logaddexp(norm.logpdf(x, 2.0, 0.2), np.log(2) + norm.logpdf(x, 8.0, 0.2))
+
+    found = sample(density, np.zeros(1), np.full(1, 10.0), np.array([[2.0]]), np.array([[[0.04]]]))
+    assert found.weight[found.point[:, 0] > 5].sum() == pytest.approx(2 / 3, abs=0.08)
+    pieces = credible(found.point[:, 0], found.weight, 0.0, 10.0, 0.95)
+    assert [round(0.5 * (low + high)) for low, high in pieces] == [2, 8]
+    (verdict,) = verdicts(found, lambda x: x, NAMES[:1], np.zeros(1), np.full(1, 10.0), 1.0)
+    assert verdict.name == "ambiguous"
+    assert "2 separate ranges" in verdict.reason
 
 
 def test_what_the_data_cannot_tell_spreads_over_its_bounds():
-    found = draws(
-        lambda x: 1.0 + (x[:, 0] - 1.0) ** 2,
-        np.array([[1.0, 0.2]]),
-        np.zeros(2),
-        np.ones(2),
-        50,
-        count=800,
-        steps=100,
-    )
-    assert ((found >= 0) & (found <= 1)).all()
-    assert found[:, 1].std() == pytest.approx(1 / np.sqrt(12), rel=0.1)
-    assert found[:, 0].mean() > 0.8
+    def density(points):
+        return -0.5 * ((points[:, 0] - 3.0) / 0.2) ** 2
+
+    lower, upper = np.zeros(2), np.full(2, 10.0)
+    found = sample(density, lower, upper, np.array([[3.0, 1.0]]), np.array([np.diag([0.04, 9.0])]))
+    assert moments(found)[1][1] == pytest.approx(10 / np.sqrt(12), rel=0.08)
+    told = verdicts(found, lambda x: x[:, :1], NAMES, lower, upper, 1.0)
+    assert [each.name for each in told] == ["identified", "not identifiable"]
+    assert "no link's path loss changes by more than 0.0 dB" in told[1].reason
+    assert told[0].lower == pytest.approx(3.0 - 1.96 * 0.2, abs=0.08)
+
+
+def test_two_that_trade_off_are_said_to():
+    def density(points):
+        return -0.5 * (points.sum(axis=1) - 10.0) ** 2 / 0.1**2
+
+    lower, upper = np.zeros(2), np.full(2, 10.0)
+    wide = np.array([np.array([[9.0, -8.9], [-8.9, 9.0]])])
+    found = sample(density, lower, upper, np.array([[5.0, 5.0]]), wide)
+    told = verdicts(found, lambda x: x.sum(axis=1, keepdims=True), NAMES, lower, upper, 1.0)
+    assert told[0].name == "not identifiable"
+    assert "glass.relative_permittivity makes up for it" in told[0].reason
+
+
+def test_one_that_runs_into_its_bound_is_called_so():
+    found = sample(lambda x: 20 * x[:, 0], np.zeros(1), np.ones(1), np.array([[0.95]]), np.array([[[0.01]]]))
+    (told,) = verdicts(found, lambda x: x * 5, NAMES[:1], np.zeros(1), np.ones(1), 1.0)
+    assert told.name == "at bound"
+    assert told.upper == 1.0
+    assert told.lower == pytest.approx(1 - 3.0 / 20, abs=0.02)
+
+
+def test_credible_sets_hold_what_they_say():
+    """Of weighted and of plain draws, wide, narrow and skewed."""
+    random = np.random.default_rng(4)
+    for draws in (
+        random.normal(5, 1e-4, 3000),
+        random.gamma(2.0, 0.5, 3000),
+        t(4).rvs(3000, random_state=random) + 5,
+    ):
+        pieces = credible(draws, np.full(3000, 1 / 3000), 0.0, 10.0, 0.9)
+        inside = np.any([(draws >= low) & (draws <= high) for low, high in pieces], axis=0)
+        assert inside.mean() == pytest.approx(0.9, abs=0.02)
+    value = random.uniform(2, 8, 4000)
+    weight = norm.pdf(value, 5, 0.5)
+    ((low, high),) = credible(value, weight / weight.sum(), 0.0, 10.0, 0.95)
+    assert (low, high) == pytest.approx((5 - 0.98, 5 + 0.98), abs=0.12)

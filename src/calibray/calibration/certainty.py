@@ -1,4 +1,4 @@
-"""How far a finished calibration can be trusted: profiles, draws from the posterior, and a free offset tried beside."""
+"""How far a finished calibration can be trusted: draws from the posterior, what they tell, and a free offset beside."""
 
 from __future__ import annotations
 
@@ -10,30 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from calibray.calibration.explaining import Explaining, has_offset
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail, rounds
 from calibray.inference.intervals import CONFIDENCE, Interval, intervals
+from calibray.inference.marginal import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 from calibray.inference.nuisance import Nuisance, make_term
-from calibray.inference.posterior import draws
-from calibray.inference.profile import LIKELY, Profile, profiles, threshold_square
+from calibray.inference.posterior import Draws, sample
 from calibray.inference.verdicts import verdicts
 from calibray.optimizers import LeastSquares
 from calibray.progress import Progress
 
-COST: Final = 10
-"""Replays of the profiles by those of the calibration, at most."""
+COST: Final = 5
+"""Replays of the draws by those of the calibration, at most."""
 
 INTERACTIONS: Final = 50_000_000
-"""Interactions times replays that profiles may take in any case: some seconds."""
+"""Interactions times replays that draws may take in any case: some seconds."""
 
-SIZES: Final = ((31, 24), (31, 8), (15, 6), (9, 4), (7, 2), (5, 1))
-"""Values of each profile and minima that it starts from, the first that the cost allows."""
-
-EVALUATIONS: Final = 6
-"""Evaluations that a minimization with one parameter held takes, about, from the nearest known minimum."""
+SIZES: Final = ((512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
+"""Points of a round and rounds, the first that the cost allows."""
 
 SEARCHES: Final = 64
 """Local searches for the minima, where the method kept none."""
+
+BASINS: Final = 24
+"""Minima that draws start around."""
+
+LIKELY: Final = 20.0
+"""Excess of the sum of squares, in variances of the noise, up to which a minimum may matter."""
+
+KEPT: Final = 128
+"""Draws that are kept with the result."""
 
 COLUMNS: Final = 100
 """Columns of the nuisance beyond which draws leave them as they are at the optimum."""
@@ -44,6 +51,15 @@ NOTED_DB: Final = 0.1
 EXACT_DB: Final = 1e-6
 """RMSE of data without noise, which tell everything [dB]."""
 
+SURE: Final = 0.5
+"""Weight from which on a departure from independent Gaussian errors is said aloud."""
+
+DEPARTURES: Final = {
+    CORRELATED: "Errors of neighbouring links are alike",
+    HEAVY: "Errors have heavy tails, as outliers make them",
+    DIFFERING: "Errors grow where materials matter more, as where walls of one material differ",
+}
+
 
 @dataclass(frozen=True)
 class Certainty:
@@ -52,6 +68,8 @@ class Certainty:
     Attributes:
         intervals: Interval and verdict by parameter; empty where the engine gives no derivatives.
         draws: Values of the parameters, by name, that explain the data about as well as those found.
+        posterior: All draws, in the search space; None where none were made.
+        noise: Weights of the kinds of noise, and of a forgotten offset.
         free_offset_db: The offset that fits best beside the study's model, where that has none [dB].
         free_offset_error_db: Its standard error [dB].
         remarks: What is to be said aloud, a sentence each.
@@ -61,6 +79,8 @@ class Certainty:
 
     intervals: dict[str, Interval] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
+    posterior: Draws | None = None
+    noise: dict[str, float] = field(default_factory=dict)
     free_offset_db: float | None = None
     free_offset_error_db: float | None = None
     remarks: tuple[str, ...] = ()
@@ -74,7 +94,7 @@ def certainty(problem: Problem, trail: Trail, progress: Progress | None = None) 
     Args:
         problem: The problem.
         trail: Its finished search.
-        progress: Called with the stage "profiling" after every parameter.
+        progress: Called with the stage "drawing" after every round.
 
     Returns:
         What the data tell of the parameters.
@@ -82,9 +102,7 @@ def certainty(problem: Problem, trail: Trail, progress: Progress | None = None) 
     if not problem.differentiable:
         name = problem.setup.study.engine.name
         return Certainty(
-            remarks=(
-                f"Intervals are not known: the engine {name!r} gives no derivatives, which profiles take.",
-            )
+            remarks=(f"Intervals are not known: the engine {name!r} gives no derivatives, which they take.",)
         )
     started, calls = time.perf_counter(), problem.engine.calls
     told = problem.evaluate(problem.parameters.to_search(trail.best)[None], derivatives=True)
@@ -99,51 +117,63 @@ def certainty(problem: Problem, trail: Trail, progress: Progress | None = None) 
         reason = "the data hold no noise"
         found = Certainty({name: replace(each, reason=reason) for name, each in local.items()})
     else:
-        found = _from_profiles(problem, trail, local, freedom, progress)
+        found = _from_draws(problem, trail, local, freedom, progress)
     return replace(found, calls=problem.engine.calls - calls, seconds=time.perf_counter() - started)
 
 
-def _from_profiles(
+def _from_draws(
     problem: Problem, trail: Trail, local: dict[str, Interval], freedom: int, progress: Progress | None
 ) -> Certainty:
     parameters = problem.parameters
     lower, upper = parameters.search_bounds
     minima, square = _minima(problem, trail)
     likely = _likely(minima, square, freedom)
-    offset = _free_offset(problem, likely, float(square.min()), freedom)
-    size = _size(problem, trail, len(likely))
+    offset, shifted = _free_offset(problem, likely, float(square.min()), freedom)
+    size = _size(problem, trail)
     if size is None:
-        reason = "by the curvature at the optimum alone: profiles would cost more than ten calibrations"
+        reason = "by the curvature at the optimum alone: draws would cost more than five calibrations"
         return replace(offset, intervals={name: replace(each, reason=reason) for name, each in local.items()})
-    values, starts = size
+    starts = np.concatenate([likely[:BASINS], shifted[:BASINS]])
+    explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
+    explaining = explaining.reduced(starts)
+    batch, turns = size
+    done = 0
 
-    def evaluate(
-        points: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        told = problem.evaluate(points, derivatives=True)
-        return told.value, told.residuals, told.slopes
+    def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress("drawing", done, turns + 1)
+        return np.logaddexp.reduce(explaining(points), axis=1)
 
-    curves = profiles(
-        evaluate, lower, upper, likely[:starts], freedom, level=CONFIDENCE, values=values, progress=progress
-    )
+    posterior = sample(
+        density, lower, upper, starts, _covariances(problem, starts, freedom), batch=batch, rounds=turns,
+        seed=problem.setup.study.method.seed,
+    )  # fmt: skip
 
     def shown(index: int, value: float) -> float:
         point = lower.copy()
         point[index] = value
         return float(parameters.from_search(point)[index])
 
-    told = verdicts(curves, evaluate, parameters.names, lower, upper, freedom, level=CONFIDENCE, shown=shown)
+    told = verdicts(
+        posterior, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
+        level=CONFIDENCE, shown=shown,
+    )  # fmt: skip
     found = {}
     for index, (name, verdict) in enumerate(zip(parameters.names, told, strict=True)):
         pieces = tuple((shown(index, low), shown(index, high)) for low, high in verdict.pieces)
         found[name] = Interval(
             local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
         )
+    noise = explaining.weights(posterior.resampled(200))
     return replace(
         offset,
         intervals=found,
-        draws=_draws(problem, curves, freedom),
-        remarks=(*offset.remarks, *_missed(curves, trail)),
+        draws=_draws(problem, posterior),
+        posterior=posterior,
+        noise=noise,
+        remarks=(*offset.remarks, *_departures(noise), *_missed(problem, posterior, trail)),
     )
 
 
@@ -171,6 +201,18 @@ def _curvature(
     }
 
 
+def _covariances(problem: Problem, points: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+    """Covariance of the parameters at minima by linear theory, nowhere wider than a third of the range [k, d, d]."""
+    told = problem.evaluate(points, derivatives=True)
+    lower, upper = problem.parameters.search_bounds
+    slopes = told.slopes * (upper - lower)
+    curvature = np.einsum("kmi,kmj->kij", slopes, slopes)
+    variance = told.value**2 * told.residuals.shape[1] / freedom
+    # A prior as wide as a third of the range keeps what the data cannot tell within it.
+    precision = curvature / variance[:, None, None] + 9.0 * np.eye(len(lower))
+    return np.linalg.inv(precision) * np.outer(upper - lower, upper - lower)
+
+
 def _minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Every minimum known, as points of the search space [k, d], and their mean squares; the best found leads."""
     minima = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
@@ -184,35 +226,22 @@ def _minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArra
 
 def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
     """Those that may matter for an interval, the lowest first."""
-    least = square.min()
     order = np.argsort(square, kind="stable")
-    order = order[square[order] <= least + LIKELY * (threshold_square(least, freedom) - least)]
+    order = order[square[order] <= square.min() * (1.0 + LIKELY / freedom)]
     return minima[order]
 
 
-def _size(problem: Problem, trail: Trail, minima: int) -> tuple[int, int] | None:
-    """Values of each profile and minima to start from, as the cost allows; None where not even the fewest do."""
+def _size(problem: Problem, trail: Trail) -> tuple[int, int] | None:
+    """Points of a round and rounds, as the cost allows; None where not even the fewest do."""
     interactions = getattr(problem.engine, "interactions", 1)
     allowed = max(COST * trail.rt_calls, INTERACTIONS // max(interactions, 1))
-    for values, starts in SIZES:
-        starts = min(starts, minima)
-        if len(problem.parameters) * (values + 8 * starts) * starts * EVALUATIONS <= allowed:
-            return values, starts
-    return None
+    return next(((batch, turns) for batch, turns in SIZES if batch * (turns + 2) <= allowed), None)
 
 
-def _draws(problem: Problem, curves: list[Profile], freedom: int) -> dict[str, list[float]]:
+def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
     """Draws from the posterior by parameter, in the fields' units."""
     parameters = problem.parameters
-    least = min(curve.square.min() for curve in curves)
-    threshold = threshold_square(least, freedom)
-    starts = np.concatenate([curve.point[curve.square <= threshold] for curve in curves])
-
-    def square(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return problem.evaluate(points).value ** 2
-
-    seed = problem.setup.study.method.seed
-    found = draws(square, starts, *parameters.search_bounds, freedom + len(parameters), seed=seed)
+    found = posterior.resampled(KEPT, problem.setup.study.method.seed)
     named = dict(zip(parameters.names, parameters.from_search(found).T.tolist(), strict=True))
     columns = problem.objective.nuisance.columns
     if len(columns) > COLUMNS:
@@ -221,36 +250,50 @@ def _draws(problem: Problem, curves: list[Profile], freedom: int) -> dict[str, l
     return named | dict(zip(columns, coefficients.T.tolist(), strict=True))
 
 
-def _missed(curves: list[Profile], trail: Trail) -> tuple[str, ...]:
-    """Said where a profile lies below what the method found."""
-    lowest = float(np.sqrt(min(curve.square.min() for curve in curves)))
-    if lowest > trail.best_value - 0.01:
-        return ()
-    return (
-        f"The method missed the optimum: the profiles reach {lowest:.2f} dB, it found {trail.best_value:.2f} dB; "
-        "intervals are those around the optimum.",
+def _departures(noise: dict[str, float]) -> tuple[str, ...]:
+    """Said where errors are likely not independent and Gaussian."""
+    return tuple(
+        f"{said} (weight {noise[kind]:.2f}, independent Gaussian errors {noise.get(GAUSSIAN, 0.0):.2f}); intervals "
+        "allow for it."
+        for kind, said in DEPARTURES.items()
+        if noise.get(kind, 0.0) > SURE
     )
 
 
-def _free_offset(problem: Problem, minima: NDArray[np.float64], square: float, freedom: int) -> Certainty:
-    """An offset for all links tried beside a model that has no term of that kind."""
-    objective, study = problem.objective, problem.setup.study
-    constant = any(term.by == "constant" and not np.isfinite(term.prior) for term in objective.nuisance.terms)
-    if study.offset is not None or constant or freedom < 2:
-        return Certainty()
+def _missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[str, ...]:
+    """Said where draws lie below what the method found."""
+    top = posterior.point[np.argsort(-posterior.density)[:16]]
+    lowest = float(problem.evaluate(top).value.min())
+    if lowest > trail.best_value - 0.01:
+        return ()
+    return (
+        f"The method missed the optimum: draws reach {lowest:.2f} dB, it found {trail.best_value:.2f} dB; intervals "
+        "are those around the optimum.",
+    )
+
+
+def _free_offset(
+    problem: Problem, minima: NDArray[np.float64], square: float, freedom: int
+) -> tuple[Certainty, NDArray[np.float64]]:
+    """An offset for all links tried beside a model that has no term of that kind, and the minima with it."""
+    objective, none = problem.objective, np.zeros((0, len(problem.parameters)))
+    if has_offset(problem) or freedom < 2:
+        return Certainty(), none
     term = make_term(problem.setup.links, "free offset")
     terms = (*objective.nuisance.terms, term)
     trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
-    search = LeastSquares(*problem.parameters.search_bounds, starts=16, x0=minima)
+    search = LeastSquares(*problem.parameters.search_bounds, starts=16, x0=minima[:BASINS])
     for _ in rounds(search, trial.evaluate):
         pass
-    told = trial.evaluate(search.best.x[None])
-    offset = float(trial.objective.coefficients(told.modelled)[0, -1])
-    left = float(told.value[0] ** 2)
+    told = trial.evaluate(search.minima)
+    shifted = _likely(search.minima, told.value**2, freedom - 1)
+    best = int(np.argmin(told.value))
+    offset = float(trial.objective.coefficients(told.modelled[best : best + 1])[0, -1])
+    left = float(told.value[best] ** 2)
     # F of one further column: the offset over its standard error, squared.
     ratio = (square - left) / left * (freedom - 1) if left > 0 else np.inf
     if not ratio > 0 or not np.isfinite(ratio):
-        return Certainty()
+        return Certainty(), shifted
     error = abs(offset) / float(np.sqrt(ratio))
     remarks: tuple[str, ...] = ()
     if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= NOTED_DB:
@@ -259,4 +302,4 @@ def _free_offset(problem: Problem, minima: NDArray[np.float64], square: float, f
             f"would be {np.sqrt(left):.2f} instead of {np.sqrt(square):.2f} dB. Say [offset] if cables or gains may be "
             "off.",
         )
-    return Certainty(free_offset_db=offset, free_offset_error_db=error, remarks=remarks)
+    return Certainty(free_offset_db=offset, free_offset_error_db=error, remarks=remarks), shifted

@@ -135,6 +135,7 @@ def outcome(
         },
         nuisance_centres={term.name: term.centre for term in objective.nuisance.terms if term.centre},
         draws=certainty.draws,
+        noise=certainty.noise,
         free_offset_db=certainty.free_offset_db,
         free_offset_error_db=certainty.free_offset_error_db,
         remarks=(*([helper.remark] if helper.remark else []), *certainty.remarks, *judgement),

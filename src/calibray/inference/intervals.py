@@ -20,7 +20,7 @@ class Interval:
         lower: Lower end of the 95 % interval, within the bounds; of the lowest piece where there are several.
         upper: Upper end, of the highest piece.
         verdict: "identified", "weakly identified", "ambiguous", "at bound" or "not identifiable".
-        pieces: Lower and upper end of every piece, ascending, where the interval was taken from a profile.
+        pieces: Lower and upper end of every piece, ascending, where the interval was taken from draws.
         reason: Why the verdict is what it is, in words.
     """
 

@@ -1,4 +1,4 @@
-"""What the data can tell of a parameter, from its profile: an interval, a verdict, and the reason in words."""
+"""What the data tell of a parameter, from draws of the posterior: an interval, a verdict, and the reason in words."""
 
 from __future__ import annotations
 
@@ -9,20 +9,31 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.inference.profile import Evaluate, Profile, threshold_square
+from calibray.inference.credible import credible
+from calibray.inference.posterior import Draws
+
+JUDGED: Final = 0.9
+"""Share of the posterior that verdicts go by: the last few per cent lie far out, where a rare model of the noise
+explains the data as well, and say little of what is known."""
 
 IDENTIFIED: Final = 0.25
-"""Widest interval, of the range, of what is called identified."""
+"""Widest set, of the range, of what is called identified."""
 
 WEAKLY: Final = 0.5
-"""Widest interval, of the range, of what is called weakly identified; a wider one tells nothing."""
+"""Widest set, of the range, of what is called weakly identified; a wider one tells nothing."""
 
 SILENT_DB: Final = 1.0
 """Change of path loss below which no link is said to depend on a parameter [dB]."""
 
-MOVED: Final = 0.25
-"""Share of its range that another parameter moves by where it is said to make up for one."""
+TRADED: Final = 0.5
+"""Rank correlation from which on another parameter is said to make up for one."""
 
+LINE: Final = 25
+"""Values over the range of a parameter that its effect is taken from."""
+
+
+Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Points [n, d] to the path loss of the links that count [n, m], [dB]."""
 
 Shown = Callable[[int, float], float]
 """A parameter's place and its value to the value that words are to give, where the search has a scale of its own."""
@@ -38,8 +49,8 @@ class Verdict:
     """What the data tell of one parameter.
 
     Attributes:
-        pieces: Lower and upper end of every piece of the confidence set, ascending; within the bounds.
-        best: Value at the lowest point.
+        pieces: Lower and upper end of every piece of the credible set, ascending; within the bounds.
+        best: Value at the point of the highest density.
         name: "identified", "weakly identified", "ambiguous", "at bound" or "not identifiable".
         reason: Why, in words.
     """
@@ -61,12 +72,12 @@ class Verdict:
 
 
 def verdicts(
-    curves: Sequence[Profile],
-    evaluate: Evaluate,
+    draws: Draws,
+    modelled: Modelled,
     names: Sequence[str],
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
-    freedom: int,
+    noise_db: float,
     *,
     level: float = 0.95,
     shown: Shown = as_it_is,
@@ -74,48 +85,48 @@ def verdicts(
     """What the data tell of every parameter.
 
     Args:
-        curves: The profile of every parameter, as `profiles` gives them.
-        evaluate: What is minimised.
+        draws: The posterior.
+        modelled: What depends on the parameters.
         names: Names of the parameters.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        freedom: Number of links less those of parameters and nuisances.
-        level: Confidence.
+        noise_db: Size of the links' errors [dB].
+        level: Share of the posterior that intervals hold.
         shown: What reasons give for a value.
 
     Returns:
         One verdict for every parameter.
     """
-    lowest = min(curves, key=lambda curve: curve.square.min())
-    least = float(lowest.square.min())
-    best = lowest.point[np.argmin(lowest.square)]
-    threshold = threshold_square(least, freedom, level)
+    best = draws.point[np.argmax(draws.density)]
     found = []
-    for index, curve in enumerate(curves):
-        pieces = curve.pieces(threshold)
+    for index in range(len(names)):
+        pieces, told = (
+            credible(draws.point[:, index], draws.weight, float(lower[index]), float(upper[index]), held)
+            for held in (JUDGED, level)
+        )
         low, high = pieces[0][0], pieces[-1][1]
         share = sum(end - start for start, end in pieces) / (upper[index] - lower[index])
         ends = _touched(pieces, lower[index], upper[index])
         if share > WEAKLY:
             name = "not identifiable"
-            reason = _blindness(curve, evaluate, names, best, upper - lower, threshold)
+            reason = _blindness(index, draws, modelled, names, best, lower, upper, noise_db)
         elif len(pieces) > 1:
-            name, reason = "ambiguous", _separate(curve, pieces, least, level, shown)
+            name, reason = "ambiguous", _separate(index, pieces, draws, shown)
         elif ends:
             side = (
                 f"below {shown(index, high):.4g}" if ends == ["lower"] else f"above {shown(index, low):.4g}"
             )
-            reason = f"the interval ends at the {ends[0]} bound: the data say only that it lies {side}"
+            reason = f"it reaches the {ends[0]} bound: the data say only that it lies {side}"
             name = "at bound"
         else:
             name = "identified" if share <= IDENTIFIED else "weakly identified"
-            reason = f"the interval takes up {share:.0%} of the range"
-        found.append(Verdict(pieces, float(best[index]), name, reason))
+            reason = f"nine tenths of the posterior take up {share:.0%} of the range"
+        found.append(Verdict(told, float(best[index]), name, reason))
     return found
 
 
 def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> list[str]:
-    """The bounds that a confidence set reaches."""
+    """The bounds that a credible set reaches."""
     slack, found = 1e-6 * (upper - lower), []
     if pieces[0][0] <= lower + slack:
         found.append("lower")
@@ -124,41 +135,42 @@ def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float
     return found
 
 
-def _separate(
-    curve: Profile, pieces: tuple[tuple[float, float], ...], least: float, level: float, shown: Shown
-) -> str:
-    """The minima that fit, with how much worse each fits than the best."""
-    parts = []
+def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> str:
+    """The ranges that explain the links, with what speaks for each."""
+    parts, value = [], draws.point[:, index]
     for low, high in pieces:
-        inside = (curve.value >= low) & (curve.value <= high)
-        at = np.flatnonzero(inside)[np.argmin(curve.square[inside])]
-        behind = float(np.sqrt(curve.square[at])) - float(np.sqrt(least))
-        parts.append(f"{shown(curve.index, float(curve.value[at])):.4g} ({behind:.2f} dB behind the best)")
-    return f"{len(pieces)} separate ranges fit at {level:.0%}: around {', '.join(parts)}"
+        inside = (value >= low) & (value <= high)
+        middle = value[inside][np.argmax(draws.density[inside])] if inside.any() else 0.5 * (low + high)
+        parts.append(f"{shown(index, float(middle)):.4g} ({draws.weight[inside].sum():.0%} of the posterior)")
+    return f"{len(pieces)} separate ranges explain the links: around {', '.join(parts)}"
 
 
 def _blindness(
-    curve: Profile,
-    evaluate: Evaluate,
+    index: int,
+    draws: Draws,
+    modelled: Modelled,
     names: Sequence[str],
     best: NDArray[np.float64],
-    width: NDArray[np.float64],
-    threshold: float,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    noise_db: float,
 ) -> str:
     """Why most of the range fits: no link depends on it, another parameter makes up for it, or errors are large."""
-    line = np.tile(best, (len(curve.value), 1))
-    line[:, curve.index] = curve.value
-    residuals = evaluate(line)[1]
-    change = float(np.nanmax(np.ptp(np.where(np.isfinite(residuals), residuals, np.nan), axis=0)))
+    line = np.tile(best, (LINE, 1))
+    line[:, index] = np.linspace(lower[index], upper[index], LINE)
+    loss = modelled(line)
+    change = float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
     if change < SILENT_DB:
         return f"no link's path loss changes by more than {change:.1f} dB over its whole range"
-    fits = curve.square <= threshold
-    moved = np.ptp(curve.point[fits], axis=0) / width
-    moved[curve.index] = 0.0
-    if moved.max() > MOVED:
-        other = names[int(np.argmax(moved))]
-        return f"{other} makes up for it: it moves over {moved.max():.0%} of its range while the fit stays as good"
-    errors = np.sqrt(threshold)
-    return (
-        f"links change by up to {change:.1f} dB over its range, too little against errors of {errors:.1f} dB"
-    )
+    rank = np.argsort(np.argsort(draws.resampled(400), axis=0), axis=0)
+    varied = np.ptp(rank, axis=0) > 0
+    traded = np.zeros(len(names))
+    if varied[index]:
+        traded[varied] = np.abs(
+            np.corrcoef(rank[:, varied].T).reshape(varied.sum(), -1)[varied[:index].sum()]
+        )
+    traded[index] = 0.0
+    if traded.max() > TRADED:
+        other = names[int(np.argmax(traded))]
+        return f"{other} makes up for it: they trade off with a rank correlation of {traded.max():.2f}"
+    return f"links change by up to {change:.1f} dB over its range, too little against errors of {noise_db:.1f} dB"

@@ -73,6 +73,7 @@ class Result:
         nuisance_centres: What was taken off the column of those that turn about a point.
         draws: Values of the parameters, and of nuisances, that explain the links about as well as those found; empty
             where none could be drawn.
+        noise: Weights of the kinds of noise that intervals allow for, and of an offset that was forgotten.
         free_offset_db: The offset that would fit best beside a study without `[offset]`, [dB]; None where not tried.
         free_offset_error_db: Its standard error, [dB].
         remarks: What is to be said aloud of this calibration, a sentence each.
@@ -118,6 +119,7 @@ class Result:
     nuisances: dict[str, dict[str, float]] = field(default_factory=dict)
     nuisance_centres: dict[str, float] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
+    noise: dict[str, float] = field(default_factory=dict)
     free_offset_db: float | None = None
     free_offset_error_db: float | None = None
     remarks: tuple[str, ...] = ()
@@ -214,6 +216,7 @@ class Result:
             "nuisances": self.nuisances,
             "nuisance_centres": self.nuisance_centres,
             "draws": self.draws,
+            "noise": self.noise,
             "free_offset_db": self.free_offset_db,
             "free_offset_error_db": self.free_offset_error_db,
             "remarks": list(self.remarks),

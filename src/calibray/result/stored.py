@@ -31,6 +31,7 @@ Count = Annotated[int, Field(ge=0)]
 Error = Annotated[float, Field(ge=0)]
 Seconds = Annotated[float, Field(ge=0)]
 Offset = Annotated[float, Field(ge=-500, le=500)]
+Share = Annotated[float, Field(ge=0, le=1.000001)]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -77,6 +78,7 @@ class Stored(Section):
     nuisances: dict[str, dict[str, float]] = Field(default_factory=dict)
     nuisance_centres: dict[str, float] = Field(default_factory=dict)
     draws: dict[str, list[float]] = Field(default_factory=dict)
+    noise: dict[str, Share] = Field(default_factory=dict)
     free_offset_db: float | None = None
     free_offset_error_db: Error | None = None
     remarks: tuple[str, ...] = ()

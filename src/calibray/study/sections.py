@@ -310,9 +310,32 @@ class NoiseSection(Section):
 
     Attributes:
         std_db: Standard deviation of a link's error [dB], against which priors are weighed; estimated if absent.
+        kind: "gaussian" or "student-t", or "auto" where intervals are to allow for either.
+        range_m: Distance over which neighbouring links' errors are alike [m], 0 where they are not, or "auto".
+        heterogeneity: Spread of one material's constants between objects, 0 for none, or "auto".
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
+    kind: Literal["auto", "gaussian", "student-t"] = "auto"
+    range_m: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
+    heterogeneity: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = "auto"
+
+    @model_validator(mode="after")
+    def _one_departure(self) -> Self:
+        stated = [
+            name
+            for name, said in (
+                ("kind = 'student-t'", self.kind == "student-t"),
+                (f"range_m = {self.range_m}", self.range_m not in ("auto", 0)),
+                (f"heterogeneity = {self.heterogeneity}", self.heterogeneity not in ("auto", 0)),
+            )
+            if said
+        ]
+        if len(stated) > 1:
+            raise InputError(
+                f"noise: {' and '.join(stated)}: only one of them can be stated; leave the others at 'auto'"
+            )
+        return self
 
 
 class HoldoutSection(Section):

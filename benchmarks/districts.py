@@ -1,0 +1,235 @@
+"""Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package knows.
+
+Even seeds are to develop on, odd ones are run once at the end. Buildings are boxes with windows, so that the building
+an interaction belongs to follows from where it happens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from calibray import engines, fields
+from calibray.calibration.problem import Problem
+from calibray.materials import Material, itu_material
+from calibray.paths import Paths
+from calibray.scenarios import demo_study_path
+from calibray.scenarios.district import Building, building_meshes, district
+from calibray.scenes.meshes import Mesh, MeshObject, joined, write_scene
+from calibray.study import Setup, Study
+
+DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 102, 104, 106, 108))
+"""Districts to develop on."""
+
+JUDGING = tuple(f"district-{seed}" for seed in (101, 103, 105, 107, 109))
+"""Districts to judge by, run once at the end."""
+
+DEMO = "demo"
+NEAR_M = 0.1
+"""Distance from a footprint within which an interaction happens on its building [m]."""
+
+
+@dataclass(frozen=True)
+class District:
+    """A district whose paths are traced.
+
+    Attributes:
+        name: Its name.
+        problem: The problem over its links.
+        footprints: Corners of every building, counter-clockwise [n, 2], [m].
+    """
+
+    name: str
+    problem: Problem
+    footprints: tuple[np.ndarray, ...]
+
+    def path_loss(self, truth: np.ndarray) -> np.ndarray:
+        """Path loss of every link with one candidate everywhere [L], [dB]."""
+        return self.problem.engine.path_loss(truth[None])[0]
+
+    def path_loss_apart(self, truth: np.ndarray, spread: float, random: np.random.Generator) -> np.ndarray:
+        """Path loss of every link where every building has walls of its own [L], [dB].
+
+        Args:
+            truth: The materials' means.
+            spread: Standard deviation of a building's factor.
+            random: Random numbers.
+        """
+        paths = self.problem.engine.paths
+        buildings, parameters = len(self.footprints), self.problem.parameters
+        own = np.clip(
+            truth * np.exp(spread * random.standard_normal((buildings, len(truth)))),
+            parameters.lower,
+            parameters.upper,
+        )
+        known = list(paths.materials.items())
+        material, table, place = paths.material.copy(), dict(paths.materials), self._building(paths)
+        for building in np.unique(place[place >= 0]):
+            here = parameters.materials(own[building], paths.materials)
+            for index, (name, _) in enumerate(known):
+                mine = (place == building) & (paths.material == index)
+                if mine.any():
+                    material[mine] = len(table)
+                    table[f"{name} of {building}"] = here[name]
+        ground = parameters.materials(truth, paths.materials)
+        table.update({name: ground[name] for name, _ in known})
+        section = self.problem.setup.study
+        return fields.path_loss(
+            replace(paths, material=material, materials=table), None, section.objective.combining,
+            section.scene.bandwidth,
+        )  # fmt: skip
+
+    def _building(self, paths: Paths) -> np.ndarray:
+        """Building of every interaction, -1 for the ground [I]."""
+        found = np.full(paths.num_interactions, -1)
+        point = np.asarray(paths.vertex, dtype=float)
+        for number, corners in enumerate(self.footprints):
+            edge = np.roll(corners, -1, axis=0) - corners
+            normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
+            depth = np.einsum("pek,ek->pe", point[:, None, :2] - corners, normal).min(axis=1)
+            found[(depth > -NEAR_M) & (point[:, 2] > NEAR_M)] = number
+        return found
+
+
+def make(name: str, folder: Path) -> District:
+    """Make a district and trace it; the package's cache keeps its paths.
+
+    Args:
+        name: "demo", or "district-SEED".
+        folder: Folder for the scene and its links.
+    """
+    if name == DEMO:
+        setup = Study.load(demo_study_path()).opened()
+        footprints = tuple(building.footprint for building in district())
+    else:
+        setup, footprints = _drawn(int(name.removeprefix("district-")), folder / name)
+    return District(name, Problem.of(setup, engines.make(setup, "replay")), footprints)
+
+
+def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
+    random = np.random.default_rng([seed, 77])
+    size, street = random.integers(2, 5, 2), random.uniform(14, 30)
+    block = random.uniform(50, 130, 2)
+    pitch = block + street
+    extent = size * pitch + street
+    buildings = []
+    for column in range(size[0]):
+        for row in range(size[1]):
+            south_west = np.array([column, row]) * pitch + street - extent / 2
+            buildings += _block(south_west, block, random, len(buildings))
+    frequency = float(random.choice([0.9e9, 2.1e9, 3.5e9, 6e9, 10e9, 28e9]))
+    structures, windows = zip(*(building_meshes(each) for each in buildings), strict=True)
+    corner = extent / 2 + 20
+    ground = Mesh(
+        np.array(
+            [
+                [-corner[0], -corner[1], 0],
+                [corner[0], -corner[1], 0],
+                [*corner, 0],
+                [-corner[0], corner[1], 0],
+            ]
+        ),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    objects = [
+        MeshObject("structures", "walls", joined(structures)),
+        MeshObject("panes", "windows", joined(windows)),
+        MeshObject("plane", "ground", ground),
+    ]
+    wall, earth = str(random.choice(["concrete", "brick", "marble"])), float(random.uniform(0.3, 3.0))
+    materials = {
+        "walls": _constants(itu_material(wall, frequency, float(random.uniform(0.1, 0.4)))),
+        "windows": _constants(itu_material("glass", frequency, float(random.uniform(0.005, 0.03)))),
+        "ground": {
+            "relative_permittivity": 4.0,
+            "conductivity": float(random.uniform(0.005, 0.1)),
+            "thickness": earth,
+        },
+    }
+    write_scene(folder / "scene", objects, materials)
+    bounds = {
+        "walls.relative_permittivity": {"bounds": [1.5, 12.0]},
+        "windows.relative_permittivity": {"bounds": [1.5, 10.0]},
+        "ground.relative_permittivity": {"bounds": [1.5, 20.0]},
+    }
+    if random.random() < 0.5:
+        bounds["walls.conductivity"] = {"bounds": [1e-3, 3.0], "scale": "log"}
+    count = round(float(np.exp(random.uniform(np.log(20), np.log(200)))))
+    table = _links(4 * count, size, pitch, street, extent, random)
+    table.to_csv(folder / "links.csv", index=False)
+    content = {
+        "version": 1,
+        "scene": {"file": "scene/scene.xml", "frequency": frequency},
+        "links": {
+            "file": "links.csv", "tx": ["tx_x", "tx_y", "tx_z"], "rx": ["rx_x", "rx_y", "rx_z"], "value": "loss_db"
+        },
+        "antennas": {end: {"pattern": "dipole", "polarization": "V"} for end in ("tx", "rx")},
+        "trace": {"max_depth": 4, "samples": 300_000},
+        "parameters": bounds,
+    }  # fmt: skip
+    setup = Study.from_content(content, folder / "study.toml").opened()
+    # Of the receivers planned, the first that some path leads to.
+    reached = np.setdiff1d(np.arange(len(table)), setup.trace().links_without_path)[:count]
+    table.iloc[reached].to_csv(folder / "links.csv", index=False)
+    setup = Study.from_content(content, folder / "study.toml").opened()
+    return setup, tuple(each.footprint for each in buildings)
+
+
+def _block(corner: np.ndarray, size: np.ndarray, random: np.random.Generator, first: int) -> list[Building]:
+    """The buildings of a block, a lot each."""
+    lots = random.integers(1, 3, 2)
+    found = []
+    for column in range(lots[0]):
+        for row in range(lots[1]):
+            low = corner + size * np.array([column, row]) / lots + random.uniform(0, 4, 2)
+            high = corner + size * np.array([column + 1, row + 1]) / lots - random.uniform(0, 4, 2)
+            low, high = np.round(low * 64) / 64, np.round(high * 64) / 64
+            footprint = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+            height = float(np.round(random.uniform(8, 50) * 64) / 64)
+            found.append(
+                Building(f"b{first + len(found):03d}", footprint, height, float(random.uniform(0.2, 0.6)))
+            )
+    return found
+
+
+def _links(
+    count: int,
+    size: np.ndarray,
+    pitch: np.ndarray,
+    street: float,
+    extent: np.ndarray,
+    random: np.random.Generator,
+) -> pd.DataFrame:
+    stations = np.column_stack(
+        [_in_streets(3, size, pitch, street, extent, random), random.uniform(3, 20, 3)]
+    )
+    stations = stations[: random.integers(1, 4)]
+    place = _in_streets(count, size, pitch, street, extent, random)
+    near = np.linalg.norm(place[:, None] - stations[None, :, :2], axis=2)
+    tx = stations[near.argmin(axis=1)]
+    table = np.column_stack([tx, place, np.full(count, 1.5)]).round(2)
+    return pd.DataFrame(table, columns=["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]).assign(loss_db=100.0)
+
+
+def _in_streets(
+    count: int,
+    size: np.ndarray,
+    pitch: np.ndarray,
+    street: float,
+    extent: np.ndarray,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Places in the streets [count, 2], [m]."""
+    along = random.random(count) < 0.5
+    line = np.where(along, random.integers(0, size[0] + 1, count), random.integers(0, size[1] + 1, count))
+    across = line * np.where(along, pitch[0], pitch[1]) + street * random.uniform(0.15, 0.85, count)
+    other = random.uniform(0, 1, count) * np.where(along, extent[1], extent[0])
+    found = np.where(along[:, None], np.stack([across, other], 1), np.stack([other, across], 1))
+    return found - extent / 2
+
+
+def _constants(material: Material) -> dict[str, float]:
+    return {name: getattr(material, name) for name in ("relative_permittivity", "conductivity", "thickness")}

@@ -1,0 +1,139 @@
+"""How well values of the parameters explain a problem's measurements, under every model of the noise that is tried."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.calibration.problem import Problem
+from calibray.engines.protocol import Differentiable
+from calibray.inference.marginal import Marginal, noise_models
+from calibray.inference.nuisance import CONSTANT
+
+CHUNK: Final = 256
+"""Points evaluated at once."""
+
+FEWEST: Final = 8
+"""Links below which noise is taken as independent and Gaussian, for they cannot tell another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explaining:
+    """The density of the measurements at points of the search space.
+
+    Attributes:
+        problem: The problem.
+        marginal: The density given path loss.
+        fixed: What coefficients at their bounds add to path loss [m], [dB].
+        scale: Roots of the weights of the links that count, their mean square one [m].
+        counted: Places of these links [m].
+    """
+
+    problem: Problem
+    marginal: Marginal
+    fixed: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    counted: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> Explaining:
+        """Set up the models of noise that a study leaves open.
+
+        Args:
+            problem: The problem.
+            best: The optimum, a point of the search space [d].
+            square: Mean square of the residuals there [dB^2].
+            freedom: Number of links less that of unknowns.
+        """
+        objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
+        counted = np.flatnonzero(objective.weight > 0)
+        weight = objective.weight[counted]
+        scale = np.sqrt(weight * len(weight) / weight.sum())
+        noise_db = float(np.sqrt(square * (freedom + len(problem.parameters)) / freedom))
+        nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
+        coefficients = objective.coefficients(problem.evaluate(best[None]).modelled)[0]
+        held = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
+        design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
+        used = objective.determined & ~held
+        models = noise_models(
+            position,
+            kind=None if section.kind == "auto" else section.kind,
+            range_m=None if section.range_m == "auto" else float(section.range_m),
+            spread=None if section.heterogeneity == "auto" else float(section.heterogeneity),
+            offset=not has_offset(problem),
+        )
+        if len(counted) < FEWEST:
+            models = noise_models(
+                position, kind="gaussian", range_m=0.0, spread=0.0, offset=not has_offset(problem)
+            )
+        ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
+        marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models)
+        return cls(problem, marginal, design[:, held] @ coefficients[held], scale, counted)
+
+    def reduced(self, points: NDArray[np.float64]) -> Explaining:
+        """The same without models that explain nothing at points that are as good as any [k, d]."""
+        return replace(self, marginal=self.marginal.reduced(self(points)))
+
+    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithm of the posterior under every model, but for one constant [n, models].
+
+        Args:
+            points: Points of the search space [n, d].
+        """
+        parts = [self._part(points[first : first + CHUNK]) for first in range(0, len(points), CHUNK)]
+        return np.concatenate(parts) if parts else np.zeros((0, len(self.marginal.models)))
+
+    def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss of the links that count [n, m], [dB]."""
+        return self.problem.objective.capped(self.problem.evaluate(points).modelled)[:, self.counted]
+
+    def weights(self, points: NDArray[np.float64]) -> dict[str, float]:
+        """What speaks for each kind of noise, and for a forgotten offset.
+
+        Args:
+            points: Draws of equal weight [n, d].
+
+        Returns:
+            Weights by kind, adding up to one, and that of "offset" where one may have been forgotten.
+        """
+        each = self(points)
+        share = np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)).mean(axis=0)
+        found: dict[str, float] = {}
+        for model, weight in zip(self.marginal.models, share.tolist(), strict=True):
+            found[model.kind] = found.get(model.kind, 0.0) + weight
+            if not has_offset(self.problem):
+                found["offset"] = found.get("offset", 0.0) + weight * model.offset
+        return found
+
+    def _part(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        problem, sensitivity = self.problem, None
+        candidates = problem.parameters.from_search(points)
+        objective, with_slopes = problem.objective, problem.observable.derivatives
+        if (
+            self.marginal.needs_slopes
+            and with_slopes is not None
+            and isinstance(problem.engine, Differentiable)
+        ):
+            modelled, slope = with_slopes(problem.engine, candidates)
+            flat = modelled >= (np.inf if objective.ceiling_db is None else objective.ceiling_db)
+            relative = np.where(flat[..., None], 0.0, slope) * candidates[:, None, :]
+            sensitivity = np.sum(relative**2, axis=2)[:, self.counted] * self.scale**2
+        else:
+            modelled = problem.observable.modelled(problem.engine, candidates)
+        loss = objective.capped(modelled)[:, self.counted]
+        gap = (objective.measured[self.counted] - self.fixed - loss) * self.scale
+        found = self.marginal.densities(gap, sensitivity)
+        if len(problem.priors):
+            found -= 0.5 * np.sum(problem.priors.rows(candidates) ** 2, axis=1)[:, None]
+        return found
+
+
+def has_offset(problem: Problem) -> bool:
+    """Whether the study's model has an offset for all links, or the like."""
+    constant = any(
+        term.by == CONSTANT and not np.isfinite(term.prior) for term in problem.objective.nuisance.terms
+    )
+    return problem.setup.study.offset is not None or constant

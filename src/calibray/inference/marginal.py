@@ -1,0 +1,329 @@
+"""How well parameters explain the measurements, whatever the noise: models of it, their unknowns integrated out.
+
+Errors of links may be independent and Gaussian, shared by neighbours, heavy-tailed, or larger where materials matter
+more, for walls of one material differ from building to building; and an offset may have been forgotten. No one knows
+which beforehand, and choosing one by its fit forgets that another fits nearly as well. So every model gets a prior
+weight, and the density of the data under each stands beside the others'; what is reported averages over them.
+
+The size of the noise has the prior 1/size and nuisances their own, flat unless stated. With Gaussian noise whose
+covariance is C times an unknown variance both integrals are closed (D. A. Harville, Biometrika 61, 1974): with whitened
+errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
+
+    p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
+
+f being the number of links less that of columns with a flat prior. With Student's t both are taken by Laplace's
+approximation at the mode, with Fisher's information.
+
+Heterogeneity: where a material's constant differs from building to building by a factor with spread tau, link i gets
+the further variance tau^2 sum_k (theta_k dm_i/dtheta_k)^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from calibray.inference.neighbours import Whitener, pairwise, whitener
+
+OFFSET_DB: Final = 10.0
+"""Standard deviation of an offset that was forgotten, as of cables and gains [dB]."""
+
+SHARES: Final = (0.4, 0.7, 0.95)
+"""Shares of the variance that neighbours have in common, where they have."""
+
+RANGES: Final = 4
+"""Ranges of correlation, from the distance of neighbours to a third of the campaign."""
+
+FREEDOMS: Final = (2.0, 4.0)
+"""Degrees of freedom of heavy-tailed noise."""
+
+SPREADS: Final = (0.07, 0.15, 0.3)
+"""Spreads of a material between buildings."""
+
+STEPS: Final = 25
+"""Steps to the mode of Student's t."""
+
+NEGLIGIBLE: Final = 1e-3
+"""Weight of a model below which it is left out."""
+
+GAUSSIAN, CORRELATED, HEAVY, DIFFERING = "gaussian", "correlated", "student-t", "heterogeneous"
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """One model of the errors.
+
+    Attributes:
+        kind: "gaussian", "correlated", "student-t" or "heterogeneous".
+        weight: Its weight before anything was measured.
+        offset: Whether a forgotten offset is part of it.
+        range_m: Range of correlation [m], if "correlated".
+        share: Share of the variance that neighbours have in common, if "correlated".
+        freedom: Degrees of freedom, if "student-t".
+        spread: Spread of a material between buildings, if "heterogeneous".
+    """
+
+    kind: str
+    weight: float
+    offset: bool = False
+    range_m: float = 0.0
+    share: float = 0.0
+    freedom: float = np.inf
+    spread: float = 0.0
+
+
+def noise_models(
+    position: NDArray[np.float64],
+    *,
+    kind: str | None = None,
+    range_m: float | None = None,
+    spread: float | None = None,
+    offset: bool = True,
+) -> tuple[NoiseModel, ...]:
+    """The models of noise that are tried, each kind with the same weight.
+
+    Args:
+        position: Where the links' ends stand [m, 3 or 6], [m].
+        kind: "gaussian" or "student-t" if it is known; both are tried if None.
+        range_m: Range of correlation [m], 0 for none; several are tried if None.
+        spread: Spread of materials between buildings, 0 for none; several are tried if None.
+        offset: Whether an offset may have been forgotten.
+
+    Returns:
+        The models; their weights add up to one.
+    """
+    found = []
+    if kind != HEAVY and not range_m and not spread:
+        found.append([NoiseModel(GAUSSIAN, 1.0)])
+    ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
+    if kind != HEAVY and ranges and not spread:
+        found.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
+    if kind != GAUSSIAN and not range_m and not spread:
+        found.append([NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS])
+    if kind != HEAVY and spread != 0 and not range_m:
+        found.append(
+            [NoiseModel(DIFFERING, 1.0, spread=s) for s in (SPREADS if spread is None else (spread,))]
+        )
+    choices = (False, True) if offset else (False,)
+    return tuple(
+        replace(model, weight=1.0 / (len(choices) * len(found) * len(group)), offset=extra)
+        for group in found
+        for model in group
+        for extra in choices
+    )
+
+
+def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
+    distance = pairwise(position)
+    np.fill_diagonal(distance, np.inf)
+    near = distance.min(axis=1)
+    near = near[near > 0]
+    distance[~np.isfinite(distance)] = 0.0
+    if len(near) < 3:
+        return ()
+    low, high = float(np.median(near)), float(distance.max()) / 3
+    return tuple(np.geomspace(low, max(high, 2 * low), RANGES).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """Density of the measurements given the parameters, under several models of the noise.
+
+    Attributes:
+        design: Columns of the nuisance, rows scaled as the gaps are [m, q].
+        ridge: Size of the noise over the standard deviations of their priors [q]; 0 where flat.
+        column: The column of a forgotten offset, scaled likewise [m].
+        noise_db: Size of the noise that priors and the spread of materials are stated against [dB].
+        models: The models.
+        whiteners: What makes the errors of a correlated model independent, by its range and share.
+    """
+
+    design: NDArray[np.float64]
+    ridge: NDArray[np.float64]
+    column: NDArray[np.float64]
+    noise_db: float
+    models: tuple[NoiseModel, ...]
+    whiteners: dict[tuple[float, float], Whitener]
+
+    @classmethod
+    def of(
+        cls,
+        design: NDArray[np.float64],
+        ridge: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        position: NDArray[np.float64],
+        noise_db: float,
+        models: Sequence[NoiseModel],
+    ) -> Marginal:
+        """Set up the models over some links.
+
+        Args:
+            design: Columns of the nuisance at the links, not scaled [m, q].
+            ridge: Size of the noise over the standard deviations of their priors [q]; 0 where flat.
+            scale: Roots of the links' weights, their mean square one [m].
+            position: Where the links' ends stand [m, 3 or 6], [m].
+            noise_db: Size of the noise, about [dB].
+            models: The models.
+
+        Returns:
+            The density.
+        """
+        places = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
+        made = {place: whitener(position, scale, *place) for place in sorted(places)}
+        return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), made)
+
+    @property
+    def needs_slopes(self) -> bool:
+        """Whether some model asks how the links depend on the parameters."""
+        return any(model.kind == DIFFERING for model in self.models)
+
+    def densities(
+        self, gap: NDArray[np.float64], sensitivity: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Logarithm of each model's weight times the density of the measurements.
+
+        Args:
+            gap: Measured minus modelled path loss, without the nuisance, times the roots of the weights [n, m], [dB].
+            sensitivity: Squares of the changes of path loss by relative changes of the constants, summed, times the
+                weights [n, m], [dB^2]; needed where a model `needs_slopes`.
+
+        Returns:
+            The logarithms [n, models]; -inf where a gap is not finite.
+
+        Raises:
+            ValueError: A model asks for the sensitivity, and it is not given.
+        """
+        found = np.full((len(gap), len(self.models)), -np.inf)
+        good = np.isfinite(gap).all(axis=1)
+        if not good.any():
+            return found
+        gap, white = gap[good], {}
+        for index, model in enumerate(self.models):
+            design, ridge = self._with_offset(model.offset)
+            if model.kind == HEAVY:
+                value = _student(gap, design, ridge / self.noise_db, model.freedom)
+            elif model.kind == DIFFERING:
+                if sensitivity is None:
+                    raise ValueError("a heterogeneous model needs the sensitivity")
+                weight = 1.0 / (1.0 + (model.spread / self.noise_db) ** 2 * sensitivity[good])
+                value = _weighted(gap, design, ridge, weight)
+            elif model.kind == CORRELATED:
+                place = (model.range_m, model.share)
+                filter_ = self.whiteners[place]
+                if place not in white:
+                    white[place] = filter_.apply(gap.T).T
+                value = _plain(white[place], filter_.apply(design), ridge) - 0.5 * filter_.log_determinant
+            else:
+                value = _plain(gap, design, ridge)
+            found[good, index] = value + np.log(model.weight)
+        return found
+
+    def reduced(self, densities: NDArray[np.float64]) -> Marginal:
+        """The same without the models that cannot matter.
+
+        Args:
+            densities: What `densities` gave for points that explain the data [n, models].
+
+        Returns:
+            The density under the others.
+        """
+        best = densities.max(axis=0)
+        kept = best - best.max() > np.log(NEGLIGIBLE)
+        return replace(
+            self, models=tuple(model for model, keep in zip(self.models, kept, strict=True) if keep)
+        )
+
+    def _with_offset(self, extra: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if not extra:
+            return self.design, self.ridge
+        return np.column_stack([self.design, self.column]), np.append(self.ridge, self.noise_db / OFFSET_DB)
+
+
+def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
+    half = 0.5 * freedom
+    return float(gammaln(half) - half * np.log(np.pi) - np.log(2.0) + np.log(ridge[ridge > 0]).sum())
+
+
+def _plain(
+    gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Log density of whitened Gaussian errors, nuisance and size integrated out [n]."""
+    freedom = gap.shape[1] - int((ridge == 0).sum())
+    square, log_root = np.sum(gap**2, axis=1), 0.0
+    if design.shape[1]:
+        factor = np.linalg.cholesky(_regular(design.T @ design + np.diag(ridge**2)))
+        square = square - np.sum(np.linalg.solve(factor, design.T @ gap.T) ** 2, axis=0)
+        log_root = float(np.log(np.diag(factor)).sum())
+    return _constant(freedom, ridge) - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
+
+
+def _weighted(
+    gap: NDArray[np.float64],
+    design: NDArray[np.float64],
+    ridge: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """The same with weights of the links that differ from point to point [n, m]."""
+    freedom = gap.shape[1] - int((ridge == 0).sum())
+    square, log_root = np.sum(weight * gap**2, axis=1), 0.0
+    if design.shape[1]:
+        matrix = _regular(_products(design, weight) + np.diag(ridge**2))
+        side = (weight * gap) @ design
+        square = square - np.einsum("nq,nq->n", side, np.linalg.solve(matrix, side[..., None])[..., 0])
+        log_root = 0.5 * np.linalg.slogdet(matrix)[1]
+    log_weight = 0.5 * np.log(weight).sum(axis=1)
+    return (
+        _constant(freedom, ridge) + log_weight - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
+    )
+
+
+def _student(
+    gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64], freedom: float
+) -> NDArray[np.float64]:
+    """Log density of errors of Student's t, by Laplace's approximation; the ridge is one over priors' spreads [n]."""
+    links, columns = gap.shape[1], design.shape[1]
+    scale = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
+    scale = np.maximum(scale, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
+    left, found = gap, np.zeros((len(gap), columns))
+    for _ in range(STEPS):
+        # K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881.
+        weight = (freedom + 1.0) / (freedom + (left / scale[:, None]) ** 2)
+        if columns:
+            matrix = _regular(_products(design, weight) + scale[:, None, None] ** 2 * np.diag(ridge**2))
+            found = np.linalg.solve(matrix, ((weight * gap) @ design)[..., None])[..., 0]
+            left = gap - found @ design.T
+        scale = np.sqrt(
+            np.sum(weight * left**2, axis=1) / np.sum(weight, axis=1)
+        )  # X.-L. Meng, D. van Dyk 1997
+        scale = np.maximum(scale, 1e-12)
+    each = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
+    value = links * (each - np.log(scale)) - 0.5 * (freedom + 1) * np.log1p(
+        (left / scale[:, None]) ** 2 / freedom
+    ).sum(axis=1)
+    value += np.sum(np.log(ridge[ridge > 0])) - 0.5 * np.sum((found * ridge) ** 2, axis=1)
+    value -= 0.5 * np.log(2 * np.pi) * int((ridge > 0).sum())
+    value += 0.5 * np.log(2 * np.pi) - 0.5 * np.log(2 * links * freedom / (freedom + 3))
+    if columns:
+        share = (freedom + 1) / (freedom + 3)
+        matrix = share * design.T @ design / scale[:, None, None] ** 2 + np.diag(ridge**2)
+        value += 0.5 * columns * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(_regular(matrix))[1]
+    return value
+
+
+def _products(design: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Design^T diag(weight) design for every row of weights [n, q, q]."""
+    links, columns = design.shape
+    outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
+    return (weight @ outer).reshape(-1, columns, columns)
+
+
+def _regular(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A little on the diagonal, for columns that others make up."""
+    size = matrix.shape[-1]
+    trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
+    return matrix + (1e-10 * trace / size + 1e-300) * np.eye(size)

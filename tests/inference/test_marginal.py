@@ -1,0 +1,127 @@
+"""Densities of the measurements against integrals by brute force, and what planted errors speak for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.special import logsumexp
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from calibray.inference.marginal import OFFSET_DB, Marginal, NoiseModel, noise_models
+from calibray.inference.neighbours import whitener
+
+RANDOM = np.random.default_rng(1)
+COUNT = 6
+POSITION = RANDOM.uniform(0, 100, (COUNT, 3))
+GAP = RANDOM.normal(0, 2, COUNT)
+SENSITIVITY = RANDOM.uniform(0, 200, COUNT)
+
+
+def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0) -> Marginal:
+    design = np.zeros((len(position), 0)) if design is None else design
+    ridge = np.zeros(design.shape[1]) if ridge is None else ridge
+    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models)
+
+
+def integral(log_density) -> float:
+    """Over the logarithm of the noise's size and one coefficient."""
+    size, coefficient = np.linspace(-2.5, 4, 261), np.linspace(-30, 30, 601)
+    value = log_density(coefficient[:, None, None], np.exp(size)[None, :, None])
+    return float(logsumexp(value) + np.log((size[1] - size[0]) * (coefficient[1] - coefficient[0])))
+
+
+@pytest.mark.parametrize(
+    ("model", "covariance"),
+    [
+        (NoiseModel("gaussian", 1.0), np.eye(COUNT)),
+        (
+            NoiseModel("correlated", 1.0, range_m=50.0, share=0.7),
+            0.7 * np.exp(-cdist(POSITION, POSITION) / 50) + 0.3 * np.eye(COUNT),
+        ),
+        (NoiseModel("heterogeneous", 1.0, spread=0.2), np.diag(1 + 0.01 * SENSITIVITY)),
+    ],
+)
+def test_gaussian_densities_are_the_integrals(model, covariance):
+    precision, determinant = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
+
+    def log_density(offset, size):
+        left = GAP - offset
+        square = np.einsum("...i,ij,...j->...", left, precision, left)
+        normal = COUNT * (np.log(size[..., 0]) + 0.5 * np.log(2 * np.pi)) + 0.5 * determinant
+        return -0.5 * square / size[..., 0] ** 2 - normal
+
+    found = marginal((model,), np.ones((COUNT, 1))).densities(GAP[None], SENSITIVITY[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
+
+
+def test_a_forgotten_offset_has_its_prior():
+    def log_density(offset, size):
+        prior = norm.logpdf(offset, 0, OFFSET_DB * size / 2.0)[..., 0]
+        return norm.logpdf(GAP, offset, size).sum(axis=-1) + prior
+
+    found = marginal((NoiseModel("gaussian", 1.0, offset=True),)).densities(GAP[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
+
+
+def test_student_is_near_its_integral():
+    def log_density(offset, size):
+        return (student.logpdf((GAP - offset) / size, 4) - np.log(size)).sum(axis=-1)
+
+    found = marginal((NoiseModel("student-t", 1.0, freedom=4.0),), np.ones((COUNT, 1))).densities(GAP[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=0.15)
+
+
+def test_neighbours_stand_for_all_where_links_are_many():
+    random = np.random.default_rng(0)
+    position, scale = random.uniform(0, 1000, (300, 3)), random.uniform(0.5, 2, 300)
+    exact, near = (whitener(position, scale, 80.0, 0.8, exact=exact) for exact in (300, 10))
+    errors = np.linalg.solve(exact.factor, random.standard_normal((300, 20)))
+    assert near.log_determinant == pytest.approx(exact.log_determinant, abs=1.0)
+    assert (near.apply(errors) ** 2).sum(axis=0) == pytest.approx(
+        (exact.apply(errors) ** 2).sum(axis=0), rel=0.01
+    )
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "correlated", "student-t", "heterogeneous"])
+def test_planted_errors_speak_for_their_kind(kind):
+    """Of 150 links; the kind planted gets the largest weight, and an offset is found where one was planted alone."""
+    random = np.random.default_rng(7)
+    position = random.uniform(0, 600, (150, 2))
+    sensitivity = random.choice([0.0, 400.0], 150)
+    errors = {
+        "gaussian": 3 * random.standard_normal(150),
+        "correlated": 3
+        * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
+        @ random.standard_normal(150),
+        "student-t": 3 * random.standard_t(2.5, 150),
+        "heterogeneous": np.sqrt(1 + 0.15**2 * sensitivity) * random.standard_normal(150),
+    }[kind]
+    models = noise_models(position)
+    assert sum(model.weight for model in models) == pytest.approx(1.0)
+    density = marginal(models, position=position, noise_db=2.0)
+
+    def weights(gap):
+        found = density.densities(gap[None], sensitivity[None])[0]
+        share = np.exp(found - logsumexp(found))
+        kinds = {model.kind: 0.0 for model in models}
+        for model, each in zip(models, share, strict=True):
+            kinds[model.kind] += each
+        return kinds, sum(each for model, each in zip(models, share, strict=True) if model.offset)
+
+    kinds, offset = weights(errors)
+    assert max(kinds, key=kinds.get) == kind
+    if kind == "gaussian":
+        assert offset < 0.5 < weights(errors + 4.0)[1]
+
+
+def test_what_a_study_states_is_not_tried():
+    def kinds(**stated):
+        return {model.kind for model in noise_models(POSITION, **stated)}
+
+    assert kinds(kind="gaussian", range_m=0.0, spread=0.0) == {"gaussian"}
+    assert kinds(kind="student-t") == {"student-t"}
+    assert {model.range_m for model in noise_models(POSITION, range_m=60.0)} == {60.0}
+    assert {model.spread for model in noise_models(POSITION, spread=0.2)} == {0.2}
+    assert not any(model.offset for model in noise_models(POSITION, offset=False))
