@@ -7,18 +7,17 @@ interaction; derivatives are differences.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 
-from calibray.fields import layout, material_table
-from calibray.fields.program import Formula, Group
+from calibray.fields import material_table
+from calibray.fields.diffraction import affine_form
 from calibray.materials import FIELDS
 from calibray.parameters import Parameters
-from calibray.paths import Paths
+from calibray.paths import Kind, Paths
 
 Complex = NDArray[np.complex128]
 
@@ -29,34 +28,6 @@ STEP: Final = 1e-6
 """Of a parameter's range, for differences."""
 
 _COLUMN: Final = {name: index for index, name in enumerate(FIELDS)}
-
-
-@dataclass(frozen=True)
-class _Group:
-    """A group of `calibray.fields.program` in complex numbers of NumPy."""
-
-    signature: str
-    tx: Complex
-    rx: Complex
-    rotation: NDArray[np.float64]
-    turn: list[Any]
-    wedge: list[Any]
-
-    @staticmethod
-    def of(group: Group) -> _Group:
-        return _Group(
-            group.signature,
-            _complex(group.tx),
-            _complex(group.rx),
-            np.asarray(group.rotation),
-            [None if turn is None else np.asarray(turn) for turn in group.turn],
-            [None if wedge is None else _complex(wedge) for wedge in group.wedge],
-        )
-
-
-def _complex(parts: Any) -> Complex:
-    """Real part, and imaginary part where there is one, as one array."""
-    return np.asarray(parts[0]) + 1j * (np.asarray(parts[1]) if len(parts) == 2 else 0.0)
 
 
 def _scatter(
@@ -89,17 +60,19 @@ class Direct:
 
     def __init__(self, paths: Paths, parameters: Parameters) -> None:
         self.paths, self.parameters = paths, parameters
-        plan = layout(paths)
-        # Tables are laid out only where they are asked for.
-        source = cast(Formula, plan.program.coefficients)
-        self._material, self._cosine, self._transmitted, self._raw = (
-            np.asarray(part) for part in (source.material, source.cosine, source.transmitted, source.raw)
-        )
-        self._groups = [_Group.of(group) for group in plan.program.groups]
-        self._positions = np.cumsum([0, *plan.program.positions])
-        self._link = paths.link[plan.order]
-        self._order = plan.order
-        self._diffuse = [np.asarray(part) for part in plan.program.diffuse[:3]]
+        faces = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
+        # Coefficients are numbered by interaction; those of the other faces of wedges follow.
+        self._material = np.concatenate([paths.material, paths.material[faces]])
+        self._cosine = np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
+        kind = np.concatenate([paths.kind, paths.kind[faces]])
+        self._transmitted, self._raw = kind == Kind.REFRACTION, kind == Kind.DIFFUSE
+        self._wedge = affine_form(paths.diffraction, np.arange(len(faces)), paths.frequency)
+        self._row = np.zeros(paths.num_interactions, dtype=np.int64)
+        for special in (Kind.DIFFUSE, Kind.DIFFRACTION):
+            at = paths.kind == special
+            self._row[at] = np.arange(at.sum())
+        self._groups = _by_kinds(paths)
+        self._scale = paths.spreading * speed_of_light / paths.frequency / (4.0 * np.pi)
         self._base = material_table(paths)
         self._rows, self._columns = parameters.indices(list(paths.materials))
 
@@ -114,9 +87,9 @@ class Direct:
         """
         rows = max(1, BLOCK // max(len(self._cosine), 1))
         blocks = [candidates[at : at + rows] for at in range(0, len(candidates), rows)]
-        power = np.concatenate([self._powers(block) for block in blocks])
+        power = np.concatenate([self.path_powers(block) for block in blocks])
         to_link = np.zeros((len(power), self.paths.num_links))
-        np.add.at(to_link.T, self._link, power.T)
+        np.add.at(to_link.T, self.paths.link, power.T)
         with np.errstate(divide="ignore"):
             return -10.0 * np.log10(to_link)
 
@@ -148,39 +121,41 @@ class Direct:
         Returns:
             Power gains in the order of the path program [n, P], [1].
         """
-        found = np.empty((len(candidates), self.paths.num_paths))
-        found[:, self._order] = self._powers(candidates)
-        return found
-
-    def _powers(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         tables = np.repeat(self._base[None], len(candidates), axis=0)
         tables[:, self._rows, self._columns] = candidates
         te, tm = self._coefficients(tables)
         scattered = self._scattered(tables)
-        parts, place, row = [], 0, 0
-        for group in self._groups:
-            a, b = (group.tx[None, :, component] for component in range(2))  # [1, T, p]
-            for step, letter in enumerate(group.signature):
-                cos, sin = group.rotation[step]
-                a, b = cos * a + sin * b, cos * b - sin * a
-                faces = []
-                for _ in range(2 if letter == "d" else 1):
-                    where = slice(self._positions[place], self._positions[place + 1])
-                    faces += [te[:, None, where], tm[:, None, where]]
-                    place += 1
-                if letter == "s":
-                    where = slice(row, row + a.shape[-1])
-                    a, b = _scatter(a, b, faces, scattered[:, None, where], group.turn[step])
-                    row = where.stop
-                elif letter == "d":
-                    a, b = _diffract(a, b, faces, group.wedge[step])
-                else:
-                    a, b = faces[0] * a, faces[1] * b
-            rx = np.conj(group.rx)[None, :, None]  # [1, R, 1, 2, p]
-            gain = rx[..., 0, :] * a[:, None] + rx[..., 1, :] * b[:, None]
-            power = (np.abs(gain) ** 2).sum(axis=(1, 2)) / len(group.tx)
-            parts.append(np.broadcast_to(power, (len(candidates), power.shape[-1])))
-        return np.concatenate(parts, axis=1)
+        found = np.empty((len(candidates), self.paths.num_paths))
+        for index, steps in self._groups:
+            found[:, index] = self._power(index, steps, te, tm, scattered)
+        return found
+
+    def _power(
+        self,
+        index: NDArray[np.int64],
+        steps: NDArray[np.int64],
+        te: Complex,
+        tm: Complex,
+        scattered: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Power gain of paths of one sequence of interactions [k, p], carried along all of them at once [n, p]."""
+        paths = self.paths
+        a, b = np.moveaxis(paths.tx_field[index], 0, -1).swapaxes(0, 1)[:, None]  # [1, T, p]
+        for at in steps:
+            cos, sin = paths.rotation[at].T
+            a, b = cos * a + sin * b, cos * b - sin * a
+            faces, kind, row = [te[:, None, at], tm[:, None, at]], paths.kind[at[0]], self._row[at]
+            if kind == Kind.DIFFUSE:
+                a, b = _scatter(a, b, faces, scattered[:, None, row], paths.diffuse.rotation[row].T)
+            elif kind == Kind.DIFFRACTION:
+                other = paths.num_interactions + row
+                faces += [te[:, None, other], tm[:, None, other]]
+                a, b = _diffract(a, b, faces, self._wedge[..., row])
+            else:
+                a, b = faces[0] * a, faces[1] * b
+        rx = np.conj(np.moveaxis(paths.rx_field[index], 0, -1))[None, :, None]  # [1, R, 1, 2, p]
+        gain = (rx[..., 0, :] * a[:, None] + rx[..., 1, :] * b[:, None]) * self._scale[index]
+        return (np.abs(gain) ** 2).sum(axis=(1, 2)) / paths.tx_field.shape[1]
 
     def _coefficients(self, tables: NDArray[np.float64]) -> tuple[Complex, Complex]:
         """Coefficients of reflection or transmission, transverse electric and magnetic [n, J] (ITU-R P.2040-3)."""
@@ -204,6 +179,18 @@ class Direct:
 
     def _scattered(self, tables: NDArray[np.float64]) -> NDArray[np.float64]:
         """S sqrt(f_s dOmega) of the diffuse interactions, by Lambert's law [n, D]."""
-        material, solid_angle, scattered = self._diffuse
-        scattering = tables[:, material.astype(np.int64), _COLUMN["scattering_coefficient"]]
-        return scattering * np.sqrt(np.maximum(scattered / np.pi * solid_angle, 0.0))
+        table, material = self.paths.diffuse, self.paths.material[self.paths.kind == Kind.DIFFUSE]
+        scattering = tables[:, material, _COLUMN["scattering_coefficient"]]
+        return scattering * np.sqrt(np.maximum(table.cos_scattered / np.pi * table.solid_angle, 0.0))
+
+
+def _by_kinds(paths: Paths) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Paths of the same sequence of kinds [p], and their interactions [k, p]."""
+    depth = np.diff(paths.first)
+    kinds = np.zeros((paths.num_paths, int(depth.max(initial=0))), dtype=np.int64)
+    for step in range(kinds.shape[1]):
+        deep = depth > step
+        kinds[deep, step] = paths.kind[paths.first[:-1][deep] + step]
+    sequences, owner = np.unique(kinds, axis=0, return_inverse=True)
+    index = [np.flatnonzero(owner.reshape(-1) == each) for each in range(len(sequences))]
+    return [(some, paths.first[some] + np.arange(depth[some[0]])[:, None]) for some in index]
