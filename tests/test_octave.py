@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.errors import EngineError
+from calibray.measurements import read_measurements
 from calibray.study import Study
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "octave_canyon"
@@ -53,3 +56,33 @@ def test_a_request_that_the_program_cannot_serve_is_refused_in_its_own_words():
     )
     with pytest.raises(EngineError, match="only isotropic antennas are programmed"):
         engines.make(study).path_loss(TRUTH)
+
+
+RAYS = """
+ray = @(tx, rx, loss, sight) struct('CoordinateSystem', 'Cartesian', 'TransmitterLocation', tx, ...
+    'ReceiverLocation', rx, 'PathLoss', loss, 'PhaseShift', 0.5, 'PropagationDelay', 1e-7, 'Frequency', 3.5e9, ...
+    'AngleOfDeparture', [10; -5], 'AngleOfArrival', [190; 5], 'LineOfSight', sight, 'NumInteractions', 2);
+tx = [0; 0; 10];
+near = [ray(tx, [30; 4; 1.5], 80, true); ray(tx, [30; 4; 1.5], 83, false)];
+rays = {near, [], ray(tx, [60; -4; 1.5], 95.25, false)};
+rays_to_links(rays, '%s');
+"""
+
+
+def test_rays_of_matlab_become_links(tmp_path):
+    """Two rays add their powers, a pair without a ray is no link, and the tables say where all of it lies."""
+    command = ["octave-cli", "--quiet", "--path", str(EXAMPLE.parent / "matlab"), "--eval", RAYS % tmp_path]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    links = read_measurements(
+        tmp_path / "links.csv",
+        [f"tx_{axis}" for axis in "xyz"],
+        [f"rx_{axis}" for axis in "xyz"],
+        "path_loss_db",
+    )
+    together = -10 * np.log10(10**-8.0 + 10**-8.3)
+    assert links.path_loss_db == pytest.approx([together, 95.25])
+    assert links.rx.tolist() == [[30, 4, 1.5], [60, -4, 1.5]]
+    paths = pd.read_csv(tmp_path / "paths.csv")
+    assert paths.interactions.tolist() == [0, 2, 2]
+    assert paths.receiver.tolist() == [1, 1, 3]
