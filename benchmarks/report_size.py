@@ -24,8 +24,11 @@ from made_up_report import made_up
 LIMIT_MB, LIMIT_S = 15.0, 5.0
 
 
-def opened(file: Path) -> float:
-    """Time [s] from asking for a page until a link is selected in it and the scene is drawn."""
+def opened(file: Path) -> tuple[float, float]:
+    """Time [s] from asking for a page until a link is selected in it and the scene is drawn.
+
+    First the wall's, which other work on the machine makes longer, then the processor's that the browser took.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -34,13 +37,21 @@ def opened(file: Path) -> float:
             args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
         )
         view = browser.new_page(viewport={"width": 1280, "height": 900})
+        counters = browser.new_browser_cdp_session()
+        before = _processor(counters)
         start = time.perf_counter()
         view.goto(file.as_uri())
         while not view.evaluate("document.documentElement.dataset.drawn"):
             time.sleep(0.01)
         taken = time.perf_counter() - start
+        spent = _processor(counters) - before
         browser.close()
-    return taken
+    return taken, spent
+
+
+def _processor(counters: object) -> float:
+    """Processor time [s] that all processes of the browser took so far, the one that draws in software included."""
+    return sum(each["cpuTime"] for each in counters.send("SystemInfo.getProcessInfo")["processInfo"])
 
 
 def main() -> None:
@@ -65,11 +76,12 @@ def main() -> None:
                 shutil.copy(file, options.keep)
             if shutil.which("chromium"):
                 taken.append(opened(file))
-                print(f"  opened in {taken[-1]:.2f} s")
+                print(f"  opened in {taken[-1][0]:.2f} s, {taken[-1][1]:.2f} s of the processor")
     print(f"size below {LIMIT_MB:g} MB: {size < LIMIT_MB}")
     if taken:
         print(
-            f"opened below {LIMIT_S:g} s: {taken[-1] < LIMIT_S}; {taken[-1] / taken[0]:.1f} times the small one"
+            f"opened below {LIMIT_S:g} s of the processor: {taken[-1][1] < LIMIT_S}; "
+            f"{taken[-1][1] / taken[0][1]:.1f} times the small one"
         )
 
 
