@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibray.calibration.certainty import Certainty
 from calibray.calibration.cheap import Aid
+from calibray.calibration.examining import examined
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
 from calibray.calibration.settle import largest
@@ -81,7 +82,8 @@ def outcome(
     offset_only, after = objective.model(np.stack([problem.before, best]))
     rival = log_distance(links, objective, study.scene.frequency)
     models = Models(objective.capped(problem.before), offset_only, after, rival)
-    terms = _terms(problem, offsets[0])
+    terms, paths = _terms(problem, offsets[0]), _traced(problem)
+    seen = examined(problem, trail.best, paths)
     table = pd.DataFrame(
         {
             "row": links.row,
@@ -94,6 +96,7 @@ def outcome(
             "retrace_gap_db": np.nan if gap is None else gap,
             **_places(links),
             **({"offset_only_db": offset_only} if fitted else {}),
+            **seen.columns,
         }
     )
     table = table.assign(**_as_measured(study, links, table))
@@ -126,7 +129,8 @@ def outcome(
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,
-        paths=_traced(problem),
+        paths=paths,
+        power_shares=seen.power_shares,
         prepared=links.prepared,
         nuisances={
             name: {label: value for label, value in values.items() if value is not None}

@@ -77,6 +77,8 @@ class Result:
         free_offset_db: The offset that would fit best beside a study without `[offset]`, [dB]; None where not tried.
         free_offset_error_db: Its standard error, [dB].
         remarks: What is to be said aloud of this calibration, a sentence each.
+        power_shares: Share of the links' power that paths with an interaction carry, by material and kind; "line of
+            sight" for those without.
         profile_calls: Replays that intervals and draws took, beside the RT calls of the method.
         profile_seconds: Time that these took [s].
         cheap_calls: Replays of the cheap model that the method had beside the engine; none of them is an RT call.
@@ -123,6 +125,7 @@ class Result:
     free_offset_db: float | None = None
     free_offset_error_db: float | None = None
     remarks: tuple[str, ...] = ()
+    power_shares: dict[str, dict[str, float]] = field(default_factory=dict)
     profile_calls: int = 0
     profile_seconds: float = 0.0
     cheap_calls: int = 0
@@ -146,6 +149,13 @@ class Result:
             "rows_with_enclosed_tx": None if self.enclosed is None else list(self.enclosed.tx),
             "rows_with_enclosed_rx": None if self.enclosed is None else list(self.enclosed.rx),
         }
+
+    @property
+    def diagnostics(self) -> dict[str, pd.DataFrame]:
+        """Residuals, leverage, power, trade-offs and neighbours as tables; see `calibray.result.diagnostics`."""
+        from calibray.result.diagnostics import diagnostics
+
+        return diagnostics(self)
 
     def __repr__(self) -> str:
         return glance.text(*summary(self))
@@ -220,6 +230,7 @@ class Result:
             "free_offset_db": self.free_offset_db,
             "free_offset_error_db": self.free_offset_error_db,
             "remarks": list(self.remarks),
+            "power_shares": self.power_shares,
             "profile_calls": self.profile_calls,
             "profile_seconds": self.profile_seconds,
             "cheap_calls": self.cheap_calls,

@@ -19,6 +19,9 @@ HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f",
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """The columns of each file, and the kinds of their numbers."""
 
+MAYBE: Final = ("leverage", "depth")
+"""Columns of numbers that are there where they could be known."""
+
 FIRST_NAMES: Final = {"result-links.csv": "links.csv", "result-history.csv": "history.csv"}
 """What the version before called the files."""
 
@@ -69,7 +72,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
             )
     if not len(table):
         raise InputError(f"{file}: has no rows; run the study again")
-    places = [column for column in table if str(column)[:3] in ("tx_", "rx_")]
+    places = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in MAYBE]
     if strange := [column for column in places if table[column].dtype.kind not in "if"]:
         raise InputError(
             f"{file}: column {strange[0]!r} holds something else than it should; run the study again"

@@ -82,6 +82,9 @@ class Stored(Section):
     free_offset_db: float | None = None
     free_offset_error_db: Error | None = None
     remarks: tuple[str, ...] = ()
+    power_shares: dict[str, dict[str, Annotated[float, Field(ge=0, le=1.000001)]]] = Field(
+        default_factory=dict
+    )
     profile_calls: Count = 0
     profile_seconds: Seconds = 0.0
     cheap_calls: Count = 0

@@ -53,11 +53,14 @@ def tables(result: Result) -> tuple[Table, ...]:
         result: The calibration.
 
     Returns:
-        Links, parameters and the reasons of their verdicts, nuisances if there are any, accuracy, remarks and cost.
+        Links, parameters and the reasons of their verdicts, nuisances if there are any, accuracy, remarks, diagnostics
+        and cost.
     """
+    from calibray.result.diagnostics import remarkable
+
     every = (
         links(result), parameters(result), reasons(result), offsets(result), accuracy(result), remarks(result),
-        costs(result),
+        remarkable(result), costs(result),
     )  # fmt: skip
     return tuple(table for table in every if table.rows)
 
