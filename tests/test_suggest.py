@@ -103,7 +103,7 @@ def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
 
 def test_intervals_are_expected_to_narrow_with_every_point(result, table):
     interval, width = result.intervals[NAME], cb.suggest(result, table, 6)[f"{NAME}_width"].to_numpy()
-    assert width[0] < 0.9 * (interval.upper - interval.lower)
+    assert width[-1] < 0.9 * (interval.upper - interval.lower)
     assert (np.diff(width) < 1e-9).all()
 
 
