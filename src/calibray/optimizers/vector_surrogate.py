@@ -4,7 +4,8 @@ The objective is a sum over links, and an evaluation that answers with every lin
 than their sum. Residuals are smoother than the objective formed from them, and tens of them share one
 dependence on the parameters (see `kriging.py` for the model).
 
-A run begins with a maximin Latin hypercube. Then three steps take turns on a model refitted after every batch:
+A run begins with a maximin Latin hypercube: of few points where there are many parameters, since residuals can be
+modelled as soon as a plane can be laid through them. Then three steps take turns on a model refitted after every batch:
 
 - *exploration*: the point of the largest expected improvement of the mean square of the residuals, over
   draws from the model: R. Astudillo, P. Frazier, ICML 2019. A normal distribution of the mean square
@@ -19,8 +20,11 @@ Input scales are learned anew at every step until there are `OFTEN` points, and 
 number by a tenth; in between the model only takes new points, which saves most of the time. Tried and not kept,
 on analytic and traced districts: a square root or a logarithm of permittivities (`logarithmic` helped with
 reflections and hurt with walls that waves pass through), a Matern kernel of smoothness 7/2, local searches begun
-from the best of hundreds of predictions, and steps from the best points shortened as uncertainty grows (a trust
-region, on eight parameters: most of the excess left is other minima, not unfinished descents).
+from the best of hundreds of predictions, exploration by a model of the objective wherever that foretells points that
+are left out better (on resonating panes 0.018 dB after 120 calls instead of 0.004), an initial design of d + 2 or
+d + 4 points for three parameters (it starts in another basin more often), and steps from the best points shortened as
+uncertainty grows (a trust region, on eight parameters: most of the excess left is other minima, not unfinished
+descents).
 
 In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
@@ -45,6 +49,9 @@ from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
+
+FIRST = 5
+"""Points of the initial design beyond the number of parameters, at most."""
 
 CANDIDATES = 600
 """Drawn over the box, and as many around the best points."""
@@ -80,7 +87,8 @@ class VectorSurrogate(Optimizer):
         upper: Upper bounds [d].
         seed: Seed of the one random generator.
         budget: Number of evaluations, 20 d if None.
-        initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
+        initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None; points told before the first
+            `ask` count.
         batch: Candidates asked for at once after the initial design, for engines that run in parallel.
         logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
@@ -124,7 +132,9 @@ class VectorSurrogate(Optimizer):
         self.box = Box.between(lower, upper)
         d = self.box.dimension
         self._budget = 20 * d if budget is None else whole("budget", budget, at_least=1)
-        self.initial = 2 * (d + 1) if initial is None else whole("initial", initial, at_least=d + 2)
+        self.initial = (
+            min(2 * (d + 1), d + FIRST) if initial is None else whole("initial", initial, at_least=d + 2)
+        )
         self.batch = whole("batch", batch, at_least=1)
         self.noisy = noisy
         self.tolerance = None if tolerance is None else real("tolerance", tolerance, at_least=0.0)
