@@ -133,13 +133,13 @@ def test_a_log_is_joined_with_its_track(tmp_path):
     joined, lost = joined_by_time(log, track, "time")
     # Ten to forty is a gap of 30 s, longer than the 10 s allowed; the last row has no time.
     assert lost == 2
-    np.testing.assert_allclose(joined[["longitude", "latitude"]], [[11.0, 48.0], [11.1, 48.05]])
+    np.testing.assert_allclose(joined[["track_longitude", "track_latitude"]], [[11.0, 48.0], [11.1, 48.05]])
     assert joined["rsrp"].tolist() == [-80.0, -81.0]
-    assert joined["height"].tolist() == [520.0, 520.0]
+    assert joined["track_height"].tolist() == [520.0, 520.0]
     assert joined_by_time(log, track, "time", longest_gap=30.0)[1] == 1
     seconds = pd.DataFrame({"time": [pd.Timestamp("2026-05-01T10:00:08Z").timestamp()]})
     late, _ = joined_by_time(seconds, track, "time", clock=3.0)
-    np.testing.assert_allclose(late["longitude"], [11.1])
+    np.testing.assert_allclose(late["track_longitude"], [11.1])
 
 
 def test_a_track_across_the_date_line(tmp_path):
@@ -147,8 +147,8 @@ def test_a_track_across_the_date_line(tmp_path):
     path.write_text(gpx(point(179.9, 0, 0) + point(-179.9, 0, 10)))
     log = pd.DataFrame({"time": ["2026-05-01T10:00:05Z", "2026-05-01T10:00:10Z"]})
     joined, _ = joined_by_time(log, read_track(path), "time")
-    np.testing.assert_allclose(np.abs(joined["longitude"]), [180.0, 179.9])
-    assert joined["height"].isna().all()
+    np.testing.assert_allclose(np.abs(joined["track_longitude"]), [180.0, 179.9])
+    assert joined["track_height"].isna().all()
 
 
 @pytest.mark.parametrize(

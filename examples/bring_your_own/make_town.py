@@ -10,26 +10,22 @@ calibration gets to see. Numbers come from one seed: the same script writes the 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pandas as pd
 
 from calibray.coordinates import Frame
-from calibray.fields import path_gains
 from calibray.scenes.making import make_scene
 from calibray.scenes.openstreetmap import read_openstreetmap
-from calibray.tracing.factory import trace
+from synthetic import amplitudes, sample
 
 HERE = Path(__file__).parent
 SEED = 12
 FRAME = Frame.local(9.99, 50.01)
 FREQUENCY = 3.6e9  # [Hz]
-ANTENNA = {"pattern": "iso", "polarization": "V"}
 DEPTH = 3
 
 WALLS = {"relative_permittivity": 6.6, "conductivity": 0.12}
@@ -87,25 +83,20 @@ def stops() -> np.ndarray:
     return np.array(east + north, dtype=float)
 
 
+def stopped(scene: Path) -> tuple[np.ndarray, list[list[np.ndarray]]]:
+    """The stops [n, 3], [m], and the amplitudes of the paths from every mast to each."""
+    places = np.column_stack([stops(), np.full(len(stops()), PHONE_HEIGHT)])
+    planted = {"walls": WALLS, "ground": GROUND}
+    masts = list(MASTS.values())
+    return places, amplitudes(scene, masts, places, FREQUENCY, planted, max_depth=DEPTH, samples=500_000)
+
+
 def measure(extract: Path, rng: np.random.Generator) -> pd.DataFrame:
     """Carry the phones through the town."""
-    places = np.column_stack([stops(), np.full(len(stops()), PHONE_HEIGHT)])
     with TemporaryDirectory() as folder:
         found, frame = read_openstreetmap(extract, FRAME)
         made = make_scene(found, Path(folder), frame)
-        links = SimpleNamespace(
-            tx=np.repeat(list(MASTS.values()), len(places), axis=0), rx=np.tile(places, (len(MASTS), 1))
-        )
-        paths = trace(
-            made.path, links, frequency=FREQUENCY, max_depth=DEPTH, samples=500_000, tx_antenna=ANTENNA,
-            rx_antenna=ANTENNA,
-        )  # fmt: skip
-    truth = {
-        **paths.materials,
-        "walls": replace(paths.materials["walls"], **WALLS),
-        "ground": replace(paths.materials["ground"], **GROUND),
-    }
-    gains = np.abs(path_gains(paths, truth))
+        places, gains = stopped(made.path)
     rows = []
     clock = pd.Timestamp("2026-05-04T09:00:00Z")
     for stop, place in enumerate(places):
@@ -115,10 +106,7 @@ def measure(extract: Path, rng: np.random.Generator) -> pd.DataFrame:
             for _ in range(SAMPLES):
                 clock += pd.Timedelta(seconds=1)
                 for number, (cell, eirp) in enumerate(EIRP_DBM.items()):
-                    here = gains[paths.link == number * len(places) + stop]
-                    # From sample to sample the phone moves by wavelengths: the phases of the paths are free.
-                    field = (here * np.exp(2j * np.pi * rng.uniform(size=len(here)))).sum()
-                    rsrp = eirp + gain_db + 20 * np.log10(max(abs(field), 1e-12))
+                    rsrp = sample(gains[number][stop], eirp + gain_db, rng)
                     heard = round(rsrp, 1) if rsrp > FLOOR_DBM else None
                     rows.append(
                         (clock.isoformat(), phone, f"{longitude:.7f}", f"{latitude:.7f}", cell, heard)

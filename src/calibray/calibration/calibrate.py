@@ -9,6 +9,7 @@ from pathlib import Path
 from calibray import engines
 from calibray.calibration.certainty import certainty
 from calibray.calibration.cheap import aid
+from calibray.calibration.heard import heard
 from calibray.calibration.methods import check_fit, check_method, choose
 from calibray.calibration.outcome import outcome
 from calibray.calibration.problem import Problem
@@ -81,7 +82,7 @@ def calibrate(
     # Before anything is calibrated on them; a ready engine may stand where no ray tracer can be loaded.
     enclosed = setup.enclosed if looked_for else None
     traced = time.perf_counter()
-    problem = weighed(problem, progress)
+    problem = weighed(heard(problem, progress), progress)
     paused = time.perf_counter()
     helper = aid(problem, progress)
     traced += time.perf_counter() - paused

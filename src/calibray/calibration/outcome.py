@@ -31,6 +31,10 @@ FEWEST: Final = 8
 """Links held out that a scale of residuals can be taken from."""
 
 
+FAINT: Final = "expected too near the noise floor, left out"
+"""What links are counted as that the model expects near the noise floor."""
+
+
 @dataclass(frozen=True, eq=False)
 class Models:
     """Path loss by each model at all links [L], [dB].
@@ -94,6 +98,7 @@ def outcome(
             "has_path": np.isfinite(problem.before) & np.isfinite(best),
             "held_out": setup.held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
+            **({} if problem.faint is None else {"faint": problem.faint}),
             **_places(links),
             **({"offset_only_db": offset_only} if fitted else {}),
             **seen.columns,
@@ -129,9 +134,9 @@ def outcome(
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,
-        paths=paths,
+paths=paths,
         power_shares=seen.power_shares,
-        prepared=links.prepared,
+        prepared=links.prepared | ({} if problem.faint is None else {FAINT: int(problem.faint.sum())}),
         nuisances={
             name: {label: value for label, value in values.items() if value is not None}
             for name, values in terms.items()

@@ -58,6 +58,7 @@ class Problem:
         before: What the engine answers to the values before calibration [L].
         observable: What is measured and modelled.
         priors: What is known of the parameters beforehand.
+        faint: Links left out because the model expects them near the noise floor [L]; None where none is.
     """
 
     setup: Setup
@@ -66,6 +67,7 @@ class Problem:
     before: NDArray[np.float64]
     observable: Observable = PATH_LOSS
     priors: LogNormal = NO_PRIOR
+    faint: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray import engines
+from calibray.calibration.heard import heard
 from calibray.calibration.methods import local_searches
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import rounds
@@ -78,7 +79,7 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = weighed(Problem.of(setup, engines.make(setup, progress=progress)))
+    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress))))
     return validated(problem, blocks, by, progress)
 
 

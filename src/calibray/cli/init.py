@@ -26,6 +26,9 @@ def init(
     transmitters: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Table of the transmitters' positions.")
     ] = None,
+    track: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="GPX track that tells where each row was measured.")
+    ] = None,
     tx: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene's frame [m].")
     ] = None,
@@ -46,9 +49,9 @@ def init(
 
     if out.exists() or out.is_symlink():
         raise InputError(f"{out}: is there already; name another file with --out, or remove it")
-    inputs = [links, *([transmitters] if transmitters else [])]
+    inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
-    found = draft(scene, links, out, transmitters, frequency, None if tx is None else _position(tx))
+    found = draft(scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track)
     measured = found.study.measurements()
     typer.echo(render(assumed(found)))
     counts = [f"{number} {what}" for what, number in measured.prepared.items()]

@@ -4,7 +4,7 @@ Positions are metres in the scene's frame once rows are links; `preparation` mak
 """
 
 from calibray.measurements.links import FREQUENCIES, Measurements
-from calibray.measurements.preparation import Averaging, Coordinates, Preparation
+from calibray.measurements.preparation import Averaging, Coordinates, Preparation, Track
 from calibray.measurements.reading import (
     LINK_COLUMNS,
     Quantity,
@@ -22,6 +22,7 @@ __all__ = [
     "Measurements",
     "Preparation",
     "Quantity",
+    "Track",
     "links_from_frame",
     "measured_links",
     "read_links",

@@ -4,6 +4,9 @@ Samples along a street fade by several dB within a wavelength, which ray tracing
 tells is the mean power over some tens of wavelengths (Lee, "Estimate of local average power of a mobile radio signal",
 IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). That mean is taken of powers, not of decibels:
 for Rayleigh fading the mean of the decibels lies 2.5 dB too low.
+
+The logarithm of a mean of few samples lies too low as well, by (10 / ln 10) var / (2 n mean^2) to second order (delta
+method): 0.2 dB for ten samples of Rayleigh fading, and nothing where there is one path.
 """
 
 from __future__ import annotations
@@ -125,8 +128,8 @@ def averaged(
 
     Returns:
         One row a label and combination, in the order of their first sample: the kept columns, the mean coordinates,
-        the value [dB], its `std_db`, the standard deviation of the samples in decibels (NaN of one sample), and their
-        `count`.
+        the value [dB], its `std_db`, the standard deviation of the samples in decibels (NaN of one sample), their
+        `count`, and `low_db`, by how much the logarithm of their mean lies too low on average (0 of one sample).
 
     Raises:
         InputError: There is no row, a column is missing or holds no number, or there are not as many labels as rows.
@@ -134,7 +137,7 @@ def averaged(
     Example:
         >>> rows = pd.DataFrame({"rx_x": [0.0, 1.0], "rx_y": [0.0, 0.0], "power": [-80.0, -90.0]})
         >>> averaged(rows, "power", np.array([0, 0]), "power").round(3).to_dict("records")
-        [{'rx_x': 0.5, 'rx_y': 0.0, 'power': -82.596, 'std_db': 7.071, 'count': 2}]
+        [{'rx_x': 0.5, 'rx_y': 0.0, 'power': -82.596, 'std_db': 7.071, 'count': 2, 'low_db': 1.454}]
     """
     table = SourceTable(rows, source="samples")
     if not len(rows) or np.shape(label) != (len(rows),):
@@ -151,10 +154,12 @@ def averaged(
     samples["label"] = label
     groups = samples.groupby([*keep, "label"], sort=False, dropna=False)
     mean: pd.DataFrame = groups[[*coordinates, "linear"]].mean()  # type: ignore[assignment]
-    power = 10 * np.log10(mean.pop("linear")) + levels.max()
+    linear, count = mean.pop("linear"), groups.size()
+    power = 10 * np.log10(linear) + levels.max()
     mean[value] = power if sense == "power" else -power
     mean["std_db"] = groups["level"].std()
-    mean["count"] = groups.size()
+    mean["count"] = count
+    mean["low_db"] = (5 / np.log(10) * groups["linear"].var() / (count * linear**2)).fillna(0.0)
     return mean.reset_index().drop(columns="label")
 
 

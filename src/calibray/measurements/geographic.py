@@ -137,7 +137,8 @@ def joined_by_time(
         clock: How much the log's clock is ahead of the track's [s].
 
     Returns:
-        The rows that have a position, with the columns longitude, latitude and height; and how many had none.
+        The rows that have a position, with the columns track_longitude, track_latitude and track_height; and how many
+        had none.
 
     Raises:
         InputError: There is no such column, a time cannot be read, or no row has a position.
@@ -170,9 +171,9 @@ def joined_by_time(
     # Longitudes count on across 180 degrees.
     east = np.unwrap(track["longitude"].to_numpy(dtype=float), period=360.0)
     found = {
-        "longitude": (np.interp(seconds[here], points, east) + 180) % 360 - 180,
-        "latitude": np.interp(seconds[here], points, track["latitude"]),
-        "height": np.interp(seconds[here], points, track["height"]),
+        "track_longitude": (np.interp(seconds[here], points, east) + 180) % 360 - 180,
+        "track_latitude": np.interp(seconds[here], points, track["latitude"]),
+        "track_height": np.interp(seconds[here], points, track["height"]),
     }
     return log.loc[here].assign(**found).reset_index(drop=True), int((~here).sum())
 

@@ -48,6 +48,7 @@ _OTHER: Final = frozenset(
     }
 )
 _GROUPS: Final = frozenset({"device", "phone", "ue", "receiver", "rx", "handset"})
+_TIME: Final = frozenset({"time", "timestamp", "date", "datetime", "utc", "epoch"})
 _NAMES: Final = frozenset({"id", "name", "transmitter", *ENDS["tx"]})
 
 
@@ -294,6 +295,22 @@ def frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
             if FREQUENCIES[0] <= np.nanmin(carrier) and np.nanmax(carrier) <= FREQUENCIES[1]:
                 return name, carrier
     return None
+
+
+def time(frame: pd.DataFrame) -> str | None:
+    """The column of times, or None.
+
+    Args:
+        frame: The links.
+
+    Returns:
+        The first column called like one.
+
+    Example:
+        >>> time(pd.DataFrame({"power": [-70.0], "UTC time": ["2026-05-04T09:00:00Z"]}))
+        'UTC time'
+    """
+    return next((str(name) for name in frame if words(name) & _TIME), None)
 
 
 def distance(frame: pd.DataFrame) -> str | None:

@@ -37,6 +37,8 @@ class Measurements:
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
         group: Labels [links] of the group each link belongs to, or None.
         frequency: Carrier of each link [links], [Hz], or None where all have the study's.
+        limit_db: Path loss [links], [dB], beyond which a link could not have been measured, or None where none is
+            known.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
         prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
@@ -58,6 +60,7 @@ class Measurements:
     weight: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]
     group: NDArray[np.str_] | None = None
     frequency: NDArray[np.float64] | None = None
+    limit_db: NDArray[np.float64] | None = None
     table: SourceTable = field(default=None)  # type: ignore[assignment]
     prepared: dict[str, int] = field(default_factory=dict)
 
@@ -77,6 +80,8 @@ class Measurements:
             set_field(self, "group", _array("group", self.group, (count,), np.str_))
         if self.frequency is not None:
             set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
+        if self.limit_db is not None:
+            set_field(self, "limit_db", _array("limit_db", self.limit_db, (count,)))
         if self.table is None:
             set_field(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
@@ -160,6 +165,7 @@ class Measurements:
             weight=self.weight[chosen],
             group=None if self.group is None else self.group[chosen],
             frequency=None if self.frequency is None else self.frequency[chosen],
+            limit_db=None if self.limit_db is None else self.limit_db[chosen],
             table=self.table.select(chosen),
             prepared=self.prepared,
         )

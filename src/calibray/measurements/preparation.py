@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements.aggregation import Sense, averaged, by_cell, by_distance, by_time
-from calibray.measurements.geographic import with_scene_positions
+from calibray.measurements.geographic import Ground, joined_by_time, read_track, with_scene_positions
 from calibray.measurements.powers import long_table, marked_censored, with_transmitters
 from calibray.measurements.tables import SourceTable, read_table
 from calibray.spelling import shortened
@@ -31,6 +31,9 @@ MOST_UNHEARD_DB: Final = 1.0
 PREPARED: Final = {end: tuple(f"{end}_{axis}" for axis in "xyz") for end in ("tx", "rx")}
 """The columns of positions in the scene's metres that preparation writes."""
 
+TRACKED: Final = ("track_longitude", "track_latitude")
+"""The columns of a row's position on a track [deg]."""
+
 Inside = Literal["drop", "move"]
 Way = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Positions [n, 3] to positions outside of buildings, NaN where given up, and how far each was moved [n], [m]."""
@@ -44,11 +47,30 @@ class Averaging:
         by: "cell" of a square grid, stretch of "distance", or window of "time".
         size: Its width or length [m], or duration [s].
         time: Column of times, for "time".
+        unbiased: Whether what the logarithm of a mean of few samples lies too low by is added.
     """
 
     by: Literal["cell", "distance", "time"]
     size: float
     time: str | None = None
+    unbiased: bool = False
+
+
+@dataclass(frozen=True)
+class Track:
+    """A track that tells where rows were measured.
+
+    Attributes:
+        file: GPX file.
+        time: Column of the rows' times.
+        longest_gap: Rows between two points further apart than this are left out [s].
+        clock: How much the rows' clock is ahead of the track's [s].
+    """
+
+    file: str
+    time: str
+    longest_gap: float = 10.0
+    clock: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -58,6 +80,8 @@ class Preparation:
     Attributes:
         wide: Name of the transmitter by column, of a table with one column a transmitter.
         where: Row filter.
+        track: Track that gives each row the columns `TRACKED` [deg].
+        ground: Height of the ground, if heights are above it.
         transmitters: File with a row for every transmitter, whose columns each link gets.
         transmitter: Column, of both tables, that says which transmitter it is.
         frame: Where the scene lies on the globe, for positions as longitude, latitude and height; None for metres.
@@ -70,6 +94,8 @@ class Preparation:
 
     wide: Mapping[str, str] = field(default_factory=dict)
     where: str | None = None
+    track: Track | None = None
+    ground: Ground | None = None
     transmitters: str | None = None
     transmitter: str = "transmitter"
     frame: Frame | None = None
@@ -82,9 +108,16 @@ class Preparation:
     @property
     def idle(self) -> bool:
         """Whether rows are links as they are, but for the filter."""
-        return not (self.wide or self.transmitters or self.frame or self.averaging or self.inside) and (
-            self.noise_floor_dbm is None
+        steps = (
+            self.wide,
+            self.track,
+            self.ground,
+            self.transmitters,
+            self.frame,
+            self.averaging,
+            self.inside,
         )
+        return not any(steps) and self.noise_floor_dbm is None
 
 
 @dataclass(frozen=True)
@@ -114,10 +147,10 @@ def prepare(
 ) -> Prepared:
     """Make links of the rows of a table.
 
-    The order is: transmitters in columns, the filter, the transmitters' positions, the noise floor, positions on the
-    globe, averages, positions inside buildings. An average holds the samples not heard at half of the floor, between
-    nothing and the floor itself; where that leaves it open by more than 1 dB it is left out, because those heard would
-    only be the strong ones.
+    The order is: transmitters in columns, the track, the filter, the transmitters' positions, the noise floor,
+    positions on the globe, averages, positions inside buildings. An average holds the samples not heard at half of the
+    floor, between nothing and the floor itself; where that leaves it open by more than 1 dB it is left out, because
+    those heard would only be the strong ones.
 
     Args:
         table: The rows.
@@ -136,10 +169,12 @@ def prepare(
     counts: dict[str, int] = {}
     if steps.wide:
         table = _long(table, steps, value, counts)
+    if steps.track is not None:
+        table = tracked(table, steps.track, counts)
     if steps.where is not None:
         table = _passed(table, steps.where)
     if steps.idle:
-        return Prepared(table, tx, rx, {})
+        return Prepared(table, tx, rx, counts)
     if steps.transmitters is not None:
         table = _with_transmitters(table, steps)
     unheard = np.zeros(len(table), dtype=bool)
@@ -149,7 +184,7 @@ def prepare(
         table = SourceTable(marked, table.row, table.source)
         if steps.averaging is None:
             table = _kept(table, ~unheard, "at or below the noise floor, left out", counts)
-    table, tx, rx = _placed(table, steps.frame, tx, rx)
+    table, tx, rx = _placed(table, steps, tx, rx)
     if steps.averaging is not None:
         table = _averaged(table, steps, steps.averaging, unheard, (tx, rx), value, sense, counts)
     if steps.inside is not None and steps.outside is not None:
@@ -200,6 +235,32 @@ def _long(table: SourceTable, steps: Preparation, value: str, counts: dict[str, 
     return SourceTable(long, row, table.source)
 
 
+def tracked(table: SourceTable, track: Track, counts: dict[str, int]) -> SourceTable:
+    """Rows with the positions of a track.
+
+    Args:
+        table: The rows.
+        track: The track.
+        counts: Gets how many rows were left out, if any.
+
+    Returns:
+        The rows at times that the track covers, with the columns `TRACKED`. Altitudes are not taken: those of
+        satellite receivers are metres off.
+
+    Raises:
+        InputError: The track cannot be read, a time cannot, or no row lies on it.
+    """
+    rows = table.frame.assign(**{_ROW: table.row})
+    try:
+        found, lost = joined_by_time(rows, read_track(track.file), track.time, track.longest_gap, track.clock)
+    except InputError as error:
+        raise InputError(f"{table.source} with {track.file}: {error}") from None
+    if lost:
+        counts["rows at no time of the track, left out"] = lost
+    row = found.pop(_ROW).to_numpy(dtype=np.int64)
+    return SourceTable(found.drop(columns="track_height"), row, table.source)
+
+
 def _passed(table: SourceTable, where: str) -> SourceTable:
     mask = table.where(where)
     if not mask.any():
@@ -231,18 +292,21 @@ def _with_transmitters(table: SourceTable, steps: Preparation) -> SourceTable:
 
 
 def _placed(
-    table: SourceTable, frame: Frame | None, tx: Coordinates, rx: Coordinates
+    table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
     """The positions of both ends as columns of metres."""
     rows = table.frame
     for end, place in (("tx", tx), ("rx", rx)):
-        if frame is not None:
-            try:
-                rows = with_scene_positions(rows, end, frame, place[0], place[1], place[2])
-            except InputError as error:
-                raise InputError(f"{table.source}: {end}: {error}") from None
-        else:
-            rows = rows.assign(**dict(zip(PREPARED[end], positions(table, end, place).T, strict=True)))
+        try:
+            if steps.frame is not None:
+                rows = with_scene_positions(rows, end, steps.frame, *place, ground=steps.ground)
+                continue
+            position = positions(table, end, place)
+            if steps.ground is not None:
+                position[:, 2] += steps.ground(position[:, 0], position[:, 1])
+        except InputError as error:
+            raise InputError(f"{table.source}: {end}: {error}") from None
+        rows = rows.assign(**dict(zip(PREPARED[end], position.T, strict=True)))
     return SourceTable(rows, table.row, table.source), PREPARED["tx"], PREPARED["rx"]
 
 
@@ -263,23 +327,21 @@ def _averaged(
     keep = [*steps.keep, *known, *tx]
     mean = averaged(rows, value, label, sense, keep, [*map(str, place[1]), _UNHEARD])
     first = ~rows[keep].assign(**{_ROW: label}).duplicated().to_numpy()
-    joined = table.frame.loc[first].reset_index(drop=True)
-    filled = {str(name): mean[name].to_numpy() for name in (value, *place[1], "std_db", "count")}
-    joined = joined.assign(**filled)
-    share = mean[_UNHEARD].to_numpy()
-    made = SourceTable(joined, table.row[first], table.source)
+    named = {str(name): mean[name].to_numpy() for name in (value, *place[1], "std_db", "count")}
+    low = mean["low_db"].to_numpy() if averaging.unbiased else np.zeros(len(mean))
+    faint = np.zeros(len(mean), dtype=bool)
     counts["samples averaged"] = len(table)
-    if steps.noise_floor_dbm is None or not unheard.any():
-        return made
-    counts["of them at or below the noise floor"] = int(unheard.sum())
-    # Powers: with the samples not heard at the floor itself, and what they are of it.
-    most = 10 ** (joined[value].to_numpy(dtype=float) / 10)
-    theirs = share * 10 ** (steps.noise_floor_dbm / 10)
-    least = np.maximum(most - theirs, 0.0)
-    open_ = most > least * 10 ** (MOST_UNHEARD_DB / 10)
-    with np.errstate(divide="ignore"):
-        joined[value] = 10 * np.log10(most - theirs / 2)
-    return _kept(made, ~open_, "averages too near the noise floor, left out", counts)
+    if steps.noise_floor_dbm is not None and unheard.any():
+        counts["of them at or below the noise floor"] = int(unheard.sum())
+        # Powers: with the samples not heard at the floor itself, and what they are of it.
+        most = 10 ** (named[value].astype(float) / 10)
+        theirs = mean[_UNHEARD].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
+        faint = most > np.maximum(most - theirs, 0.0) * 10 ** (MOST_UNHEARD_DB / 10)
+        named[value] = 10 * np.log10(most - theirs / 2)
+    named[value] = named[value] + (low if sense == "power" else -low)
+    joined = table.frame.loc[first].reset_index(drop=True).assign(**named)
+    made = SourceTable(joined, table.row[first], table.source)
+    return _kept(made, ~faint, "averages too near the noise floor, left out", counts)
 
 
 def _labels(rows: pd.DataFrame, averaging: Averaging) -> NDArray[np.int64]:

@@ -113,6 +113,10 @@ def measured_links(
         table, steps or Preparation(), tx, rx, value, "loss" if quantity == "path_loss" else "power"
     )
     table = made.table
+    limit = None
+    if steps is not None and steps.noise_floor_dbm is not None:
+        sent = 0.0 if tx_power_dbm is None else _number_or_column(table, tx_power_dbm)
+        limit = np.full(len(table), sent - steps.noise_floor_dbm)
     measurements = Measurements(
         tx=positions(table, "tx", made.tx),
         rx=positions(table, "rx", made.rx),
@@ -120,6 +124,7 @@ def measured_links(
         weight=_weights(table, weight, std),
         group=None if group is None else group_labels(table, group),
         frequency=None if frequency is None else table.numbers(frequency),
+        limit_db=limit,
         table=table,
         prepared=made.counts,
     )

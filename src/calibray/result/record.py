@@ -61,8 +61,9 @@ class Result:
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
             whether a path leads there, whether it was held out, and its own change on tracing again; then the positions
             tx_x to rx_z [m], the group and the carrier [Hz] where links have them, path loss with the offsets alone
-            [dB] where there are any, and, where not path loss was measured, the three values as what was. Results of
-            the version before lack what follows the change.
+            [dB] where there are any, and, where not path loss was measured, the three values as what was. Where the
+            model expects some too near the noise floor, `faint` says which. Results of the version before lack what
+            follows the change.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         laws: How calibrated constants follow the frequency: the coefficients itu_a to itu_d of ITU-R P.2040's law, by
             material of which one is a parameter.
@@ -142,6 +143,8 @@ class Result:
         has_path = self.links["has_path"].to_numpy(bool)
         held_out = self.links["held_out"].to_numpy(bool)
         usable = has_path | (self.study.objective.no_path == "censor")
+        if "faint" in self.links:
+            usable &= ~self.links["faint"].to_numpy(bool)
         return {
             "calibrated_on": int((~held_out & usable).sum()),
             "held_out": int((held_out & usable).sum()),

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibray.errors import InputError
 from calibray.extras import library
 from calibray.scenes.diagnosis import read_meshes
 from calibray.scenes.source import find_scene
@@ -104,6 +105,37 @@ class Overhead:
         place = np.asarray(points, dtype=float).reshape(-1, 3)[:, :2]
         low, high = self.bounds[:2] - margin, self.bounds[3:5] + margin
         return np.asarray(((place < low) | (place > high)).any(axis=1))
+
+    def ground(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """The height of the ground: of the lowest surface there is at a place.
+
+        Args:
+            x: Eastings [n], [m].
+            y: Northings [n], [m].
+
+        Returns:
+            Heights [n], [m].
+
+        Raises:
+            InputError: The scene has no surface at a place, or shapely is not installed.
+
+        Example:
+            >>> slope = np.array([[[0, 0, 0], [4, 0, 2], [0, 4, 0]], [[0, 0, 9], [4, 0, 9], [0, 4, 9]]], float)
+            >>> Overhead(slope, np.zeros(6)).ground([1, 2], [1, 1])
+            array([0.5, 1. ])
+        """
+        place = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
+        index, height = self._surfaces(place)
+        lowest = np.full(len(place), np.inf)
+        np.minimum.at(lowest, index, height)
+        if (bare := np.isinf(lowest)).any():
+            first = int(np.flatnonzero(bare)[0])
+            raise InputError(
+                f"heights above the ground: the scene has no ground at {int(bare.sum())} of {len(place)} places, the "
+                f"first at ({place[first, 0]:.1f}, {place[first, 1]:.1f}) m; make the scene with a wider --margin, or "
+                "leave those rows out"
+            )
+        return lowest
 
     def _surfaces(self, place: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """The heights of the faces at places: number of the place, and height [m]."""

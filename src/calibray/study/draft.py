@@ -6,6 +6,7 @@ import os
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,8 +15,9 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements import guessing
+from calibray.measurements import Measurements, Track, guessing
 from calibray.measurements.guessing import Place, Value
+from calibray.measurements.preparation import TRACKED, tracked
 from calibray.measurements.tables import SourceTable, read_table
 from calibray.scenes import read_scene
 from calibray.scenes.making import read_frame
@@ -31,6 +33,7 @@ WAVELENGTHS: Final = 40
 
 _METAL: Final = 1e6  # [S/m], a conductivity beyond which a path loss tells nothing of it
 _MOST_MATERIALS: Final = 6
+_LEVEL: Final = 0.5  # [m], within which the ground counts as the scene's zero
 _MISS: Final = 0.05  # [m], by which a table's distances may differ from its positions
 
 
@@ -71,6 +74,7 @@ def draft(
     transmitters: str | Path | None = None,
     frequency: float | None = None,
     tx: Sequence[float] | None = None,
+    track: str | Path | None = None,
 ) -> Draft:
     """Draft a study; nothing is written.
 
@@ -81,6 +85,7 @@ def draft(
         transmitters: SourceTable of the transmitters' positions, if they do not stand in the links.
         frequency: Carrier frequency [Hz], if the table does not tell it.
         tx: Transmitter position (x, y, z) [m] in the scene's frame, if the table does not tell it.
+        track: GPX track that tells where each row was measured, if the table does not tell it.
 
     Returns:
         The draft.
@@ -88,9 +93,8 @@ def draft(
     Raises:
         InputError: A file cannot be read, or something cannot be told from the files and was not given.
     """
-    made = _Drafting(
-        scene, Path(links), Path(target), Path(transmitters) if transmitters else None, frequency, tx
-    )
+    files = [Path(file) if file else None for file in (transmitters, track)]
+    made = _Drafting(scene, Path(links), Path(target), *files, frequency, tx)
     content = made.content()
     text = toml(content, {each.what: each.reason for each in made.assumed})
     study = Study.from_content(tomllib.loads(text), target)
@@ -105,6 +109,7 @@ class _Drafting:
     links: Path
     target: Path
     transmitters: Path | None
+    track: Path | None
     given_frequency: float | None
     given_tx: Sequence[float] | None
     assumed: list[Assumption] = field(default_factory=list)
@@ -114,9 +119,15 @@ class _Drafting:
         self.table = read_table(self.links)
         self.sites = None if self.transmitters is None else read_table(self.transmitters)
 
+    @cached_property
+    def overhead(self) -> Overhead:
+        """What lies above and below places of the scene."""
+        return Overhead.of(self.scene)
+
     def content(self) -> dict[str, Any]:
         """The sections of the study."""
         section: dict[str, Any] = {"file": self._relative(self.links)}
+        self._tracked(section)
         self._wide(section)
         frequency = self._frequency(section)
         rx, tx = self._places()
@@ -128,6 +139,7 @@ class _Drafting:
         groups = self._groups(section, value)
         self._floor(section, value)
         self._averages(section, rx, groups, frequency)
+        self._heights(section, tx, rx)
         indoors = self._indoors(section)
         if section.get("position") == "geographic" and not indoors:
             section["inside"] = "move"
@@ -161,6 +173,25 @@ class _Drafting:
 
     def _scene_file(self) -> str:
         return self.scene if self.scene.startswith(BUNDLED) else self._relative(Path(self.scene))
+
+    def _tracked(self, section: dict[str, Any]) -> None:
+        """The positions of a track."""
+        if self.track is None:
+            return
+        name = guessing.time(self.table.frame)
+        if name is None:
+            raise InputError(
+                f"{self.links}: no column looks like the times that {self.track} is joined by "
+                f"({', '.join(map(str, self.table.frame))}); call it time"
+            )
+        section["track"] = {"file": self._relative(self.track), "time": name}
+        rows = len(self.table)
+        self.table = tracked(self.table, Track(str(self.track), name), {})
+        self._assume(
+            "links.track",
+            f"{self.track.name} by {name}",
+            f"given; it covers {len(self.table)} of {rows} rows",
+        )
 
     def _wide(self, section: dict[str, Any]) -> None:
         """One column a transmitter, if the table of transmitters says so."""
@@ -227,7 +258,10 @@ class _Drafting:
         )
 
     def _places(self) -> tuple[Place, Place | None]:
-        rx = guessing.place(self.table.frame, "rx", own=True)
+        if self.track is None:
+            rx = guessing.place(self.table.frame, "rx", own=True)
+        else:
+            rx = Place("geographic", *TRACKED, height=None)
         if rx is None:
             raise InputError(
                 f"{self.links}: no columns look like the receivers' positions "
@@ -363,12 +397,43 @@ class _Drafting:
         if places >= len(frame) / 2 and not copies:
             return
         size = float(np.clip(round(WAVELENGTHS * speed_of_light / frequency, 1), 1.0, 10.0))
-        section["average"] = {"by": "cell", "size": size}
-        reason = f"{len(frame)} rows at {places} places; {WAVELENGTHS} wavelengths even out fading"
+        section["average"] = {"by": "cell", "size": size, "unbiased": True}
+        reason = (
+            f"{len(frame)} rows at {places} places; {WAVELENGTHS} wavelengths even out fading; the logarithm of a mean "
+            "of few lies low"
+        )
         self._assume("links.average", f"cells of {size:g} m", reason)
+
+    def _heights(self, section: dict[str, Any], tx: Place | None, rx: Place) -> None:
+        """Heights above the ground, where it is not level at zero and heights can be meant so."""
+        given_in_scene = any(
+            place is not None and place.position == "scene" and place.height is not None for place in (tx, rx)
+        )
+        if given_in_scene or self.given_tx is not None:
+            return
+        links = self._links(section)
+        try:
+            ground = self.overhead.ground(*np.concatenate([links.tx, links.rx])[:, :2].T)
+        except InputError:
+            return  # somewhere the scene ends, or has no floor
+        if np.abs(ground).max() > _LEVEL:
+            section["heights"] = "ground"
+            low, high = ground.min(), ground.max()
+            self._assume(
+                "links.heights", "ground", f"it lies at {low:.0f} to {high:.0f} m; heights count from it"
+            )
 
     def _indoors(self, section: dict[str, Any]) -> bool:
         """Whether most receivers have a ceiling above them."""
+        links = self._links(section)
+        share = float(self.overhead.roofed(links.rx).mean())
+        indoors = share > 0.5
+        told = f"{share:.0%} of the receivers have something above them"
+        self._assume("trace", "through walls" if indoors else "around buildings", told)
+        return indoors
+
+    def _links(self, section: dict[str, Any]) -> Measurements:
+        """The links, as far as they are drafted."""
         content = {
             "version": VERSION,
             "scene": {"file": self._scene_file(), "frequency": 1e9},
@@ -376,12 +441,7 @@ class _Drafting:
             "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
             "offset": {},
         }
-        links = Study.from_content(content, self.target).measurements()
-        share = float(Overhead.of(self.scene).roofed(links.rx).mean())
-        indoors = share > 0.5
-        told = f"{share:.0%} of the receivers have something above them"
-        self._assume("trace", "through walls" if indoors else "around buildings", told)
-        return indoors
+        return Study.from_content(content, self.target).measurements()
 
     def _parameters(self, frequency: float, indoors: bool) -> dict[str, dict[str, Any]]:
         materials = read_scene(self.scene, frequency).materials

@@ -222,6 +222,12 @@ class Study(Section):
         return None if file is None else self._resolve("links.transmitters", file)
 
     @property
+    def track_path(self) -> Path | None:
+        """The track, if there is one."""
+        track = self.links.track
+        return None if track is None else self._resolve("links.track.file", track.file)
+
+    @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
         """The transmit and the receive antenna, their files of gains resolved."""
         ends = ((end, getattr(self.antennas, end)) for end in ("tx", "rx"))
@@ -383,8 +389,8 @@ class Study(Section):
         """The files that the study names, and its own; those of a bundled scene are left out."""
         antennas = [Path(each.gain_file) for each in self.antenna_pair if each.gain_file is not None]
         scene = [] if self.scene.file.startswith(BUNDLED) else [Path(self.scene_source)]
-        transmitters = [] if self.transmitters_path is None else [self.transmitters_path]
-        return (self._path, self.links_path, *transmitters, *scene, *antennas)
+        others = [path for path in (self.transmitters_path, self.track_path) if path is not None]
+        return (self._path, self.links_path, *others, *scene, *antennas)
 
     def _resolve(self, key: str, file: str) -> Path:
         try:
@@ -399,6 +405,8 @@ class Study(Section):
         ]
         if self.links.transmitters is not None and self.transmitters_path is not None:
             files.append(("links.transmitters", self.links.transmitters, self.transmitters_path))
+        if self.links.track is not None and self.track_path is not None:
+            files.append(("links.track.file", self.links.track.file, self.track_path))
         for end, antenna in zip(("tx", "rx"), self.antenna_pair, strict=True):
             if antenna.gain_file is not None:
                 written = getattr(self.antennas, end).pattern

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements import Averaging, Preparation
+from calibray.measurements import Averaging, Preparation, Track
 from calibray.scenes.outlines import led_outside, outlines
+from calibray.scenes.overhead import Overhead
 from calibray.scenes.source import find_scene
 
 if TYPE_CHECKING:
@@ -34,7 +35,12 @@ def preparation(study: Study) -> Preparation:
     inside = None if links.inside == "keep" else links.inside
     per = study.offset.per if study.offset else None
     groups = [per] if isinstance(per, str) else [*(per or ())]
+    track = links.track
     return Preparation(
+        track=None
+        if track is None
+        else Track(str(study.track_path), track.time, track.longest_gap, track.clock),
+        ground=None if links.heights is None else Overhead.of(study.scene_source).ground,
         wide=links.wide,
         where=links.where,
         transmitters=None if transmitters is None else str(transmitters),

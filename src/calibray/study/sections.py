@@ -96,11 +96,13 @@ class AverageSection(Section):
         by: "cell" of a square grid, stretch of "distance" along the rows' order, or window of "time".
         size: Its width or length [m], or duration [s].
         time: Column of times, for "time" only.
+        unbiased: Whether to add what the logarithm of a mean of few samples lies too low by.
     """
 
     by: Literal["cell", "distance", "time"]
     size: Annotated[float, Field(gt=0)]
     time: Text | None = None
+    unbiased: bool = False
 
     @model_validator(mode="after")
     def _timed(self) -> Self:
@@ -108,6 +110,22 @@ class AverageSection(Section):
             remedy = "needs time, the column of times" if self.by == "time" else "takes no time; leave it out"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
+
+
+class TrackSection(Section):
+    """``[links.track]``: a GPX track that tells where each row was measured, by the time.
+
+    Attributes:
+        file: GPX file, relative to the study file's folder.
+        time: Column of the rows' times: ISO 8601, or seconds since 1970.
+        longest_gap: Rows between two points of the track further apart than this are left out [s].
+        clock: How much the table's clock is ahead of the track's [s].
+    """
+
+    file: Text
+    time: Text
+    longest_gap: Annotated[float, Field(gt=0)] = 10.0
+    clock: float = 0.0
 
 
 class LinksSection(Section):
@@ -128,6 +146,8 @@ class LinksSection(Section):
         tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
         wide: Name of the transmitter by column, of a table with one column a transmitter.
+        track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
+        heights: "ground" for heights above the scene's ground at each place; above the scene's zero if absent.
         transmitters: Table with a row for every transmitter, relative to the study file's folder.
         transmitter: Column, of both tables, that says which transmitter it is.
         noise_floor_dbm: Received powers at or below it, and missing ones, were not heard [dBm].
@@ -147,6 +167,8 @@ class LinksSection(Section):
     tx_power_dbm: Coordinate | None = None
     frequency: Text | None = None
     wide: dict[str, Text] = Field(default_factory=dict)
+    track: TrackSection | None = None
+    heights: Literal["ground"] | None = None
     transmitters: Text | None = None
     transmitter: Text = "transmitter"
     noise_floor_dbm: float | None = None

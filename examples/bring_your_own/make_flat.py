@@ -1,0 +1,79 @@
+"""Make the flat of this folder: a plan as somebody draws it, and what a laptop heard of three access points in it.
+
+    python examples/bring_your_own/make_flat.py
+
+Everything is synthetic, so the truth is known: `flat/truth.json` holds the materials that the walls were given and
+what the access points transmit. `flat/plan.csv`, `flat/access_points.csv` and `flat/rss.csv` are all that a calibration
+gets to see.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+
+from calibray.scenes.plan import merge_faces, read_plan
+from calibray.scenes.rooms import make_plan_scene
+from synthetic import amplitudes, sample
+
+FOLDER = Path(__file__).parent / "flat"
+SEED = 34
+FREQUENCY = 2.44e9  # [Hz]
+DEPTH = 3
+HEIGHT = 1.5  # [m]
+SAMPLES = 30  # of one value: what a laptop averages while it is turned about
+
+PLANTED = {
+    "brick_wall": {"relative_permittivity": 5.1, "conductivity": 0.06},
+    "plasterboard_wall": {"relative_permittivity": 2.2, "conductivity": 0.03},
+}
+EIRP_DBM = {"ap1": 17.0, "ap2": 14.5, "ap3": 20.0}  # unknown to the user
+ACCESS_POINTS = {"ap1": (0.6, 0.7, 2.2), "ap2": (9.4, 6.1, 2.3), "ap3": (4.6, 6.4, 1.1)}  # [m]
+WALLS = [
+    (0, 0, 10, 0, "brick", 0.24), (10, 0, 10, 7, "brick", 0.24), (10, 7, 0, 7, "brick", 0.24),
+    (0, 7, 0, 0, "brick", 0.24), (5.5, 0, 5.5, 2.8, "brick", 0.24), (5.5, 3.8, 5.5, 7, "brick", 0.24),
+    (0, 3.6, 1.8, 3.6, "plasterboard", 0.1), (2.8, 3.6, 5.5, 3.6, "plasterboard", 0.1),
+    (5.5, 4.3, 8.2, 4.3, "plasterboard", 0.1), (9.2, 4.3, 10, 4.3, "plasterboard", 0.1),
+]  # fmt: skip
+
+
+def spots() -> np.ndarray:
+    """Where the laptop was held, x and y [n, 2], [m]."""
+    return np.array([(x, y) for x in (0.9, 2.3, 3.7, 4.8, 6.4, 7.7, 9.0) for y in (0.9, 2.4, 4.9, 6.2)])
+
+
+def main() -> None:
+    """Write the plan, the values, the access points and the truth."""
+    FOLDER.mkdir(exist_ok=True)
+    plan = pd.DataFrame(WALLS, columns=["x0", "y0", "x1", "y1", "type", "thickness"])
+    plan.to_csv(FOLDER / "plan.csv", index=False, lineterminator="\n")
+    places = np.column_stack([spots(), np.full(len(spots()), HEIGHT)])
+    with TemporaryDirectory() as folder:
+        sheets, _ = merge_faces(read_plan(FOLDER / "plan.csv", 2.6))
+        scene = make_plan_scene(sheets, folder).path
+        gains = amplitudes(
+            scene, list(ACCESS_POINTS.values()), places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=500_000,
+            refraction=True,
+        )  # fmt: skip
+    rng = np.random.default_rng(SEED)
+    table = pd.DataFrame(spots(), columns=["x", "y"])
+    for point, (name, eirp) in enumerate(EIRP_DBM.items()):
+        power = [
+            np.mean([10 ** (sample(gains[point][spot], eirp, rng) / 10) for _ in range(SAMPLES)])
+            for spot in range(len(table))
+        ]
+        table[f"rss_{name}"] = np.round(10 * np.log10(power), 1)
+    table.to_csv(FOLDER / "rss.csv", index=False, lineterminator="\n")
+    points = pd.DataFrame(list(ACCESS_POINTS.values()), columns=["x", "y", "z"])
+    points.insert(0, "ap", list(ACCESS_POINTS))
+    points.to_csv(FOLDER / "access_points.csv", index=False, lineterminator="\n")
+    truth = {"frequency": FREQUENCY, "eirp_dbm": EIRP_DBM, "materials": PLANTED}
+    (FOLDER / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

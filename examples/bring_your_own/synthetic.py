@@ -1,0 +1,58 @@
+"""What the makers of these examples share: amplitudes under planted materials, and what fading makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from calibray.fields import path_gains
+from calibray.tracing.factory import trace
+
+ANTENNA = {"pattern": "iso", "polarization": "V"}
+
+
+def amplitudes(
+    scene: Path,
+    masts: Sequence[Sequence[float]],
+    places: np.ndarray,
+    frequency: float,
+    planted: Mapping[str, Mapping[str, float]],
+    **settings: Any,
+) -> list[list[np.ndarray]]:
+    """Amplitudes of the paths from every mast to every place.
+
+    Args:
+        scene: The scene.
+        masts: Transmitter positions [m].
+        places: Receiver positions [n, 3], [m].
+        frequency: Carrier [Hz].
+        planted: Constants in place of the scene's, by material.
+        settings: How to trace.
+
+    Returns:
+        By mast and place, the amplitudes of the paths between them.
+    """
+    links = SimpleNamespace(
+        tx=np.repeat(list(masts), len(places), axis=0), rx=np.tile(places, (len(masts), 1))
+    )
+    paths = trace(scene, links, frequency=frequency, tx_antenna=ANTENNA, rx_antenna=ANTENNA, **settings)
+    truth = dict(paths.materials)
+    for name, constants in planted.items():
+        truth[name] = replace(truth[name], **constants)
+    gains = np.abs(path_gains(paths, truth))
+    every = [gains[paths.link == link] for link in range(len(links.tx))]
+    return [every[mast * len(places) :][: len(places)] for mast in range(len(masts))]
+
+
+def sample(gains: np.ndarray, level_dbm: float, rng: np.random.Generator) -> float:
+    """Power of one sample [dBm], of paths' amplitudes and what is added to their power.
+
+    From sample to sample the phone moves by wavelengths: the phases of the paths are free.
+    """
+    field = (gains * np.exp(2j * np.pi * rng.uniform(size=len(gains)))).sum()
+    return level_dbm + 20 * np.log10(max(abs(field), 1e-12))
