@@ -20,7 +20,7 @@ from calibray.measurements.tables import SourceTable
 from calibray.parameters import Parameter, Parameters
 
 STONE = Parameter("stone.relative_permittivity", 1.5, 12.0, 8.0)
-SLOPE, SPREAD_DB, LIMIT_DB = 5.0, 3.0, 115.0
+SLOPE, SPREAD_DB, LIMIT_DB = 5.0, 2.0, 115.0
 WAY = np.tile(np.linspace(0.0, 10.0, 60), 3)
 
 
@@ -67,14 +67,14 @@ def test_a_fit_to_what_was_heard_is_too_strong_and_one_to_what_is_expected_is_no
     chosen = [heard(problem) for problem in every]
     all_heard, expected = (np.array([slope(each) for each in problems]) for problems in (every, chosen))
     errors = [slopes.std(ddof=1) / np.sqrt(len(every)) for slopes in (all_heard, expected)]
-    assert all_heard.mean() < SLOPE - 6 * errors[0]
+    assert all_heard.mean() < SLOPE - 4 * errors[0]
     assert abs(expected.mean() - SLOPE) < 3 * errors[1]
     one = chosen[0]
     assert one.faint is not None
     assert np.array_equal(one.faint, one.objective.weight == 0)
     # Those left out are expected beyond the limit less the margin, by the fit to those left.
     model = 80.0 + SLOPE * one.setup.links.rx[:, 0]
-    assert model[one.faint].min() == pytest.approx(LIMIT_DB - MARGIN * SPREAD_DB, abs=3.0)
+    assert model[one.faint].min() == pytest.approx(LIMIT_DB - MARGIN * SPREAD_DB, abs=2.0)
 
 
 def test_without_a_floor_or_far_above_it_all_links_count():

@@ -18,8 +18,10 @@ from calibray.measurements import guessing
 from calibray.measurements.tables import SourceTable
 from calibray.scenes.footprints import Footprints
 from calibray.scenes.making import make_scene
+from calibray.scenes.overhead import Overhead
 from calibray.scenes.plan import read_plan
 from calibray.scenes.rooms import make_plan_scene
+from calibray.scenes.terrain import Terrain
 from calibray.study import Study
 from calibray.study.draft import draft
 from calibray.study.schema import schema_text
@@ -112,8 +114,47 @@ def test_a_wide_table_indoors(tmp_path):
     assert links.group_names == ("ap1", "ap2")
     assert links.tx[0].tolist() == [1.0, 1.0, 2.5]
     assert found.study.trace.refraction
+    # The line from ap1 to (8, 5) crosses one wall; no fewer than three interactions.
+    assert found.study.trace.max_depth == 3
     assert assumed(found)["trace"] == "through walls"
     assert "brick_wall.conductivity" in found.study.parameters
+
+
+def test_a_track_and_a_hill(tmp_path):
+    """A house on a slope of 1 in 10, a walk of 40 m past it: each row at its time, each antenna above its ground."""
+    rows, columns = np.mgrid[0:2, 0:2]
+    terrain = Terrain(
+        np.array([-50.0, 50.0]), np.array([-50.0, 50.0]), 5.0 + 0.1 * (100.0 * columns + 0.0 * rows)
+    )
+    box = np.array([shapely.box(20, -10, 40, 10)])
+    house = Footprints(box, np.zeros(1), np.full(1, 9.0), ("house",), ("height",), np.zeros(1, bool), {})
+    scene = str(make_scene(house, tmp_path / "hill", FRAME, terrain).path)
+    east = FRAME.to_geographic([(-20.0, 20.0, 0.0), (20.0, 20.0, 0.0), (0.0, -30.0, 0.0)])
+    points = "".join(
+        f'<trkpt lat="{east[k][1]:.8f}" lon="{east[k][0]:.8f}"><time>2026-05-04T09:00:{8 * k:02d}Z</time></trkpt>'
+        for k in range(2)
+    )
+    (tmp_path / "walk.gpx").write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
+    clock = [f"2026-05-04T09:00:{second:02d}Z" for second in (0, 2, 4, 6, 8, 30)]
+    file = table(tmp_path, time=clock, mast="a", rsrp_dbm=np.linspace(-80.0, -90.0, 6))
+    sites = tmp_path / "sites.csv"
+    sites.write_text(f"mast,longitude,latitude,height\na,{east[2][0]:.8f},{east[2][1]:.8f},12\n")
+    found = draft(scene, file, tmp_path / "study.toml", sites, 3.5e9, track=tmp_path / "walk.gpx")
+    links = found.study.measurements()
+    assert links.rx[:, 0] == pytest.approx([-20, -10, 0, 10, 20], abs=0.01)
+    assert links.rx[:, 2] == pytest.approx(5.0 + 0.1 * (links.rx[:, 0] + 50) + 1.5, abs=0.01)
+    assert links.tx[0] == pytest.approx([0, -30, 22.0], abs=0.01)
+    assert links.prepared == {"rows at no time of the track, left out": 1}
+    assert found.study.files()[2:4] == (tmp_path / "sites.csv", tmp_path / "walk.gpx")
+    assert assumed(found)["links.heights"] == "ground"
+    assert assumed(found)["links.track"] == "walk.gpx by time"
+    with pytest.raises(InputError, match="joined by"):
+        draft(scene, table(tmp_path, rsrp_dbm=[-80.0]), tmp_path / "study.toml", sites, 3.5e9,
+              track=tmp_path / "walk.gpx")  # fmt: skip
+    # Beyond the scene there is no ground to count from.
+    far = links.frame.assign(time=clock[:5])
+    with pytest.raises(InputError, match=r"no ground at 5 of 5 places"):
+        Overhead.of(scene).ground(far["rx_x"] + 500.0, far["rx_y"])
 
 
 @pytest.mark.parametrize(

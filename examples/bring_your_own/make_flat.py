@@ -23,7 +23,7 @@ from synthetic import amplitudes, sample
 FOLDER = Path(__file__).parent / "flat"
 SEED = 34
 FREQUENCY = 2.44e9  # [Hz]
-DEPTH = 3
+DEPTH = 4
 HEIGHT = 1.5  # [m]
 SAMPLES = 30  # of one value: what a laptop averages while it is turned about
 

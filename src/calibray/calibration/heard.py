@@ -20,8 +20,11 @@ from calibray.inference.objective import Objective
 from calibray.optimizers import LeastSquares
 from calibray.progress import Progress
 
-MARGIN: Final = 4.0
-"""How far above the noise floor a link must be expected, in standard deviations of the links' errors."""
+MARGIN: Final = 8.0
+"""How far above the noise floor a link must be expected, in standard deviations of the links' errors.
+
+Errors of position make paths come and go, so that errors have tails: with four, links that luck let be heard remain.
+"""
 
 ROUNDS: Final = 4
 """Choices at most; one more or less hardly changes the fit once few links change sides."""

@@ -220,6 +220,24 @@ def wide(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
     return found if len(found) > 1 else {}
 
 
+def common_value(columns: Iterable[str]) -> str:
+    """What the column of values is called that columns of transmitters become: by the words that all have in common.
+
+    Args:
+        columns: The columns, at least one.
+
+    Returns:
+        The name.
+
+    Example:
+        >>> common_value(["RSS AP1", "RSS AP2"])
+        'rss_value'
+    """
+    common = frozenset.intersection(*map(words, columns))
+    terms = ("rsrp", "rss", "rssi", "loss", "pl", "gain")
+    return next((term for term in terms if term in common), "rss") + "_value"
+
+
 def shared_name(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
     """The column by which two tables name the transmitter.
 

@@ -22,14 +22,16 @@ _STEEP: Final = 0.1  # share of a face's normal that points upward; less is a wa
 
 @dataclass(frozen=True, eq=False)
 class Overhead:
-    """The faces of a scene that are no walls.
+    """The faces of a scene, those that are no walls apart.
 
     Attributes:
         corners: Their corners [faces, 3, 3], [m].
+        walls: Corners of the faces that are walls, likewise.
         bounds: West, south, bottom, east, north and top of the whole scene [6], [m].
     """
 
     corners: NDArray[np.float64]
+    walls: NDArray[np.float64]
     bounds: NDArray[np.float64]
 
     @classmethod
@@ -51,7 +53,7 @@ class Overhead:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         level = np.abs(normal[:, 2]) > _STEEP * np.linalg.norm(normal, axis=1)
         every = corners.reshape(-1, 3)
-        return cls(corners[level], np.concatenate([every.min(axis=0), every.max(axis=0)]))
+        return cls(corners[level], corners[~level], np.concatenate([every.min(axis=0), every.max(axis=0)]))
 
     def roofed(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which points have something above them.
@@ -66,7 +68,8 @@ class Overhead:
             InputError: shapely is not installed.
 
         Example:
-            >>> roof = Overhead(np.array([[[0, 0, 3], [4, 0, 3], [0, 4, 3]]], float), np.array([0, 0, 3, 4, 4, 3.0]))
+            >>> roof = np.array([[[0, 0, 3], [4, 0, 3], [0, 4, 3]]], float)
+            >>> roof = Overhead(roof, np.zeros((0, 3, 3)), np.array([0, 0, 3, 4, 4, 3.0]))
             >>> roof.roofed([[1, 1, 1.5], [1, 1, 5.0], [3, 3, 1.5]])
             array([ True, False, False])
         """
@@ -121,7 +124,7 @@ class Overhead:
 
         Example:
             >>> slope = np.array([[[0, 0, 0], [4, 0, 2], [0, 4, 0]], [[0, 0, 9], [4, 0, 9], [0, 4, 9]]], float)
-            >>> Overhead(slope, np.zeros(6)).ground([1, 2], [1, 1])
+            >>> Overhead(slope, np.zeros((0, 3, 3)), np.zeros(6)).ground([1, 2], [1, 1])
             array([0.5, 1. ])
         """
         place = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])

@@ -17,12 +17,14 @@ from scipy.constants import speed_of_light
 from calibray.errors import InputError
 from calibray.measurements import Measurements, Track, guessing
 from calibray.measurements.guessing import Place, Value
+from calibray.measurements.powers import long_table
 from calibray.measurements.preparation import TRACKED, tracked
 from calibray.measurements.tables import SourceTable, read_table
-from calibray.scenes import read_scene
+from calibray.scenes.crossing import crossings
 from calibray.scenes.making import read_frame
 from calibray.scenes.overhead import Overhead
 from calibray.scenes.source import find_scene
+from calibray.study.draft_parameters import calibratable
 from calibray.study.draft_text import toml
 from calibray.study.model import BUNDLED, VERSION, Study
 
@@ -31,8 +33,7 @@ TRANSMITTER_HEIGHT: Final = 10.0
 WAVELENGTHS: Final = 40
 """Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.aggregation`)."""
 
-_METAL: Final = 1e6  # [S/m], a conductivity beyond which a path loss tells nothing of it
-_MOST_MATERIALS: Final = 6
+_DEPTHS: Final = (3, 5)  # within which walls decide how deep is traced indoors
 _LEVEL: Final = 0.5  # [m], within which the ground counts as the scene's zero
 _MISS: Final = 0.05  # [m], by which a table's distances may differ from its positions
 
@@ -149,7 +150,7 @@ class _Drafting:
         self._assume(
             "antennas", "iso, V, at both ends", "nothing tells them; name yours, with their orientation"
         )
-        trace = {"max_depth": 5 if indoors else 3, "samples": 200_000}
+        trace = {"max_depth": self._depth(section) if indoors else 3, "samples": 200_000}
         if indoors:
             trace["refraction"] = True
         return {
@@ -215,24 +216,8 @@ class _Drafting:
         self._assume(
             "links.wide", ", ".join(columns), f"called like those in {Path(str(self.transmitters)).name}"
         )
-        frame = self.table.frame
-        values = frame[list(columns)].apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
-        long = frame.drop(columns=list(columns)).loc[frame.index.repeat(len(columns))].reset_index(drop=True)
-        long = long.assign(
-            **{name: list(columns.values()) * len(frame), self._wide_value(columns): values.ravel()}
-        )
-        self.table = SourceTable(
-            long.dropna(subset=[self._wide_value(columns)]).reset_index(drop=True), source=str(self.links)
-        )
-
-    @staticmethod
-    def _wide_value(columns: dict[str, str]) -> str:
-        """What the new column of values is called: by the words that all columns have in common."""
-        common = frozenset.intersection(*map(guessing.words, columns))
-        return (
-            next((term for term in ("rsrp", "rss", "rssi", "loss", "pl", "gain") if term in common), "rss")
-            + "_value"
-        )
+        long = long_table(self.table.frame, columns, guessing.common_value(columns), name)
+        self.table = SourceTable(long, source=str(self.links))
 
     def _frequency(self, section: dict[str, Any]) -> float:
         found = guessing.frequency(self.table.frame)
@@ -432,6 +417,19 @@ class _Drafting:
         self._assume("trace", "through walls" if indoors else "around buildings", told)
         return indoors
 
+    def _depth(self, section: dict[str, Any]) -> int:
+        """As many interactions as the straight lines of nearly all links cross walls, and one for a reflection."""
+        links = self._links(section)
+        walls = int(np.quantile(crossings(self.overhead.walls, links.tx, links.rx), 0.95))
+        depth = int(np.clip(walls + 1, *_DEPTHS))
+        self._assume(
+            "trace.max_depth",
+            depth,
+            f"straight lines cross up to {walls} walls; one reflection more, "
+            f"at least {_DEPTHS[0]}, at most {_DEPTHS[1]}: each more takes about three times the work",
+        )
+        return depth
+
     def _links(self, section: dict[str, Any]) -> Measurements:
         """The links, as far as they are drafted."""
         content = {
@@ -444,26 +442,8 @@ class _Drafting:
         return Study.from_content(content, self.target).measurements()
 
     def _parameters(self, frequency: float, indoors: bool) -> dict[str, dict[str, Any]]:
-        materials = read_scene(self.scene, frequency).materials
-        chosen = {
-            name: constants
-            for name, constants in materials.items()
-            if constants.conductivity < _METAL and constants.relative_permittivity > 1.5
-        }
-        names = list(chosen)[:_MOST_MATERIALS]
-        if not names:
-            raise InputError(f"{self.scene}: has no material to calibrate; all are metal or air")
-        found: dict[str, dict[str, Any]] = {}
-        for name in names:
-            constants = chosen[name]
-            upper = max(15.0, round(2 * constants.relative_permittivity))
-            found[f"{name}.relative_permittivity"] = {"bounds": [1.5, upper]}
-            if indoors and constants.conductivity > 0:
-                found[f"{name}.conductivity"] = {
-                    "bounds": [min(1e-3, float(f"{constants.conductivity / 10:.0e}")), 3.0],
-                    "scale": "log",
-                }
+        names, entries = calibratable(self.scene, frequency, indoors)
         self._assume(
             "parameters", ", ".join(names), "the scene's materials that are no metal; start: the scene's"
         )
-        return found
+        return entries
