@@ -134,7 +134,7 @@ def outcome(
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,
-paths=paths,
+        paths=paths,
         power_shares=seen.power_shares,
         prepared=links.prepared | ({} if problem.faint is None else {FAINT: int(problem.faint.sum())}),
         nuisances={
