@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
+from calibray.reporting.positions import draw_positions
 from calibray.scenes.diagnosis import SceneDiagnosis, diagnose
-from calibray.scenes.drawing import draw_positions
 from calibray.scenes.extrusion import Windows
 from calibray.scenes.health import health
 from calibray.scenes.making import make_scene

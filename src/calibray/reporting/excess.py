@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from calibray.comparison.labels import label
 from calibray.files import write_table
-from calibray.reporting.style import COLORS, PALETTE, plain_figure, styled
+from calibray.reporting.style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.reporting.style import write as write_figure
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def figure(comparison: Comparison) -> Figure:
         dashed = "--" if contender.endless or contender.name != contender.method else "-"
         axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(contender.name))
         axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
-    axes.set(yscale="log", xlim=(0, last))
+    logarithmic(axes, "y")
+    axes.set_xlim(0, last)
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return drawing

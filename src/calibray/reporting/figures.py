@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from calibray.comparison.labels import label
@@ -20,6 +20,7 @@ from calibray.reporting.style import (
     LINE,
     ORANGE,
     dress,
+    logarithmic,
     plain_figure,
     styled,
 )
@@ -38,6 +39,9 @@ SHADED: Final = 500
 MANY: Final = 2000
 """Points beyond which a figure holds them as an image."""
 
+UNEQUAL: Final = 4
+"""How many times as many RT calls one method may spend as another before their axis is logarithmic."""
+
 GROUPS: Final = 24
 """Groups that are shown, those with the most links first."""
 
@@ -54,6 +58,9 @@ def cumulative_cost(results: Mapping[str, Result]) -> Figure:
     """
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
+    calls = [result.history["call"].max() for result in results.values()]
+    if max(calls) > UNEQUAL * min(calls):
+        logarithmic(panels[0], "y")
     for axes, column, y in zip(
         panels, ("call", "seconds"), ("RT calls so far", "Time so far [s]"), strict=True
     ):
@@ -94,6 +101,10 @@ def convergence(results: Mapping[str, Result], optimum_db: float | None = None) 
             history["call"], history["best_db"], where="post", color=COLORS.get(method),
             label=f"{label(method)}: {result.rmse_db:.3f} dB",
         )  # fmt: skip
+    calls = [result.history["call"].max() for result in results.values()]
+    if max(calls) > UNEQUAL * min(calls):
+        logarithmic(axes, "x")
+        axes.set_xlim(left=1)
     if optimum_db is not None:
         axes.axhline(optimum_db, color=INK, ls="--", lw=1, label=f"global optimum: {optimum_db:.3f} dB")
     axes.legend(frameon=False)
@@ -129,11 +140,13 @@ def path_loss_by_receiver(results: Mapping[str, Result]) -> Figure:
 
     draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
     draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
-    for method, result in results.items():
+    for number, (method, result) in enumerate(results.items()):
         color, size = COLORS.get(method, BLUE), 2 if many else 4
-        draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=1.3)
+        # Lines on top of each other are thinner, so that those below are seen.
+        width = 1.3 + 1.4 * (len(results) - 1 - number)
+        draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=width)
     axes.set_xlim(0, len(links) + 1)
-    axes.legend(frameon=False, ncols=2)
+    axes.legend(frameon=False, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
@@ -161,9 +174,7 @@ def residual_over_distance(survey: Survey) -> Figure:
                          label=f"{name} ({shown.sum():,})", rasterized=len(left) > MANY)  # fmt: skip
     known = survey.distance[np.isfinite(left)]
     if len(known) and known.max() > 8 * known.min():
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        logarithmic(axes, "x")
     axes.legend(frameon=False, loc="best")
     return figure
 

@@ -167,7 +167,7 @@ def save_positions(
     Raises:
         InputError: The file has another ending, or must not be replaced; or the scene cannot be read.
     """
-    from calibray.scenes.drawing import draw_positions
+    from calibray.reporting.positions import draw_positions
 
     if file.suffix.lower() not in PICTURES:
         raise InputError(f"{file}: cannot draw a {file.suffix or 'nameless'} file; use {', '.join(PICTURES)}")

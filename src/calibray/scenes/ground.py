@@ -1,4 +1,4 @@
-"""Ground: how high it lies under places of a grid, whatever stands on it."""
+"""Ground: which mesh it is, and how high it lies under places of a grid, whatever stands on it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.scenes.meshes import Mesh
 from calibray.scenes.triangles import Triangles
 
 NEAR: Final = 1e-9
@@ -55,3 +56,21 @@ def _places(
     """Where values lie on an axis, a hair further out."""
     step = NEAR * max(float(np.ptp(axis)), 1.0) * (1 if side == "right" else -1)
     return np.searchsorted(axis, value + step, side=side)
+
+
+def is_ground(mesh: Mesh, whole: NDArray[np.float64]) -> bool:
+    """Whether a mesh is a sheet under the whole scene.
+
+    Args:
+        mesh: The mesh.
+        whole: Extent of the scene to the east and to the north [2], [m].
+
+    Returns:
+        True if no face of it is steep, and it covers most of the scene.
+    """
+    sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    level = np.abs(normal[:, 2]) > 0.5 * np.linalg.norm(normal, axis=1)
+    wide = (np.ptp(mesh.vertices[:, :2], axis=0) > 0.8 * whole).all()
+    seen, extent = np.abs(normal[:, 2]).sum() / 2, float(np.prod(whole))
+    return bool(level.all() and wide and seen > 0.5 * extent)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.extras import library
 from calibray.scenes.diagnosis import read_meshes
-from calibray.scenes.drawing import is_ground
+from calibray.scenes.ground import is_ground
 from calibray.scenes.source import find_scene
 
 
