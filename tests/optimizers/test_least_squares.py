@@ -1,12 +1,17 @@
 """Multi-start Levenberg-Marquardt against SciPy, brute force and known minima."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
+from calibray.optimizers.descent import descend
 from calibray.optimizers.landscapes import blocks, hall, rosenbrock, tones, within
+from calibray.optimizers.least_squares import returns
+from calibray.optimizers.sampling import design
 
 
 def scipy_search(landscape, start):
@@ -154,3 +159,46 @@ def test_duplicate_starts_are_merged():
 def test_impossible_starts_are_refused(x0, message):
     with pytest.raises(InputError, match=message):
         LeastSquares([-2.0, -2.0], [2.0, 2.0], x0=x0)
+
+
+def searched(count, wide):
+    """As many minima of equal width, the lowest of which lies in a basin so wide."""
+    edges = np.concatenate([[0.0, wide], wide + (1.0 - wide) * np.linspace(0.0, 1.0, count)[1:]])
+    centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    optimizer = LeastSquares([0.0], [1.0])
+    while not optimizer.done:
+        x = optimizer.ask()
+        basin = np.clip(np.searchsorted(edges, x[:, 0], side="right") - 1, 0, count - 1)
+        r = np.stack([(x[:, 0] - centre[basin]) / width[basin], 1.0 + 0.1 * basin], axis=1)
+        slope = np.stack([1.0 / width[basin], np.zeros(len(x))], axis=1)[:, :, None]
+        optimizer.tell(x, np.sqrt(np.mean(r**2, axis=1)), r, slope)
+    assert optimizer.best.y == pytest.approx(np.sqrt(0.5), abs=1e-9)
+    return optimizer.evaluations
+
+
+def test_starts_end_when_the_best_minimum_keeps_coming_back():
+    """And no sooner: a basin that few searches end in has all of them."""
+    often = searched(5, 0.4)
+    seldom = searched(5, 0.01)
+    assert often < 4 * 64
+    assert seldom > 512
+
+
+def test_searches_are_counted_where_they_end():
+    """Every search that began stands somewhere, under its own name or another's."""
+    landscape = tones()
+    width = np.subtract(landscape.upper, landscape.lower)
+    ended = None
+
+    def followed(descent):
+        nonlocal ended
+        ended = yield from descent
+
+    descent = followed(descend(design("sobol", 64, 3, np.random.default_rng(0)), 100, 1e-10, 100.0))
+    unit = next(descent, None)
+    while ended is None:
+        r, slope = landscape.model(landscape.lower + unit * width)
+        with suppress(StopIteration):
+            unit = descent.send((r, slope * width))
+    assert ended.searches.sum() == 64
+    assert 1 < returns(ended) < 64

@@ -12,7 +12,7 @@ engine, `vector_surrogate.py` its model.
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class Starts:
         curvature: Its Gauss-Newton matrix H [s, d, d].
         damping: mu [s].
         growth: Factor on the damping at the next rejection [s].
+        searches: How many searches each stands for: itself, and those that were merged with it [s].
     """
 
     unit: NDArray[np.float64]
@@ -47,6 +48,7 @@ class Starts:
     curvature: NDArray[np.float64]
     damping: NDArray[np.float64]
     growth: NDArray[np.float64]
+    searches: NDArray[np.int64]
 
     def rows(self, keep: NDArray[np.bool_]) -> Starts:
         """The searches that go on.
@@ -83,6 +85,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
         curvature=curvature,
         damping=INITIAL_DAMPING * np.where(largest > 0.0, largest, 1.0),
         growth=np.full(len(unit), 2.0),
+        searches=np.ones(len(unit), dtype=np.int64),
     )
 
 
@@ -150,27 +153,37 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
         return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     unit, cost, gradient, curvature = (chosen(name) for name in ("unit", "cost", "gradient", "curvature"))
-    return Starts(unit, cost, gradient, curvature, damping, growth)
+    return Starts(unit, cost, gradient, curvature, damping, growth, starts.searches)
 
 
-def redundant(starts: Starts, settled: Starts) -> NDArray[np.bool_]:
-    """Which searches come close to a better one, and would only find the same minimum.
+def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
+    """Find searches that come close to a better one, and would only find the same minimum.
 
     Args:
         starts: The searches that move.
-        settled: Those that have converged.
+        settled: Those that have ended.
 
     Returns:
-        True for each moving search that can be dropped [s].
+        Both, the better ones standing for the others as well; and True for each moving search that can be dropped [s].
     """
-    unit = np.concatenate([settled.unit, starts.unit])
-    rank = np.lexsort((np.arange(len(unit)), np.concatenate([settled.cost, starts.cost]))).argsort()
-    near = cdist(starts.unit, unit) < MERGE_DISTANCE
-    return np.asarray((near & (rank[None] < rank[len(settled.unit) :, None])).any(axis=1))
+    number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
+    rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
+    apart = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
+    near = (apart < MERGE_DISTANCE) & (rank[None] < rank[number:, None])
+    merged = np.asarray(near.any(axis=1))
+    searches = np.concatenate([settled.searches, starts.searches])
+    target = np.where(near, apart, np.inf).argmin(axis=1) if merged.any() else rank[:0]
+    for row in sorted(np.flatnonzero(merged), key=lambda row: -rank[number + row]):  # the worst first
+        searches[target[row]] += searches[number + row]
+    return replace(starts, searches=searches[number:]), replace(settled, searches=searches[:number]), merged
 
 
 def descend(
-    unit: NDArray[np.float64], iterations: int, tolerance: float, catch_up: float = 1e30
+    unit: NDArray[np.float64],
+    iterations: int,
+    tolerance: float,
+    catch_up: float = 1e30,
+    known: Starts | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
     """Advance all starts until each has converged, merged with a better one, or been given up.
 
@@ -181,26 +194,29 @@ def descend(
             cost, or a step shorter than this.
         catch_up: A search is given up when it lies more than this many of its predicted decreases behind
             the best one.
+        known: Where earlier searches ended, so that these need not end there again.
 
     Yields:
         Points to evaluate [s, d].
 
     Returns:
-        The searches that converged or were still moving at the end, then those that were given up: they stand so near
-        a minimum of their own that they could not catch up any more.
+        What is known, the searches that converged or were still moving at the end, then those that were given up: they
+        stand so near a minimum of their own that they could not catch up any more.
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
-    settled = behind = starts.rows(np.zeros(len(starts.cost), dtype=bool))
+    behind = starts.rows(np.zeros(len(starts.cost), dtype=bool))
+    settled = behind if known is None else known
     for _ in range(iterations):
         step, predicted = damped_steps(starts)
         still = (predicted <= tolerance * starts.cost) | (np.abs(step).max(axis=1) <= tolerance)
         settled = joined(settled, starts.rows(still))
+        starts, step, predicted = starts.rows(~still), step[~still], predicted[~still]
         lowest = min(starts.cost.min(initial=np.inf), settled.cost.min(initial=np.inf))
         hopeless = starts.cost - catch_up * predicted > lowest
-        merged = redundant(starts, settled)
-        behind = joined(behind, starts.rows(hopeless & ~still & ~merged))
-        moving = ~still & ~hopeless & ~merged
+        starts, settled, merged = merge(starts, settled)
+        behind = joined(behind, starts.rows(hopeless & ~merged))
+        moving = ~hopeless & ~merged
         starts, step, predicted = starts.rows(moving), step[moving], predicted[moving]
         if not moving.any():
             break
