@@ -17,6 +17,7 @@ from calibray.cli.app import app
 from calibray.coordinates import transformer
 from calibray.errors import InputError
 from calibray.inference import coverage
+from calibray.reporting.plan import footprints
 from calibray.scenes.ground import ground_heights
 from calibray.scenes.triangles import Triangles
 
@@ -153,3 +154,13 @@ def test_receivers_stand_on_the_lowest_ground():
     outside = (east > 10) | (north > 10)
     expected = np.where(outside, 0.0, 0.1 * east + 0.2 * north)
     assert ground_heights(scene, x, y) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_building_on_the_border_keeps_its_outline():
+    """A roof of four triangles around its middle, of which only the eastern one reaches into the area."""
+    vertex = np.array([(0, 0), (-10, -10), (10, -10), (10, 10), (-10, 10)], dtype=float)
+    face = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
+    roof = Triangles(np.column_stack([vertex, np.full(5, 9.0)]), face, np.zeros(4, int), np.zeros(4, bool))
+    (outline,) = footprints(roof, 5.0, -50.0, 105.0, 50.0)
+    assert sorted(map(tuple, outline)) == [(-10, -10), (-10, 10), (10, -10), (10, 10)]
+    assert footprints(roof, 11.0, -50.0, 111.0, 50.0) == []

@@ -42,6 +42,9 @@ MANY: Final = 2000
 UNEQUAL: Final = 4
 """How many times as many RT calls one method may spend as another before their axis is logarithmic."""
 
+LONG: Final = 1000
+"""RT calls beyond which the axis of the best RMSE is logarithmic: most is gained in the first."""
+
 GROUPS: Final = 24
 """Groups that are shown, those with the most links first."""
 
@@ -58,9 +61,6 @@ def cumulative_cost(results: Mapping[str, Result]) -> Figure:
     """
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
-    calls = [result.history["call"].max() for result in results.values()]
-    if max(calls) > UNEQUAL * min(calls):
-        logarithmic(panels[0], "y")
     for axes, column, y in zip(
         panels, ("call", "seconds"), ("RT calls so far", "Time so far [s]"), strict=True
     ):
@@ -80,6 +80,8 @@ def cumulative_cost(results: Mapping[str, Result]) -> Figure:
                         lean.index[0] - 1, color=COLORS[method], ls="--", lw=1, label="surrogate takes over"
                     )
         axes.legend(frameon=False)
+    if _unequal(results):
+        logarithmic(panels[0], "y")
     return figure
 
 
@@ -101,8 +103,7 @@ def convergence(results: Mapping[str, Result], optimum_db: float | None = None) 
             history["call"], history["best_db"], where="post", color=COLORS.get(method),
             label=f"{label(method)}: {result.rmse_db:.3f} dB",
         )  # fmt: skip
-    calls = [result.history["call"].max() for result in results.values()]
-    if max(calls) > UNEQUAL * min(calls):
+    if _unequal(results) or max(result.history["call"].max() for result in results.values()) > LONG:
         logarithmic(axes, "x")
         axes.set_xlim(left=1)
     if optimum_db is not None:
@@ -229,6 +230,11 @@ def every(result: Result, links: Survey | None) -> dict[str, Figure]:
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
     return figures
+
+
+def _unequal(results: Mapping[str, Result]) -> bool:
+    calls = [result.history["call"].max() for result in results.values()]
+    return bool(max(calls) > UNEQUAL * min(calls))
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -130,7 +130,7 @@ def _nice(value: float, up: bool = False) -> float:
 def footprints(
     triangles: Triangles, west: float, south: float, east: float, north: float
 ) -> list[NDArray[np.float64]]:
-    """Outlines of all that lies within an area, the ground apart.
+    """Outlines of all that lies, whole or in part, within an area, the ground apart.
 
     Args:
         triangles: The scene.
@@ -146,14 +146,18 @@ def footprints(
     area = np.linalg.norm(normal, axis=1)
     corners = triangles.corners
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
-    inside = (high > [west, south]).all(axis=1) & (low < [east, north]).all(axis=1)
+    least, most = np.array([west, south]), np.array([east, north])
+    # Faces around the area too: half a roof has another outline.
+    around = (most - least) / 2
+    inside = (high > least - around).all(axis=1) & (low < most + around).all(axis=1)
     lying = (np.abs(normal[:, 2]) > LEVEL * area) & (area > 0)
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
     _, index = np.unique(face.reshape(-1, 3).round(3), axis=0, return_inverse=True)
     point = dict(zip(index.reshape(-1).tolist(), face.reshape(-1, 3)[:, :2].tolist(), strict=True))
-    return [np.array([point[each] for each in loop]) for loop in _loops(index.reshape(-1, 3).tolist())]
+    lines = (np.array([point[each] for each in loop]) for loop in _loops(index.reshape(-1, 3).tolist()))
+    return [each for each in lines if (each.max(axis=0) > least).all() and (each.min(axis=0) < most).all()]
 
 
 def _buildings(triangles: Triangles, shown: Plan) -> str:
