@@ -168,6 +168,27 @@ def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
     assert found.residual_basis == "2 blocks held out in turn"
     assert found.residual_db == pytest.approx(found.holdout_rmse_db)
     assert any(remark.startswith("Calibration ") for remark in found.remarks)
+    assert found.chosen.name.startswith("calibrated")
+
+
+def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noisy):
+    """Where distance alone was planted, that is the law."""
+    distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    noise = 0.5 * np.random.default_rng(5).standard_normal(12)
+    table = noisy.assign(path_loss_db=30 + 35 * np.log10(distance) + noise)
+    law = run(tmp_path, table, holdout={"blocks": 3})
+    assert law.chosen.name == LAW
+    assert law.chosen.parameters is None
+    assert any("Predictions go by the model 'log-distance'" in remark for remark in law.remarks)
+    told = law.predict_interval(planted.links())
+    assert told.path_loss_db.to_numpy() == pytest.approx(30 + 35 * np.log10(distance), abs=1.0)
+    assert told.path_loss_db.to_numpy() == pytest.approx(law.predict(planted.links()))
+    assert ((told.lower_db < table.path_loss_db) & (table.path_loss_db < told.upper_db)).mean() > 0.8
+    assert "log-distance, errors on 3 blocks" in told.basis[0]
+    law.save(tmp_path / "out")
+    loaded = Result.load(tmp_path / "out")
+    assert loaded.chosen == law.chosen
+    assert loaded.predict_interval(planted.links()).equals(told)
 
 
 def test_prediction_tells_how_sure_it_is(tmp_path, noisy, result):

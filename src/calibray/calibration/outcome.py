@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibray.calibration.certainty import Certainty
 from calibray.calibration.cheap import Aid
+from calibray.calibration.choosing import choose_model
 from calibray.calibration.examining import examined
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail
@@ -105,10 +106,17 @@ def outcome(
         }
     )
     table = table.assign(**_as_measured(study, links, table))
+    chosen = None
     if validation is None:
         judged = _held_out(problem, trail, models)
     else:
         judged = _in_turn(validation, _rmse(problem, models.before, validation.block >= 0), fitted)
+        chosen = choose_model(problem, validation, parameters.to_search(trail.best))
+        if chosen.name != CALIBRATED:
+            judged["judgement"] += (
+                f"Predictions go by the model {chosen.name!r}, which did best on the blocks: "
+                f"{chosen.residual_db:.2f} dB, the calibrated one {judged['holdout_rmse_db']:.2f} dB.",
+            )
     judgement = judged.pop("judgement")
     return Result(
         study=study,
@@ -148,6 +156,7 @@ def outcome(
         free_offset_db=certainty.free_offset_db,
         free_offset_error_db=certainty.free_offset_error_db,
         remarks=(*([helper.remark] if helper.remark else []), *certainty.remarks, *judgement),
+        chosen=chosen,
         profile_calls=certainty.calls,
         profile_seconds=certainty.seconds,
         cheap_calls=0 if helper.model is None else helper.model.calls,

@@ -17,10 +17,21 @@ from calibray.calibration.weighing import weighed
 from calibray.engines.protocol import Differentiable
 from calibray.errors import EngineError, InputError
 from calibray.inference.blocks import blocks as parted
-from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term
+from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term, transmitters
 from calibray.inference.objective import Objective
 from calibray.inference.rivals import kriging, log_distance
-from calibray.inference.validation import BEFORE, CALIBRATED, KRIGING, LAW, PRIOR, SLOPE, Validation
+from calibray.inference.validation import (
+    BEFORE,
+    CALIBRATED,
+    FIELD,
+    KRIGING,
+    LAW,
+    PER_TX,
+    PRIOR,
+    PRIOR_PER_TX,
+    SLOPE,
+    Validation,
+)
 from calibray.optimizers import LeastSquares
 from calibray.parameters import LogNormal
 from calibray.progress import Progress
@@ -42,6 +53,9 @@ MINIMA: Final = 24
 
 SEARCHES: Final = 32
 """Points of its own."""
+
+TX_OFFSET: Final = "offset of the transmitter"
+"""Name of the term that gives each transmitter its offset."""
 
 TX: Final = "tx"
 """Label of a link's transmitter where the table has no such column: its position."""
@@ -120,13 +134,12 @@ def validated(
     block, labels = _parted(problem, blocks, by)
     searches = min(local_searches(_interactions(problem)), 128)
     known = _minima(problem, np.zeros((0, len(problem.parameters))), searches)
-    names = (BEFORE, CALIBRATED, PRIOR, SLOPE, LAW, KRIGING)
-    errors = {name: np.full(len(links), np.nan) for name in names}
+    errors: dict[str, NDArray[np.float64]] = {}
     for number in range(len(labels)):
         here = block == number
         part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
-        for name, model in _models(part, known).items():
-            errors[name][here] = (model - objective.measured)[here]
+        for name, model in models(part, known).items():
+            errors.setdefault(name, np.full(len(links), np.nan))[here] = (model - objective.measured)[here]
         if progress is not None:
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[BEFORE]) & np.isfinite(errors[CALIBRATED])
@@ -163,29 +176,65 @@ def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
     return block, labels
 
 
-def _models(part: Problem, known: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Path loss of every model at all links, fitted to those that count [L], [dB]."""
+def models(part: Problem, known: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Every model, fitted to the links that count.
+
+    Args:
+        part: The problem, other links without weight.
+        known: Points that searches start from beside their own [k, d].
+
+    Returns:
+        Path loss at all links by name of the model [L], [dB]; NaN where nothing could be kriged.
+    """
     setup, objective = part.setup, part.objective
+    twins = fitted_twins(part, known)
+    found = {name: _at(variant, point) for name, (variant, point) in twins.items()}
+    found[LAW] = log_distance(setup.links, objective, setup.study.scene.frequency)
+    for name, law in ((KRIGING, LAW), (FIELD, CALIBRATED)):
+        try:
+            found[name] = kriging(setup.links, objective, found[law])
+        except (InputError, EngineError):
+            # Too few or too many links, or all at one place: nothing to krige.
+            found[name] = np.full(len(setup.links), np.nan)
+    return found
+
+
+def fitted_twins(part: Problem, known: NDArray[np.float64]) -> dict[str, tuple[Problem, NDArray[np.float64]]]:
+    """Every model that knows the scene, fitted to the links that count.
+
+    Args:
+        part: The problem, other links without weight.
+        known: Points that searches start from beside their own [k, d].
+
+    Returns:
+        By name of the model: the problem that it solves, and where it found its optimum, a point of the search
+        space [d].
+    """
+    setup, objective, parameters = part.setup, part.objective, part.parameters
     calibrated = _minima(part, known)
-    found = {
-        BEFORE: _predicted(_with_term(objective, CONSTANT, setup), part.before),
-        CALIBRATED: _at(part, calibrated[0]),
-    }
+    shifted = replace(part, objective=_with_term(objective, CONSTANT, setup))
+    found = {BEFORE: (shifted, parameters.to_search(parameters.start)), CALIBRATED: (part, calibrated[0])}
     rows = objective.num_counted
-    freedom = max(rows - len(part.parameters) - int(objective.determined.sum()), 1)
+    freedom = max(rows - len(parameters) - int(objective.determined.sum()), 1)
     noise = float(part.evaluate(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / freedom)
     prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
-    slope = replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))
-    for name, variant in ((PRIOR, prior), (SLOPE, slope)):
-        found[name] = _at(variant, _minima(variant, calibrated)[0])
-    frequency = setup.study.scene.frequency
-    found[LAW] = log_distance(setup.links, objective, frequency)
-    try:
-        found[KRIGING] = kriging(setup.links, objective, found[LAW])
-    except (InputError, EngineError):
-        # Too few or too many links, or all at one place: nothing to krige.
-        found[KRIGING] = np.full(len(setup.links), np.nan)
+    variants = {PRIOR: prior, SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))}
+    if (per_tx := _per_transmitter(objective, setup)) is not None:
+        variants[PER_TX] = replace(part, objective=per_tx)
+        variants[PRIOR_PER_TX] = replace(prior, objective=replace(per_tx, noise_db=noise))
+    for name, variant in variants.items():
+        found[name] = variant, _minima(variant, calibrated)[0]
     return found
+
+
+def _per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
+    """The objective with an offset for every transmitter, if there are several and it has none such."""
+    labels = transmitters(setup.links)
+    if len(np.unique(labels)) < 2 or any(len(term.labels) > 1 for term in objective.nuisance.terms):
+        return None
+    offset = make_term(setup.links, TX_OFFSET, labels=labels)
+    kept = [term for term in objective.nuisance.terms if term.by != CONSTANT]
+    return replace(objective, nuisance=Nuisance(len(setup.links), (*kept, offset)))
 
 
 def _minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHES) -> NDArray[np.float64]:

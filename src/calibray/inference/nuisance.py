@@ -137,6 +137,18 @@ def make_term(
     return Term(name, by, value - centre, group, known, (float(lower), float(upper)), prior, centre)
 
 
+def transmitters(links: Measurements) -> NDArray[np.str_]:
+    """Labels of the links' transmitters, by where they stand to the centimetre.
+
+    Args:
+        links: The links.
+
+    Returns:
+        A label for each link [L].
+    """
+    return np.array([",".join(f"{each:.2f}" for each in place) for place in links.tx], dtype=np.str_)
+
+
 def _column(links: Measurements, by: str) -> NDArray[np.float64]:
     if by == CONSTANT:
         return np.ones(len(links))

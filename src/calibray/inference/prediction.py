@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,13 +14,20 @@ from scipy.special import stdtrit
 from calibray import fields
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
-from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB
+from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
 from calibray.measurements import Measurements, links_from_frame
 from calibray.progress import Progress
 from calibray.study import Setup
 
 if TYPE_CHECKING:
     from calibray.result import Result
+    from calibray.result.chosen import Chosen
+
+TRANSMITTER: Final = "transmitter"
+"""What a term of the model that was chosen has an offset for each of, without a column that says so."""
+
+KnownTerm = tuple[str, NDArray[np.float64], "NDArray[np.str_] | None", dict[str, float]]
+"""Name of a nuisance, its column [n], labels of the groups [n] if it has any, and the coefficient of each."""
 
 
 def predict(
@@ -72,7 +79,10 @@ def opened(result: Result, links: Measurements, *, anyway: bool = False) -> Setu
 
 def _path_loss(result: Result, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
     links, study = setup.links, result.study
-    shift = _shift(result, links, {}).value[0]
+    if result.chosen is not None:
+        loss, shift = _chosen(result, result.chosen, setup, progress, strangers=False)
+        return loss + shift.value[0]
+    shift = _shift(_terms(result, links), links, {}).value[0]
     paths = setup.trace(result.materials, progress)
     if links.frequency is None:
         return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + shift
@@ -134,8 +144,14 @@ def interval(
         return pd.DataFrame({"path_loss_db": _path_loss(result, setup, progress)})
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must lie between 0 and 1, as 0.9")
+    if (chosen := result.chosen) is not None:
+        loss, shift = _chosen(result, chosen, setup, progress, strangers=True)
+        size, free = chosen.residual_db, chosen.links
+        return _framed(
+            loss + shift.value[0], np.sqrt(size**2 + shift.spread**2), shift, level, free, chosen.basis
+        )
     size, basis = _residual(result)
-    shift = _shift(result, links, result.draws, strangers=True)
+    shift = _shift(_terms(result, links), links, result.draws, strangers=True)
     names = setup.parameters.names
     values = np.array([[result.parameters[name] for name in names]])
     if result.draws:
@@ -145,9 +161,22 @@ def interval(
     drawn = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     variance = size**2 + shift.spread**2 + (np.mean(drawn**2, axis=0) if len(drawn) else 0.0)
     freedom = max(result.counts["calibrated_on"] - len(names), 1)
-    half = np.where(reached, stdtrit(freedom, (1 + level) / 2) * np.sqrt(variance), np.nan)
-    ending = "" if len(drawn) else ", parameters as if known"
-    said = np.where(shift.spread > 0, f"{basis}{ending}, group never measured", f"{basis}{ending}")
+    basis += "" if len(drawn) else ", parameters as if known"
+    return _framed(np.where(reached, best, np.inf), np.sqrt(variance), shift, level, freedom, basis)
+
+
+def _framed(
+    best: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+    shift: Shift,
+    level: float,
+    freedom: int,
+    basis: str,
+) -> pd.DataFrame:
+    """Predictions with their intervals, Student's t as wide as a deviation [n], [dB]."""
+    reached = np.isfinite(best)
+    half = np.where(reached, stdtrit(freedom, (1 + level) / 2) * deviation, np.nan)
+    said = np.where(shift.spread > 0, f"{basis}, group never measured", basis)
     return pd.DataFrame(
         {
             "path_loss_db": best,
@@ -205,13 +234,37 @@ class Shift(NamedTuple):
     spread: NDArray[np.float64]
 
 
+def _chosen(
+    result: Result, chosen: Chosen, setup: Setup, progress: Progress | None, strangers: bool
+) -> tuple[NDArray[np.float64], Shift]:
+    """Path loss by the model that was chosen, without its nuisances [n], [dB], and these."""
+    links = setup.links
+    shift = _shift(_chosen_terms(chosen, links), links, {}, strangers)
+    if chosen.parameters is None:
+        carrier = result.study.scene.frequency if links.frequency is None else links.frequency
+        return 20 * np.log10(np.full(len(links), carrier) / result.study.scene.frequency), shift
+    values = np.array([[chosen.parameters[name] for name in setup.parameters.names]])
+    loss = replay(setup, setup.trace(result.materials, progress)).path_loss(values)[0]
+    ceiling = result.study.objective.ceiling_db
+    return loss if ceiling is None else np.minimum(loss, ceiling), shift
+
+
+def _chosen_terms(chosen: Chosen, links: Measurements) -> Iterator[KnownTerm]:
+    for term in chosen.terms:
+        labels = None
+        if term.per == TRANSMITTER:
+            labels = transmitters(links)
+        elif term.per:
+            labels = links.group if term.per == OFFSET else links.table.labels(term.per)
+        yield term.name, _column(links, term.by, term.centre), labels, term.coefficients
+
+
 def _shift(
-    result: Result, links: Measurements, draws: dict[str, list[float]], strangers: bool = False
+    terms: Iterator[KnownTerm], links: Measurements, draws: dict[str, list[float]], strangers: bool = False
 ) -> Shift:
     count = 1 + len(next(iter(draws.values()), ()))
     value, variance = np.zeros((count, len(links))), np.zeros(len(links))
-    for name, by, labels, known in _terms(result, links):
-        column = np.ones(len(links)) if by == CONSTANT else _column(result, links, name, by)
+    for name, column, labels, known in terms:
         best = np.array(list(known.values()))
         every = np.stack([
             np.array([known[label], *draws.get(f"{name}[{label}]" if label else name, [known[label]] * (count - 1))])
@@ -232,23 +285,22 @@ def _shift(
     return Shift(value, np.sqrt(variance))
 
 
-def _terms(
-    result: Result, links: Measurements
-) -> Iterator[tuple[str, str, NDArray[np.str_] | None, dict[str, float]]]:
+def _terms(result: Result, links: Measurements) -> Iterator[KnownTerm]:
     """Name, column, labels at the links and coefficients of every nuisance."""
     if result.offsets_db:
         grouped = result.study.offset is not None and result.study.offset.per is not None
-        yield OFFSET, CONSTANT, links.group if grouped else None, result.offsets_db
+        yield OFFSET, np.ones(len(links)), links.group if grouped else None, result.offsets_db
     for name, known in result.nuisances.items():
         section = result.study.nuisance[name]
         labels = None if section.per is None else links.table.labels(section.per)
         if known:
-            yield name, section.by, labels, known
+            yield name, _column(links, section.by, result.nuisance_centres.get(name, 0.0)), labels, known
 
 
-def _column(result: Result, links: Measurements, name: str, by: str) -> NDArray[np.float64]:
-    value = np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)
-    return value - result.nuisance_centres.get(name, 0.0)
+def _column(links: Measurements, by: str, centre: float) -> NDArray[np.float64]:
+    if by == CONSTANT:
+        return np.ones(len(links))
+    return (np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)) - centre
 
 
 def _check_files(result: Result, setup: Setup) -> None:

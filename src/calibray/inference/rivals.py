@@ -77,6 +77,27 @@ def log_distance(links: Measurements, objective: Objective, frequency: float) ->
     Raises:
         EngineError: Fewer than two links count.
     """
+    law, rise = fitted_law(links, objective, frequency)
+    filled, _ = law.nuisance.filled(law.coefficients(rise[None]), objective.weight > 0)
+    return law.nuisance.contribution(filled)[0] + rise
+
+
+def fitted_law(
+    links: Measurements, objective: Objective, frequency: float
+) -> tuple[Objective, NDArray[np.float64]]:
+    """The log-distance model as an objective of its own, whose terms are all that it has.
+
+    Args:
+        links: All links.
+        objective: What the twin is fitted by.
+        frequency: Carrier of the study [Hz].
+
+    Returns:
+        The objective, and what it is fitted beside: the rise over carriers in free space [L], [dB].
+
+    Raises:
+        EngineError: Fewer than two links count.
+    """
     rise = np.zeros(len(links)) if links.frequency is None else 20 * np.log10(links.frequency / frequency)
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model needs at least two links")
@@ -88,15 +109,7 @@ def log_distance(links: Measurements, objective: Objective, frequency: float) ->
         if (by, ("",)) not in kinds:
             name = next(each for each in (by, f"{by} of all", f"{by} of all links") if each not in names)
             terms.append(make_term(links, name, by))
-    law = replace(
-        objective,
-        measured=objective.measured - rise,
-        nuisance=Nuisance(len(links), tuple(terms)),
-        ceiling_db=None,
-    )
-    coefficients = law.coefficients(np.zeros((1, len(links))))
-    filled, _ = law.nuisance.filled(coefficients, objective.weight > 0)
-    return law.nuisance.contribution(filled)[0] + rise
+    return replace(objective, nuisance=Nuisance(len(links), tuple(terms)), ceiling_db=None), rise
 
 
 def kriging(links: Measurements, objective: Objective, law: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.progress import Progress
+from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.result.rows import COLUMNS, read_rows
 from calibray.result.stored import VERSION, read_stored
 from calibray.result.tables import summary
@@ -88,6 +89,7 @@ class Result:
         residual_basis: What it was taken from.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
         paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
+        chosen: The model that did best on blocks held out in turn, which predictions go by; None where none were.
         prepared: What was left out, averaged or moved before rows were links, and how many of them.
     """
 
@@ -133,6 +135,7 @@ class Result:
     cheap_seconds: float = 0.0
     residual_db: float | None = None
     residual_basis: str = ""
+    chosen: Chosen | None = None
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -240,6 +243,7 @@ class Result:
             "cheap_seconds": self.cheap_seconds,
             "residual_db": self.residual_db,
             "residual_basis": self.residual_basis,
+            "chosen": None if self.chosen is None else asdict(self.chosen),
         }
 
     @classmethod
@@ -269,6 +273,9 @@ class Result:
         if stored.links is not None and stored.antennas_indoors is not None:
             tx, rx = stored.links.rows_with_enclosed_tx or (), stored.links.rows_with_enclosed_rx or ()
             given["enclosed"] = Enclosed(tx, rx, stored.antennas_indoors)
+        if stored.chosen is not None:
+            terms = tuple(ChosenTerm(**asdict(each)) for each in stored.chosen.terms)
+            given["chosen"] = replace(Chosen(**asdict(stored.chosen)), terms=terms)
         given["intervals"] = {name: Interval(**asdict(each)) for name, each in stored.intervals.items()}
         given["materials"] = {name: Material(**asdict(each)) for name, each in stored.materials.items()}
         return cls(**{**given, "study": study, "links": links, "history": history})

@@ -13,6 +13,7 @@ from calibray.closed import CLOSED, Section
 from calibray.errors import InputError
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
+from calibray.result.chosen import Chosen
 from calibray.spelling import shortened
 from calibray.study import Study
 from calibray.study.faults import explain
@@ -23,9 +24,11 @@ VERSION = 1
 if TYPE_CHECKING:
     _Interval = Interval
     _Material = Material
+    _Chosen = Chosen
 else:
     _Interval = checked(Interval, config=CLOSED, frozen=True)
     _Material = checked(Material, config=CLOSED, frozen=True)
+    _Chosen = checked(Chosen, config=CLOSED, frozen=True)
 
 Count = Annotated[int, Field(ge=0)]
 Error = Annotated[float, Field(ge=0)]
@@ -91,6 +94,7 @@ class Stored(Section):
     cheap_seconds: Seconds = 0.0
     residual_db: Error | None = None
     residual_basis: str = ""
+    chosen: _Chosen | None = None
 
 
 def read_stored(source: Path) -> tuple[Stored, Study]:

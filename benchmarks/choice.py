@@ -1,0 +1,117 @@
+"""Whether the model chosen by held-out blocks is the right one where nothing was fitted or chosen.
+
+    CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml examples/auckland_tower.toml
+    python benchmarks/choice.py --chance 100 --workers 2
+
+Nested: each block is held out in turn; all models are validated on blocks of the rest, the one that is best there is
+fitted to the rest, and judged by the block, which had no say. Beside its pooled RMSE stands every model's own, and how
+often the block's links lie in the 90 % interval as wide as the chosen model's errors on the inner blocks.
+
+With `--chance`, the twin without a chance: measurements from a log-distance law with noise, in the demo district. The
+sentence must say that calibration did not help; the script fails where it does so in fewer than 95 of 100.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.special import stdtrit
+
+from calibray import engines
+from calibray.calibration.problem import Problem
+from calibray.calibration.validate import models, validated
+from calibray.calibration.weighing import weighed
+from calibray.inference.blocks import blocks as parted
+from calibray.scenarios import demo_study_path
+from calibray.study import Study
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render
+
+LEVEL = 0.9
+NOISE_DB = 4.0
+INTERCEPT_DB, SLOPE_DB = 40.0, 35.0
+
+
+def opened(file: str) -> Problem:
+    """A study's problem over all its links, those that it holds out included."""
+    setup = Study.load(file).opened()
+    setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
+    return weighed(Problem.of(setup, engines.make(setup)))
+
+
+def nested(problem: Problem, count: int) -> tuple[Table, str]:
+    """Leave one block out, and choose without it."""
+    links, objective = problem.setup.links, problem.objective
+    counted = np.flatnonzero(objective.weight > 0)
+    block = np.full(len(links), -1)
+    block[counted] = parted(links.rx[counted, :2], count)
+    errors, inside, chosen = {}, [], []
+    mine = np.full(len(links), np.nan)
+    for number in range(count):
+        here = block == number
+        part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
+        inner = validated(part)
+        for name, model in models(part, np.zeros((0, len(problem.parameters)))).items():
+            errors.setdefault(name, np.full(len(links), np.nan))[here] = (model - objective.measured)[here]
+        best = inner.best
+        chosen.append(best)
+        mine[here] = errors[best][here]
+        judged = mine[here][np.isfinite(mine[here])]
+        reach = stdtrit(np.count_nonzero(inner.block >= 0), (1 + LEVEL) / 2) * inner.scale(best)
+        inside += (np.abs(judged) <= reach).tolist()
+        print(f"block {number + 1} of {count}: {best}", file=sys.stderr)
+    rmse = {name: float(np.sqrt(np.nanmean(each**2))) for name, each in errors.items()}
+    rows = [("chosen without the block", f"{np.sqrt(np.nanmean(mine**2)):.2f}", f"{np.mean(inside):.0%}")]
+    rows += [(name, f"{value:.2f}", "") for name, value in sorted(rmse.items(), key=lambda each: each[1])]
+    columns = (Column("model"), numbers("RMSE", "dB"), numbers(f"in {LEVEL:.0%} interval"))
+    return Table(f"{links.source}: {len(counted)} links, {count} blocks", columns, tuple(rows)), ", ".join(
+        chosen
+    )
+
+
+@cache
+def _demo() -> Problem:
+    return opened(str(demo_study_path()))
+
+
+def without_a_chance(seed: int) -> str:
+    """What is said of a twin whose measurements follow distance alone."""
+    problem = _demo()
+    links, random = problem.setup.links, np.random.default_rng([seed, 5])
+    law = INTERCEPT_DB + SLOPE_DB * np.log10(links.distance)
+    measured = law + NOISE_DB * random.standard_normal(len(links))
+    return validated(replace(problem, objective=replace(problem.objective, measured=measured))).sentence
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("studies", nargs="*", help="study files")
+    parser.add_argument("--blocks", type=int, default=4)
+    parser.add_argument("--chance", type=int, default=0, help="repetitions of the twin without a chance")
+    parser.add_argument("--workers", type=int, default=1)
+    given = parser.parse_args()
+    for file in given.studies:
+        table, chosen = nested(opened(file), given.blocks)
+        print(render(table, f"Chosen for each block: {chosen}."))
+    if not given.chance:
+        return
+    if given.workers > 1:
+        with ProcessPoolExecutor(given.workers, multiprocessing.get_context("spawn")) as pool:
+            said = list(pool.map(without_a_chance, range(given.chance)))
+    else:
+        said = [without_a_chance(seed) for seed in range(given.chance)]
+    right = sum(sentence.startswith("Calibration did not") for sentence in said)
+    print(f"A twin without a chance is called so in {right} of {given.chance} repetitions.")
+    if right < 0.95 * given.chance:
+        sys.exit("too often a twin without a chance is said to help")
+
+
+if __name__ == "__main__":
+    main()

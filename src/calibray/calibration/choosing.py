@@ -1,0 +1,62 @@
+"""The model that did best where nothing was fitted, fitted once more to all links."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.calibration.problem import Problem
+from calibray.calibration.validate import TX_OFFSET, fitted_twins
+from calibray.inference.nuisance import OFFSET
+from calibray.inference.objective import Objective
+from calibray.inference.rivals import fitted_law
+from calibray.inference.validation import FIELD, KRIGING, LAW, Validation
+from calibray.result.chosen import Chosen, ChosenTerm
+from calibray.study import Study
+
+
+def choose_model(problem: Problem, validation: Validation, best: NDArray[np.float64]) -> Chosen:
+    """Fit the model that held-out blocks speak for to all links that count.
+
+    Kriging is not among those chosen from: it tells nothing beyond the measured places, which blocks are not about.
+
+    Args:
+        problem: The problem.
+        validation: Held-out errors of every model.
+        best: The calibrated optimum, a point of the search space [d].
+
+    Returns:
+        The model.
+    """
+    figures = validation.table["rmse_db"].drop([KRIGING, FIELD], errors="ignore")
+    name = str(figures.idxmin())
+    count = int(np.count_nonzero(validation.block >= 0))
+    basis = f"{name}, errors on {len(validation.labels)} blocks held out in turn"
+    size = validation.scale(name)
+    study, frequency = problem.setup.study, problem.setup.study.scene.frequency
+    if name == LAW:
+        law, rise = fitted_law(problem.setup.links, problem.objective, frequency)
+        return Chosen(name, None, _terms(law, rise[None], study), size, basis, count)
+    variant, point = fitted_twins(problem, best[None])[name]
+    told = variant.evaluate(point[None])
+    values = problem.parameters.named(problem.parameters.from_search(point))
+    return Chosen(name, values, _terms(variant.objective, told.modelled, study), size, basis, count)
+
+
+def _terms(objective: Objective, path_loss: NDArray[np.float64], study: Study) -> tuple[ChosenTerm, ...]:
+    """Terms and their coefficients where the model gives a path loss [1, L]."""
+    coefficients = objective.coefficients(path_loss)
+    filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
+    found, first = [], 0
+    for term in objective.nuisance.terms:
+        values = filled[0, first : (first := first + len(term.labels))].tolist()
+        if term.labels == ("",):
+            per = ""
+        elif term.name == TX_OFFSET:
+            per = "transmitter"
+        else:
+            per = OFFSET if term.name == OFFSET else str(study.nuisance[term.name].per)
+        found.append(
+            ChosenTerm(term.name, term.by, per, dict(zip(term.labels, values, strict=True)), term.centre)
+        )
+    return tuple(found)
