@@ -91,7 +91,7 @@ class ScreenedSGWOIM(Optimizer):
         self.elites = min(whole("elites", elites, at_least=1), self.population)
         self.w_min = real("w_min", w_min, at_least=0.0, at_most=1.0)
         self.w_max = real("w_max", w_max, at_least=0.0, at_most=1.0)
-        self._screen = screen
+        self._screen, self._screened = screen, np.zeros(0)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
 
@@ -128,6 +128,7 @@ class ScreenedSGWOIM(Optimizer):
         if not len(archive) or not np.isfinite(archive.best.y):
             return screen(positions)
         told = archive.imputed(archive.all())
+        self._screened = np.append(self._screened, screen(told.x[len(self._screened) :]))
         spanned = np.linalg.matrix_rank(told.x - told.x.mean(axis=0)) == self.box.dimension
-        missed = interpolated(self.box, told.x, told.y - screen(told.x), positions) if spanned else 0.0
+        missed = interpolated(self.box, told.x, told.y - self._screened, positions) if spanned else 0.0
         return screen(positions) + missed
