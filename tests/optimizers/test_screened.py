@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calibray.optimizers import SGWOIM, ScreenedSGWOIM, landscapes, make
+from calibray.optimizers.cheap_model import Differenced, value_of
 
 
 def run(screen, seed, budget=60):
@@ -49,3 +50,11 @@ def test_a_cheap_model_chooses_the_first_wolves():
     first = optimizer.ask()
     assert first.shape == (5, 2)
     assert np.abs(first - 0.3).max() < 0.15
+
+
+def test_the_value_of_a_cheap_model_is_that_of_the_rows_it_knows():
+    known = np.array([True, True, False])
+    model = Differenced(
+        lambda x, _: np.stack([x[:, 0], 2.0 * x[:, 0], 1e6 + x[:, 0]], axis=1), np.ones(1), known
+    )
+    assert value_of(model, np.array([[1.0], [3.0]])) == pytest.approx(np.sqrt(2.5) * np.array([1.0, 3.0]))

@@ -25,8 +25,8 @@ from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.progress import Progress
 
-METHOD: Final = "space-mapping"
-"""The method that takes a cheap model."""
+HELPED: Final = ("space-mapping", "sgwo-im-screened")
+"""The methods that take a cheap model."""
 
 SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity": 0.2}
 """Standard deviation of the logarithm of a constant around what the study says."""
@@ -211,7 +211,7 @@ def aid(problem: Problem, progress: Progress | None = None) -> Aid:
     """
     setup = problem.setup
     section = setup.study.method
-    wanted = section.name in (AUTO, METHOD) and section.model == "replay"
+    wanted = section.name in (AUTO, *HELPED) and section.model == "replay"
     if not wanted or not setup.study.engine.dear or problem.observable is not PATH_LOSS:
         return Aid()
     try:

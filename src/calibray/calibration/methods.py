@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,7 @@ from calibray.calibration.problem import Problem
 from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, Optimizer
-from calibray.optimizers.cheap_model import CheapModel
+from calibray.optimizers.cheap_model import CheapModel, value_of
 from calibray.parameters import Parameters
 from calibray.spelling import did_you_mean
 from calibray.study import Setup, Study
@@ -91,6 +92,7 @@ def _make(
             section.seed,
             start=parameters.to_search(parameters.start),
             starts=None if interactions is None else local_searches(interactions),
+            screen=None if model is None else partial(value_of, model),
             model=model,
             options=section.options,
         )

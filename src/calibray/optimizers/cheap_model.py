@@ -71,6 +71,20 @@ class CheapModel(Protocol):
         ...
 
 
+def value_of(model: CheapModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The objective of a cheap model with the constants that it was told, over the rows that it knows.
+
+    Args:
+        model: The model.
+        points: Points of the box [n, d].
+
+    Returns:
+        Root mean square of its residuals [n].
+    """
+    constants = np.repeat(model.constants.centre[None], len(points), axis=0)
+    return np.sqrt(np.mean(model.residuals(points, constants)[:, model.known] ** 2, axis=1))
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Differenced:
