@@ -219,8 +219,15 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(result, tmp_pa
 
 def test_figures_are_written_as_svg_and_png(written):
     names = {path.name for path in (written / "figures").iterdir() if path.suffix in (".svg", ".png")}
-    stems = {"convergence", "cumulative-cost", "path-loss", "residual-over-distance", "residual-by-group"}
-    assert names == {f"{stem}.{suffix}" for stem in stems for suffix in ("svg", "png")}
+    stems = {
+        "convergence",
+        "cumulative-cost",
+        "path-loss",
+        "residual-over-distance",
+        "residual-by-group",
+        "power",
+    }
+    assert names >= {f"{stem}.{suffix}" for stem in stems for suffix in ("svg", "png")}
     for path in (written / "figures").glob("*.svg"):
         ElementTree.parse(path)
 
@@ -283,7 +290,7 @@ def test_the_summary_says_what_the_data_cannot_tell(result):
 
 def test_bars_stand_where_the_values_are(result):
     entry = values(replace(result, intervals={}))[0]
-    assert "lower" not in entry.places
+    assert entry.pieces == ()
     content = result.study.content()
     name = next(iter(content["parameters"]))
     content["parameters"][name] = {"bounds": [1.0, 100.0], "scale": "log", "start": 10.0}
@@ -292,8 +299,9 @@ def test_bars_stand_where_the_values_are(result):
         initial_parameters=result.initial_parameters | {name: 10.0},
         intervals={name: Interval(1.0, 10**0.5, 1000.0, "identified")},
     )  # fmt: skip
-    places = values(logarithmic)[0].places
-    assert places == pytest.approx({"before": 0.5, "after": 0.75, "lower": 0.25, "upper": 1.0})
+    entry = values(logarithmic)[0]
+    assert entry.places == pytest.approx({"before": 0.5, "after": 0.75})
+    assert entry.pieces == pytest.approx(((0.25, 1.0),))
 
 
 # Map and scene

@@ -145,6 +145,7 @@ def outcome(
         paths=paths,
         power_shares=seen.power_shares,
         prepared=links.prepared | ({} if problem.faint is None else {FAINT: int(problem.faint.sum())}),
+        validation=validation,
         nuisances={
             name: {label: value for label, value in values.items() if value is not None}
             for name, values in terms.items()

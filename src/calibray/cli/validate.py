@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from calibray.cli.console import StudyFile, log
+from calibray.cli.console import Overwrite, StudyFile, log
 
 
 def validate(
@@ -27,14 +28,33 @@ def validate(
             metavar="COLUMN", help="Hold out each label of a column in turn; tx for each transmitter."
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            help="Write it into this folder, that of a result of the study: `calibray report DIR` shows it then.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Calibrate without each block of links in turn, and judge the twin and its rivals by the block left out."""
     from calibray.calibration.validate import validate as judge
     from calibray.cli.progress import progress_bars
+    from calibray.files import check_outputs
+    from calibray.result.validation import FILE, write_validation
     from calibray.study import Study
     from calibray.tables.text import render
 
+    study = Study.load(study_file)
+    if out is not None:
+        check_outputs(out, (FILE,), study.files(), overwrite)
     with progress_bars(log) as progress:
-        found = judge(Study.load(study_file), blocks=blocks, by=by, progress=progress)
+        found = judge(study, blocks=blocks, by=by, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_validation(found, out)
+        typer.echo(f"Written to {out / FILE}", err=True)

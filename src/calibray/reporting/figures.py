@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from calibray.comparison.labels import label
+from calibray.reporting.examining import examined
 from calibray.reporting.style import (
     BLUE,
     COLORS,
@@ -229,7 +230,7 @@ def every(result: Result, links: Survey | None) -> dict[str, Figure]:
         figures["residual-over-distance"] = residual_over_distance(links)
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
-    return figures
+    return figures | examined(result)
 
 
 def _unequal(results: Mapping[str, Result]) -> bool:

@@ -11,7 +11,7 @@ import math
 import shlex
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -33,6 +33,7 @@ from calibray.reporting.solid import packed
 from calibray.reporting.survey import Survey, residual, survey
 from calibray.reporting.values import values
 from calibray.result import tables
+from calibray.result.diagnostics import remarkable
 from calibray.scenes import Scene, read_scene
 from calibray.scenes.triangles import Triangles, read_triangles
 from calibray.tables import Column, Table, numbers
@@ -56,6 +57,17 @@ CAPTIONS: Final = {
     "cumulative-cost": "RT calls and time spent, over the method's iterations.",
     "path-loss": "Path loss of every link: measured, before calibration and after; shaded where held out.",
     "residual-over-distance": "Calibrated minus measured path loss over the distance between the antennas.",
+    "possible-values": "Draws of every parameter that explain the links, over its bounds: bars where they lie, wide "
+    "lines for the 95 % interval, dashes for the value before, a line for the calibrated one.",
+    "held-out-errors": "Share of the links held out whose error is within so many dB, by model; the best model bold.",
+    "held-out-blocks": "RMSE on each block that was held out, by model.",
+    "power": "What the links' power passes by: share of it on paths that meet a material, by kind of interaction. What "
+    "a path meets counts in full.",
+    "neighbours": "Half the mean square difference of residuals over the distance between receivers: where it rises, "
+    "neighbours share their errors.",
+    "leverage": "Residuals over leverage: near 1 a link decides something alone, and its residual tells nothing.",
+    "residual-by-depth": "Mean residual by interactions of the strongest path, with two standard errors; links in "
+    "brackets.",
     "residual-by-group": "The same by group: median, quartiles, and whiskers around 90 % of the links.",
 }
 
@@ -198,7 +210,13 @@ def page(result: Result, shown: Shown, figures: Mapping[str, Figure]) -> str:
         missing=shown.missing,
         triangles=shown.triangles,
         accuracy=tables.accuracy(result),
-        diagnostics=(tables.links(result), tables.costs(result)),
+        validation=None if result.validation is None else result.validation.summary(),
+        diagnostics=(
+            replace(remarkable(result), title=""),
+            tables.remarks(result),
+            tables.links(result),
+            tables.costs(result),
+        ),
         study=json.dumps(result.study.content(), indent=2, ensure_ascii=False),
         commands=_commands(result),
         versions=_versions(),

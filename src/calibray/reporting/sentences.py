@@ -87,6 +87,12 @@ def _fit(result: Result) -> Sentence:
 
 def _help(result: Result) -> Sentence:
     heading = "Did it help where nothing was fitted?"
+    if (found := result.validation) is not None:
+        text = (
+            f"{len(found.labels)} blocks of links were held out in turn. {found.sentence} The least RMSE there has the "
+            f"model {found.best!r}, {found.table['rmse_db'].min():.2f} dB."
+        )
+        return Sentence(heading, text, "good" if found.judgement.helped else "caution")
     after, before = result.holdout_rmse_db, result.initial_holdout_rmse_db
     if after is None or before is None:
         return Sentence(
@@ -160,6 +166,8 @@ def _sure(result: Result) -> Iterator[Sentence]:
             "good",
         )
     for verdict, meaning in (
+        ("weakly identified", "told roughly: their intervals take up much of their ranges"),
+        ("ambiguous", "told to lie in one of several ranges; which of them, these links do not tell"),
         (
             "at bound",
             "at an end of their bounds: the best value may lie beyond, or the model lacks something",
@@ -172,10 +180,16 @@ def _sure(result: Result) -> Iterator[Sentence]:
 
 
 def _next(result: Result, meets: Mapping[str, int] | None) -> Iterator[Sentence]:
-    unsure = list(dict.fromkeys(name.rpartition(".")[0] for name in _by_verdict(result, "not identifiable")))
+    blind = _by_verdict(result, "not identifiable")
+    if result.draws and (blind or _by_verdict(result, "ambiguous")):
+        yield Sentence(
+            "What to measure next?",
+            "calibray suggest DIR CANDIDATES ranks places by how much narrower the intervals would become.",
+        )
+    unsure = list(dict.fromkeys(name.rpartition(".")[0] for name in blind))
     if not unsure:
         return
-    heading = "What to measure next?"
+    heading = "" if result.draws else "What to measure next?"
     if meets is None:
         yield Sentence(heading, f"Links whose strongest paths meet {_list(unsure)}.")
         return

@@ -8,11 +8,18 @@ from math import log
 from typing import TYPE_CHECKING
 
 from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.result.tables import ends_text
 
 if TYPE_CHECKING:
     from calibray.result import Result
 
-MARKS = {"identified": "●", "at bound": "◐", "not identifiable": "○"}
+MARKS = {
+    "identified": "●",
+    "weakly identified": "◕",
+    "ambiguous": "◑",
+    "at bound": "◐",
+    "not identifiable": "○",
+}
 
 
 @dataclass(frozen=True)
@@ -28,7 +35,9 @@ class Value:
         verdict: How far the data tell it.
         bounds: Its bounds, lower and upper.
         scale: "linear" or "log".
-        places: Where on the bar the values before and after stand, and the interval begins and ends, each 0 to 1.
+        places: Where on the bar the values before and after stand, each 0 to 1.
+        pieces: Where every piece of the interval begins and ends, each 0 to 1.
+        reason: Why the verdict is what it is; empty where that is not known.
     """
 
     name: str
@@ -40,6 +49,8 @@ class Value:
     bounds: tuple[str, str]
     scale: str
     places: dict[str, float]
+    pieces: tuple[tuple[float, float], ...] = ()
+    reason: str = ""
 
     @property
     def mark(self) -> str:
@@ -61,8 +72,7 @@ def values(result: Result) -> list[Value]:
         entry, interval = result.study.parameters[name], result.intervals.get(name)
         before, place = result.initial_parameters[name], _scale(*entry.bounds, entry.scale)
         places = {"before": place(before), "after": place(after)}
-        if interval is not None:
-            places |= {"lower": place(interval.lower), "upper": place(interval.upper)}
+        pieces = () if interval is None else interval.pieces or ((interval.lower, interval.upper),)
         unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
         found.append(
             Value(
@@ -70,11 +80,13 @@ def values(result: Result) -> list[Value]:
                 "" if unit == "1" else unit,
                 f"{before:.4g}",
                 f"{after:.4g}",
-                "" if interval is None else f"{interval.lower:.4g} to {interval.upper:.4g}",
+                "" if interval is None else ends_text(interval),
                 "not known" if interval is None else interval.verdict,
                 (f"{entry.bounds[0]:.4g}", f"{entry.bounds[1]:.4g}"),
                 entry.scale,
                 places,
+                tuple((place(low), place(high)) for low, high in pieces),
+                "" if interval is None else interval.reason,
             )
         )
     return found

@@ -159,7 +159,7 @@ def _trade_offs(result: Result) -> pd.DataFrame:
     names = [name for name, values in result.draws.items() if np.ptp(values) > 0]
     if not 2 <= len(names) <= PAIRS:
         return pd.DataFrame()
-    matrix = np.corrcoef([_searched(result, name) for name in names])
+    matrix: NDArray[np.float64] = np.corrcoef([_searched(result, name) for name in names])
     rows = [
         {"first": names[i], "second": names[k], "correlation": float(matrix[i, k])}
         for i, k in combinations(range(len(names)), 2)
@@ -226,13 +226,16 @@ def _spread_said(known: dict[str, pd.DataFrame], name: str, words: str) -> str:
     if name not in known or len(known[name]) < 2:
         return ""
     table = known[name]
-    error = table["standard_deviation_db"] / np.sqrt(table["links"].clip(lower=1))
     many = table[table["links"] >= 3]
     if not len(many):
         return ""
-    worst = many.loc[many["mean_db"].abs().idxmax()]
+    worst = many.iloc[int(np.argmax(many["mean_db"].abs()))]
     label = f"{worst[name]:g}" if isinstance(worst[name], float) else str(worst[name])
-    clear = "" if abs(worst["mean_db"]) > CLEAR * error[worst.name] else ", which may be chance"
+    clear = (
+        ""
+        if abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
+        else ", which may be chance"
+    )
     said = words.format(label)
     return f"furthest off are {said}: {worst['mean_db']:+.1f} dB on the mean of {worst['links']:.0f} links{clear}"
 
@@ -243,7 +246,8 @@ def _neighbours_said(known: dict[str, pd.DataFrame]) -> str:
     table = known["neighbours"]
     nearest, level = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
     share = 1.0 - nearest["semivariance_db2"] / level if level > 0 else 0.0
-    if share < 0.2:
+    # A semivariance of so many pairs is known to about this share of itself.
+    if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
         return f"receivers {nearest['distance_m']:.0f} m apart share no more of their errors than others do"
     return f"receivers {nearest['distance_m']:.0f} m apart share {share:.0%} of the variance of their errors"
 
@@ -257,8 +261,9 @@ def _leverage_said(known: dict[str, pd.DataFrame]) -> str:
     mighty = table[table["leverage"] > DECIDING]
     if len(mighty):
         rows = rows_text(mighty["row"].tolist())
-        return f"{len(mighty)} links decide something almost alone (leverage above {DECIDING:g}): {rows}"
-    top = table.loc[table["leverage"].idxmax()]
+        links = "link decides" if len(mighty) == 1 else "links decide"
+        return f"{len(mighty)} {links} something almost alone (leverage above {DECIDING:g}): {rows}"
+    top = table.iloc[int(np.argmax(table["leverage"]))]
     return f"no link decides anything alone; the largest is {top['leverage']:.2f}, in row {top['row']:.0f}"
 
 
@@ -276,7 +281,7 @@ def _moved_said(known: dict[str, pd.DataFrame]) -> str:
     if "moved" not in known:
         return ""
     table = known["moved"]
-    far = table.loc[table["moved"].abs().idxmax()]
+    far = table.iloc[int(np.argmax(table["moved"].abs()))]
     return (
         f"furthest {far['parameter']}, from {far['before']:.4g} to {far['after']:.4g}: {abs(far['moved']):.0%} of "
         "its range"

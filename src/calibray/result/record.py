@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pandas as pd
@@ -22,10 +22,15 @@ from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.result.rows import COLUMNS, read_rows
 from calibray.result.stored import VERSION, read_stored
 from calibray.result.tables import summary
+from calibray.result.validation import FILE as VALIDATION_FILE
+from calibray.result.validation import read_validation, write_validation
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.study import Study
 from calibray.tables import glance
 from calibray.tracing.enclosed import Enclosed
+
+if TYPE_CHECKING:
+    from calibray.inference.validation import Validation
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
 """What a result is written to; users have files called links.csv and scene.xml themselves."""
@@ -81,6 +86,7 @@ class Result:
         remarks: What is to be said aloud of this calibration, a sentence each.
         power_shares: Share of the links' power that paths with an interaction carry, by material and kind; "line of
             sight" for those without.
+        validation: Held-out errors of every model, where blocks were held out in turn; None where none were.
         profile_calls: Replays that intervals and draws took, beside the RT calls of the method.
         profile_seconds: Time that these took [s].
         cheap_calls: Replays of the cheap model that the method had beside the engine; none of them is an RT call.
@@ -129,6 +135,7 @@ class Result:
     free_offset_error_db: float | None = None
     remarks: tuple[str, ...] = ()
     power_shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    validation: Validation | None = None
     profile_calls: int = 0
     profile_seconds: float = 0.0
     cheap_calls: int = 0
@@ -172,7 +179,8 @@ class Result:
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
 
-        Each file is written beside its place and then moved there, so that none is ever half-written.
+        Where blocks were held out in turn, `result-validation.json` as well. Each file is written beside its place and
+        then moved there, so that none is ever half-written.
 
         Args:
             folder: Folder to write into; made if absent.
@@ -181,7 +189,7 @@ class Result:
         Raises:
             InputError: The folder cannot be written, or a file there must not be replaced.
         """
-        target = check_outputs(folder, FILES, self.study.files(), overwrite)
+        target = check_outputs(folder, (*FILES, VALIDATION_FILE), self.study.files(), overwrite)
         try:
             target.mkdir(parents=True, exist_ok=True)
             self._write(target)
@@ -197,6 +205,10 @@ class Result:
         export_scene(scene, self.materials, target / SCENE_FILE)
         write_text(target / LINKS_FILE, self.links.to_csv(index=False, float_format="%.10g"))
         write_text(target / HISTORY_FILE, self.history.to_csv(index=False, float_format="%.9g"))
+        # One of an earlier calibration is of that calibration.
+        (target / VALIDATION_FILE).unlink(missing_ok=True)
+        if self.validation is not None:
+            write_validation(self.validation, target)
         write_text(target / RESULT_FILE, json.dumps(self.content(), indent=2) + "\n")
 
     def content(self) -> dict[str, Any]:
@@ -263,7 +275,7 @@ class Result:
         source = Path(folder) / RESULT_FILE
         stored, study = read_stored(source)
         links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
-        for name in () if anyway else (RESULT_FILE, *COLUMNS):
+        for name in () if anyway else (RESULT_FILE, *COLUMNS, VALIDATION_FILE):
             if (source.parent / name).exists():
                 check_unchanged(source.parent / name)
         given = {name: getattr(stored, name) for name in type(stored).model_fields}
@@ -278,6 +290,7 @@ class Result:
             given["chosen"] = replace(Chosen(**asdict(stored.chosen)), terms=terms)
         given["intervals"] = {name: Interval(**asdict(each)) for name, each in stored.intervals.items()}
         given["materials"] = {name: Material(**asdict(each)) for name, each in stored.materials.items()}
+        given["validation"] = read_validation(source.parent, len(links))
         return cls(**{**given, "study": study, "links": links, "history": history})
 
     def predict(
