@@ -301,7 +301,7 @@ def test_bars_stand_where_the_values_are(result):
     )  # fmt: skip
     entry = values(logarithmic)[0]
     assert entry.places == pytest.approx({"before": 0.5, "after": 0.75})
-    assert entry.pieces == pytest.approx(((0.25, 1.0),))
+    assert entry.pieces[0] == pytest.approx((0.25, 1.0))
 
 
 # Map and scene

@@ -159,7 +159,7 @@ def _trade_offs(result: Result) -> pd.DataFrame:
     names = [name for name, values in result.draws.items() if np.ptp(values) > 0]
     if not 2 <= len(names) <= PAIRS:
         return pd.DataFrame()
-    matrix: NDArray[np.float64] = np.corrcoef([_searched(result, name) for name in names])
+    matrix = np.atleast_2d(np.corrcoef([_searched(result, name) for name in names]))
     rows = [
         {"first": names[i], "second": names[k], "correlation": float(matrix[i, k])}
         for i, k in combinations(range(len(names)), 2)
