@@ -146,11 +146,64 @@ def test_missing_mesh(tmp_path: Path) -> None:
 
 def test_damaged_mesh_is_told_by_the_tracer(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
-    (tmp_path / "meshes" / "floor.ply").rename(tmp_path / "meshes" / "floor.obj")
-    file.write_text(file.read_text().replace("floor.ply", "floor.obj").replace('"ply"', '"obj"'))
+    (tmp_path / "meshes" / "floor.ply").rename(tmp_path / "meshes" / "floor.serialized")
+    file.write_text(
+        file.read_text().replace("floor.ply", "floor.serialized").replace('"ply"', '"serialized"')
+    )
     links = SimpleNamespace(tx=np.zeros((1, 3)), rx=np.ones((1, 3)))
     with pytest.raises(InputError, match=r"scene\.xml: Sionna RT cannot load the scene"):
         cb.trace(file, links, frequency=2e9, max_depth=0, samples=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", r"line 3: 'v 0 nan 0': a vertex is three finite numbers"),
+        ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0': a vertex is"),
+        (
+            "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n",
+            "line 4: 'f 1 2 4': a face names three or more of the 3 vertices",
+        ),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face names three"),
+        ("v 0 0 0\n", "has no faces"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1/1 -2/2/2 -1\n", None),
+    ],
+)
+def test_an_obj_mesh_that_cannot_be_traced_is_refused(tmp_path: Path, text: str, message: str | None) -> None:
+    file = write_scene(tmp_path, FLOOR)
+    (tmp_path / "meshes" / "floor.obj").write_text(text)
+    file.write_text(file.read_text().replace("floor.ply", "floor.obj").replace('"ply"', '"obj"'))
+    if message is None:
+        assert read_scene(file, 2e9).materials
+        return
+    with pytest.raises(InputError, match=message):
+        read_scene(file, 2e9)
+
+
+@pytest.mark.parametrize(
+    ("step", "sound"),
+    [
+        ('<scale value="0"/>', False),
+        ('<scale x="3" y="0" z="1"/>', False),
+        ('<scale value="nan"/>', False),
+        ('<translate x="inf"/>', False),
+        ('<rotate z="1" angle="north"/>', False),
+        ('<matrix value="1 0 0 0 0 1 0 0 0 0 0 0 0 0 0 1"/>', False),
+        ('<matrix value="1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1"/>', True),
+        ('<scale x="3" y="-2"/><rotate z="1" angle="30"/><translate x="0" y="4"/>', True),
+    ],
+)
+def test_a_transform_that_flattens_a_shape_is_refused(tmp_path: Path, step: str, sound: bool) -> None:
+    file = write_scene(tmp_path, FLOOR)
+    placed = f'<shape type="rectangle" id="mesh-sheet"><transform name="to_world">{step}</transform>'
+    file.write_text(
+        file.read_text().replace("<shape", f'{placed}<ref id="mat-stone" name="bsdf"/></shape><shape', 1)
+    )
+    if sound:
+        assert read_scene(file, 2e9).materials
+        return
+    with pytest.raises(InputError, match=r"of shape 'mesh-sheet' is .*leave the shape its width"):
+        read_scene(file, 2e9)
 
 
 def test_shape_without_a_material(tmp_path: Path) -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from calibray.errors import InputError
 from calibray.files import exists
+from calibray.scenes.obj import check_obj
 from calibray.scenes.ply import check_ply
 from calibray.spelling import shortened
 
@@ -157,6 +161,7 @@ def check_shape(shape: ElementTree.Element, path: Path) -> None:
             f"{path}: shape {name!r} is a {shortened(kind)!r}, must be one of {', '.join(SHAPES)}; "
             "export it as a triangle mesh"
         )
+    _check_transform(shape, path)
     filename = shape.find("string[@name='filename']")
     if filename is None:
         if kind in ("obj", "ply", "serialized"):
@@ -170,6 +175,27 @@ def check_shape(shape: ElementTree.Element, path: Path) -> None:
         )
     if kind == "ply":
         check_ply(mesh)
+    if kind == "obj":
+        check_obj(mesh)
+
+
+def _check_transform(shape: ElementTree.Element, path: Path) -> None:
+    """Refuse a transform that makes a shape flat or sends it nowhere: rays would pass as if it were not there."""
+    for step in shape.findall("transform/*"):
+        words = [value for key, value in step.attrib.items() if key in ("x", "y", "z", "value", "angle")]
+        try:
+            numbers = np.array([float(word) for text in words for word in re.split(r"[,\s]+", text.strip())])
+        except ValueError:
+            numbers = np.array([np.nan])
+        flat = step.tag == "scale" and not numbers.all()
+        if step.tag == "matrix" and len(numbers) in (9, 16):
+            with np.errstate(all="ignore"):
+                flat = np.linalg.det(numbers.reshape(int(np.sqrt(len(numbers))), -1)) == 0
+        if flat or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{path}: <{step.tag}> of shape {shape.get('id')!r} is {shortened(' '.join(words))!r}, must be finite "
+                "numbers that leave the shape its width; export the scene again"
+            )
 
 
 def check_files(root: ElementTree.Element, path: Path) -> None:

@@ -379,14 +379,12 @@ class _Drafting:
         keys += [each for each in section["tx"] if isinstance(each, str) and each in frame]
         places = len(frame[keys].drop_duplicates())
         copies = frame.duplicated([*keys, section["value"]]).any()
-        if places >= len(frame) / 2 and not copies:
+        if self.track is None and places >= len(frame) / 2 and not copies:
             return
         size = float(np.clip(round(WAVELENGTHS * speed_of_light / frequency, 1), 1.0, 10.0))
         section["average"] = {"by": "cell", "size": size, "unbiased": True}
-        reason = (
-            f"{len(frame)} rows at {places} places; {WAVELENGTHS} wavelengths even out fading; the logarithm of a mean "
-            "of few lies low"
-        )
+        taken = f"{len(frame)} rows " + ("along a track" if self.track else f"at {places} places")
+        reason = f"{taken}; {WAVELENGTHS} wavelengths even out fading"
         self._assume("links.average", f"cells of {size:g} m", reason)
 
     def _heights(self, section: dict[str, Any], tx: Place | None, rx: Place) -> None:
@@ -425,8 +423,7 @@ class _Drafting:
         self._assume(
             "trace.max_depth",
             depth,
-            f"straight lines cross up to {walls} walls; one reflection more, "
-            f"at least {_DEPTHS[0]}, at most {_DEPTHS[1]}: each more takes about three times the work",
+            f"straight lines cross up to {walls} walls; one reflection more, {_DEPTHS[0]} to {_DEPTHS[1]}",
         )
         return depth
 

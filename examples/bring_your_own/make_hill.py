@@ -1,0 +1,144 @@
+"""Make the hill of this folder: houses on a slope, and the log of a scanner carried past them along a GPX track.
+
+    python examples/bring_your_own/make_hill.py
+
+Everything is synthetic, so the truth is known: `hill/truth.json` holds the materials that walls and ground were given and
+what the mast transmits. The other files are all that a calibration gets to see: `houses.geojson`, footprints with
+heights; `ground.tif`, a height model above the sea; `walk.gpx`, a point every five seconds; `power.csv`, five values a
+second without positions; `masts.csv`, the mast's place and its height above the ground.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pandas as pd
+import rasterio
+from rasterio.transform import from_origin
+
+from calibray.coordinates import Frame
+from calibray.scenes.making import make_scene
+from calibray.scenes.overhead import Overhead
+from calibray.scenes.terrain import lowered, read_terrain
+from calibray.scenes.vectors import read_footprints
+from synthetic import amplitudes, sample
+
+FOLDER = Path(__file__).parent / "hill"
+SEED = 56
+FRAME = Frame.local(9.99, 50.01)
+FREQUENCY = 2.1e9  # [Hz]
+DEPTH = 3
+PLANTED = {
+    "walls": {"relative_permittivity": 4.4, "conductivity": 0.08},
+    "ground": {"relative_permittivity": 6.8, "conductivity": 0.07},
+}
+MAST = (-6.0, 0.0, 8.0)  # [m], its height above the ground
+EIRP_DBM = 31.0  # unknown to the user
+SPEED, RATE, TRACKED = 1.2, 5, 5  # [m/s], values a second, [s] between two points of the track
+GPS_ERROR = 0.4  # [m], standard deviation in x and in y
+HEIGHT = 1.5  # [m]
+START = pd.Timestamp("2026-05-04T09:00:00Z")
+HOUSES = [
+    (-70, 10, -40, 24, 8.0), (-30, 12, 5, 26, 10.5), (15, 10, 40, 25, 7.5), (48, 12, 75, 30, 12.0),
+    (-60, -28, -25, -12, 9.0), (-12, -30, 20, -14, 11.0), (30, -26, 70, -11, 8.5),
+]  # fmt: skip
+CORNERS = [(-72, -6), (-20, -6), (22, 4), (44, 4), (44, 34), (-35, 34)]
+"""The way, x and y [m]: along the street, then behind the houses."""
+
+
+def write_houses() -> None:
+    """Write the footprints."""
+    features = []
+    for west, south, east, north, height in HOUSES:
+        ring = [(west, south), (east, south), (east, north), (west, north), (west, south)]
+        degrees = FRAME.to_geographic([(*corner, 0.0) for corner in ring])[:, :2].round(7).tolist()
+        geometry = {"type": "Polygon", "coordinates": [degrees]}
+        features.append({"type": "Feature", "properties": {"height_m": height}, "geometry": geometry})
+    collection = {"type": "FeatureCollection", "features": features}
+    (FOLDER / "houses.geojson").write_text(json.dumps(collection) + "\n")
+
+
+def write_ground() -> None:
+    """Write the height model: 240 m above the sea, rising to the north-east, with a bump."""
+    west, south = FRAME.to_geographic([(-240.0, -240.0, 0.0)])[0][:2]
+    east, north = FRAME.to_geographic([(240.0, 240.0, 0.0)])[0][:2]
+    count = 17
+    x = y = np.linspace(-240.0, 240.0, count)
+    heights = 240 + 0.05 * x[None, :] + 0.03 * y[::-1, None]
+    heights = heights + 4 * np.exp(-((x[None, :] - 30) ** 2 + (y[::-1, None] - 30) ** 2) / 60**2)
+    step = (east - west) / (count - 1), (north - south) / (count - 1)
+    place = from_origin(west - step[0] / 2, north + step[1] / 2, *step)
+    with rasterio.open(
+        FOLDER / "ground.tif", "w", driver="GTiff", width=count, height=count, count=1, dtype="float32",
+        crs="EPSG:4326", transform=place, compress="deflate",
+    ) as file:  # fmt: skip
+        file.write(heights.astype("float32"), 1)
+
+
+def way(seconds: np.ndarray) -> np.ndarray:
+    """Where the scanner is, x and y [n, 2], [m]."""
+    corners = np.array(CORNERS, dtype=float)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    return np.stack([np.interp(SPEED * seconds, along, corners[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def main() -> None:
+    """Write the map, the log and the truth."""
+    FOLDER.mkdir(exist_ok=True)
+    write_houses()
+    write_ground()
+    rng = np.random.default_rng(SEED)
+    length = np.linalg.norm(np.diff(np.array(CORNERS), axis=0), axis=1).sum()
+    duration = int(length / SPEED)
+    with TemporaryDirectory() as folder:
+        found, frame = read_footprints(FOLDER / "houses.geojson", "height_m", 0.0)
+        bounds = found.bounds + 50 * np.array([-1, -1, 1, 1])
+        terrain, frame = lowered(read_terrain(FOLDER / "ground.tif", frame, bounds), frame)
+        scene = make_scene(found, Path(folder), frame, terrain).path
+        overhead = Overhead.of(scene)
+
+        def placed(points: np.ndarray, height: float) -> np.ndarray:
+            """Places of `FRAME` in the scene's, above its ground."""
+            degrees = FRAME.to_geographic(np.column_stack([points, np.zeros(len(points))]))
+            place = frame.to_scene(degrees[:, 0], degrees[:, 1], 0.0)
+            place[:, 2] = overhead.ground(place[:, 0], place[:, 1]) + height
+            return place
+
+        mast = placed(np.array([MAST[:2]]), MAST[2])
+        places = placed(way(np.arange(duration) + 0.5), HEIGHT)
+        gains = amplitudes(scene, mast, places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=200_000)[0]
+    rows = []
+    for value in range(duration * RATE):
+        # Along one second the amplitudes stay, the phases do not.
+        power = sample(gains[value // RATE], EIRP_DBM, rng)
+        rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", round(power, 1)))
+    log = pd.DataFrame(rows, columns=["time", "mast", "power_dbm"])
+    log.to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
+    seconds = np.arange(0, duration + TRACKED, TRACKED)
+    recorded = way(seconds) + rng.normal(0.0, GPS_ERROR, (len(seconds), 2))
+    degrees = FRAME.to_geographic(np.column_stack([recorded, np.zeros(len(seconds))]))
+    points = [
+        f'<trkpt lat="{latitude:.7f}" lon="{longitude:.7f}"><time>{START + pd.Timedelta(seconds=int(second)):%FT%TZ}'
+        "</time></trkpt>"
+        for second, (longitude, latitude, _) in zip(seconds, degrees, strict=True)
+    ]
+    lines = [
+        '<gpx version="1.1" creator="calibray example"><trk><trkseg>',
+        *points,
+        "</trkseg></trk></gpx>",
+        "",
+    ]
+    (FOLDER / "walk.gpx").write_text("\n".join(lines))
+    longitude, latitude, _ = FRAME.to_geographic([(*MAST[:2], 0.0)])[0]
+    (FOLDER / "masts.csv").write_text(
+        f"mast,longitude,latitude,height\nmast-1,{longitude:.7f},{latitude:.7f},{MAST[2]:g}\n"
+    )
+    truth = {"frequency": FREQUENCY, "eirp_dbm": EIRP_DBM, "materials": PLANTED, "gps_error": GPS_ERROR}
+    (FOLDER / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
