@@ -1,15 +1,20 @@
-"""A new user's walk: a map and a log, three commands, no edit and no line of code."""
+"""A new user's walks: a map or a plan, and a log; three commands, no edit and no line of code."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import pytest
 from typer.testing import CliRunner
 
 from calibray.cli.app import app
+from calibray.fields import path_loss
 from calibray.result import Result
+from calibray.study import Setup, Study
 
 TOWN = Path(__file__).parents[1] / "examples" / "bring_your_own"
 
@@ -44,3 +49,66 @@ def test_scene_init_run(tmp_path, monkeypatch):
     assert result.rmse_db < 1.6 < result.log_distance_rmse_db
     walls = result.intervals["walls.relative_permittivity"]
     assert walls.lower < truth["walls"]["relative_permittivity"] < walls.upper
+
+
+def planted(folder: Path) -> tuple[dict, dict]:
+    """The truth of an example, and its materials."""
+    truth = json.loads((folder / "truth.json").read_text())
+    return truth, truth["materials"]
+
+
+def spread_at_truth(study: Study, materials: dict) -> tuple[float, dict[str, float]]:
+    """Standard deviation [dB] of the links about the planted materials, and the offset of every group [dB]."""
+    setup = Setup.open(study)
+    paths = setup.trace()
+    truth = {name: replace(paths.materials[name], **constants) for name, constants in materials.items()}
+    gap = setup.links.path_loss_db - path_loss(paths, {**paths.materials, **truth})
+    groups = pd.Series(gap).groupby(setup.links.group_index)
+    return float((gap - groups.transform("mean")).std()), dict(
+        zip(setup.links.group_names, groups.mean().tolist(), strict=True)
+    )
+
+
+def test_a_plan_and_a_wide_table(tmp_path, monkeypatch):
+    """On the drafted study as it is, the planted materials explain what was measured."""
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    flat = TOWN / "flat"
+    typed("scene", "plan", flat / "plan.csv", "--height", "2.6", "--out", tmp_path / "flat")
+    told = typed(
+        "init", tmp_path / "flat" / "scene.xml", flat / "rss.csv", "--transmitters", flat / "access_points.csv",
+        "--frequency", "2.44e9", "--out", tmp_path / "study.toml",
+    )  # fmt: skip
+    assert "straight lines cross up to 2 walls" in told
+    study = Study.load(tmp_path / "study.toml")
+    assert list(study.links.wide) == ["rss_ap1", "rss_ap2", "rss_ap3"]
+    assert study.trace.refraction
+    assert study.trace.max_depth == 4
+    truth, materials = planted(flat)
+    spread, offsets = spread_at_truth(study, materials)
+    assert spread < 0.8
+    for name, offset in offsets.items():
+        assert offset == pytest.approx(-truth["eirp_dbm"][name], abs=0.6)
+
+
+def test_footprints_a_height_model_and_a_track(tmp_path, monkeypatch):
+    """Every value gets its place by its time, every antenna stands above its ground."""
+    monkeypatch.setenv("CALIBRAY_CACHE", "")
+    hill = TOWN / "hill"
+    typed(
+        "scene", "footprints", hill / "houses.geojson", "--height", "height_m", "--terrain", hill / "ground.tif",
+        "--out", tmp_path / "hill",
+    )  # fmt: skip
+    told = typed(
+        "init", tmp_path / "hill" / "scene.xml", hill / "power.csv", "--transmitters", hill / "masts.csv", "--track",
+        hill / "walk.gpx", "--frequency", "2.1e9", "--out", tmp_path / "study.toml",
+    )  # fmt: skip
+    assert "1010 rows along a track" in told
+    study = Study.load(tmp_path / "study.toml")
+    links = study.measurements()
+    # Up to the north-east, as the ground rises.
+    assert np.corrcoef(links.rx[:, 0], links.rx[:, 2])[0, 1] > 0.9
+    assert np.ptp(links.rx[:, 2]) > 5.0
+    truth, materials = planted(hill)
+    spread, offsets = spread_at_truth(study, materials)
+    assert spread < 1.5
+    assert offsets["mast-1"] == pytest.approx(-truth["eirp_dbm"], abs=0.8)

@@ -37,6 +37,7 @@ PLANTED = {
 }
 MAST = (-6.0, 0.0, 8.0)  # [m], its height above the ground
 EIRP_DBM = 31.0  # unknown to the user
+FLOOR_DBM = -115.0  # [dBm] below which the scanner reports nothing
 SPEED, RATE, TRACKED = 1.2, 5, 5  # [m/s], values a second, [s] between two points of the track
 GPS_ERROR = 0.4  # [m], standard deviation in x and in y
 HEIGHT = 1.5  # [m]
@@ -45,8 +46,8 @@ HOUSES = [
     (-70, 10, -40, 24, 8.0), (-30, 12, 5, 26, 10.5), (15, 10, 40, 25, 7.5), (48, 12, 75, 30, 12.0),
     (-60, -28, -25, -12, 9.0), (-12, -30, 20, -14, 11.0), (30, -26, 70, -11, 8.5),
 ]  # fmt: skip
-CORNERS = [(-72, -6), (-20, -6), (22, 4), (44, 4), (44, 34), (-35, 34)]
-"""The way, x and y [m]: along the street, then behind the houses."""
+CORNERS = [(-78, -6), (-20, -6), (22, 4), (84, 2), (84, -4), (10, -8)]
+"""The way, x and y [m]: up the street, and back half of it."""
 
 
 def write_houses() -> None:
@@ -114,7 +115,8 @@ def main() -> None:
     for value in range(duration * RATE):
         # Along one second the amplitudes stay, the phases do not.
         power = sample(gains[value // RATE], EIRP_DBM, rng)
-        rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", round(power, 1)))
+        heard = round(power, 1) if power > FLOOR_DBM else None
+        rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", heard))
     log = pd.DataFrame(rows, columns=["time", "mast", "power_dbm"])
     log.to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
     seconds = np.arange(0, duration + TRACKED, TRACKED)
@@ -136,7 +138,13 @@ def main() -> None:
     (FOLDER / "masts.csv").write_text(
         f"mast,longitude,latitude,height\nmast-1,{longitude:.7f},{latitude:.7f},{MAST[2]:g}\n"
     )
-    truth = {"frequency": FREQUENCY, "eirp_dbm": EIRP_DBM, "materials": PLANTED, "gps_error": GPS_ERROR}
+    truth = {
+        "frequency": FREQUENCY,
+        "eirp_dbm": EIRP_DBM,
+        "floor_dbm": FLOOR_DBM,
+        "materials": PLANTED,
+        "gps_error": GPS_ERROR,
+    }
     (FOLDER / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
 
 

@@ -416,14 +416,14 @@ class _Drafting:
         return indoors
 
     def _depth(self, section: dict[str, Any]) -> int:
-        """As many interactions as the straight lines of nearly all links cross walls, and one for a reflection."""
+        """As many interactions as the straight lines of nearly all links cross walls, and two for reflections."""
         links = self._links(section)
         walls = int(np.quantile(crossings(self.overhead.walls, links.tx, links.rx), 0.95))
-        depth = int(np.clip(walls + 1, *_DEPTHS))
+        depth = int(np.clip(walls + 2, *_DEPTHS))
         self._assume(
             "trace.max_depth",
             depth,
-            f"straight lines cross up to {walls} walls; one reflection more, {_DEPTHS[0]} to {_DEPTHS[1]}",
+            f"straight lines cross up to {walls} walls; two reflections more, {_DEPTHS[0]} to {_DEPTHS[1]}",
         )
         return depth
 
