@@ -144,7 +144,7 @@ def test_a_track_and_a_hill(tmp_path):
     assert links.rx[:, 0] == pytest.approx([-20, -10, 0, 10, 20], abs=0.01)
     assert links.rx[:, 2] == pytest.approx(5.0 + 0.1 * (links.rx[:, 0] + 50) + 1.5, abs=0.01)
     assert links.tx[0] == pytest.approx([0, -30, 22.0], abs=0.01)
-    assert links.prepared == {"rows at no time of the track, left out": 1}
+    assert links.prepared == {"rows at no time of the track, left out": 1, "samples averaged": 5}
     assert found.study.files()[2:4] == (tmp_path / "sites.csv", tmp_path / "walk.gpx")
     assert assumed(found)["links.heights"] == "ground"
     assert assumed(found)["links.track"] == "walk.gpx by time"

@@ -2,8 +2,8 @@
 
     python examples/bring_your_own/make_hill.py
 
-Everything is synthetic, so the truth is known: `hill/truth.json` holds the materials that walls and ground were given and
-what the mast transmits. The other files are all that a calibration gets to see: `houses.geojson`, footprints with
+Everything is synthetic, so the truth is known: `hill/truth.json` holds the materials that walls and ground were given
+and what the mast transmits. The other files are all that a calibration gets to see: `houses.geojson`, footprints with
 heights; `ground.tif`, a height model above the sea; `walk.gpx`, a point every five seconds; `power.csv`, five values a
 second without positions; `masts.csv`, the mast's place and its height above the ground.
 """
