@@ -29,7 +29,7 @@ from calibray.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (
-    "space-mapping", "vector-surrogate", "sgwo-im", "sgwo-im-screened", "gwo", "gaussian-process", "cma-es",
+    "space-mapping@30", "vector-surrogate", "sgwo-im", "sgwo-im-screened", "gwo", "gaussian-process", "cma-es",
     "differential-evolution", "dfo-ls", "random", "latin-hypercube", "sobol",
 )  # fmt: skip
 

@@ -10,6 +10,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
+from calibray.paths.program import take
 from calibray.scenarios.direct import Direct
 from calibray.scenarios.family import LINKS, NOISE_DB, PARAMETERS, problem
 from calibray.scenarios.office import office_site
@@ -59,6 +60,14 @@ def test_derivatives_are_differences(direct):
             2.0 * step[:, column, None]
         )
         assert jacobian[:, :, column] == pytest.approx(slope, rel=1e-3, abs=1e-4 * np.abs(slope).max())
+
+
+def test_a_link_without_a_path_has_no_derivative(direct):
+    less = Direct(take(direct.paths, np.flatnonzero(direct.paths.link != 1)), direct.parameters)
+    loss, jacobian = less.path_loss_and_jacobian(direct.parameters.start[None])
+    assert np.isinf(loss[0]).tolist() == [False, True, False, False]
+    assert (jacobian[0, 1] == 0.0).all()
+    assert np.isfinite(jacobian).all()
 
 
 @pytest.mark.parametrize("make", [district_site, office_site])

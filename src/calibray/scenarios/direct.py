@@ -102,7 +102,8 @@ class Direct:
             candidates: Parameter values [n, d], in the fields' units.
 
         Returns:
-            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
+            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter; 0 where a link has no
+            path.
         """
         count, width = candidates.shape
         # Relative to the value: conductivities span decades. Into the box, whose faces physics may bound.
@@ -110,7 +111,9 @@ class Direct:
         moved = candidates[:, None, :] + step[:, :, None] * np.eye(width)
         every = self.path_loss(np.concatenate([candidates, moved.reshape(-1, width)]))
         here, there = every[:count], every[count:].reshape(count, width, -1)
-        return here, np.moveaxis((there - here[:, None]) / step[:, :, None], 1, -1)
+        reached = np.isfinite(here)[:, None]
+        rise = np.where(reached, there, 0.0) - np.where(reached, here[:, None], 0.0)
+        return here, np.moveaxis(rise / step[:, :, None], 1, -1)
 
     def path_powers(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Power gain of every path for candidates.
