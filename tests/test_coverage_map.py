@@ -99,6 +99,12 @@ def test_the_geotiff_lies_where_the_scene_does(result, found, tmp_path):
     assert (tmp_path / "map.png").stat().st_size > 20_000
 
 
+def test_the_place_of_the_transmitter_has_no_path_loss(result, monkeypatch):
+    monkeypatch.setattr(cb.Setup, "trace", None)
+    alone = cb.coverage_map(result, TX, height=12.0, cell=10.0, bounds=(-5, -5, 5, 5), columns=WEST)
+    assert np.isnan(alone.path_loss_db).all()
+
+
 def test_power_is_what_is_sent_less_what_is_lost(found):
     power = replace(found, power_dbm=43.0).layers
     assert list(power) == ["received_power_dbm", "lower_dbm", "upper_dbm"]

@@ -202,6 +202,8 @@ def line(rng: Random, found: World, folder: Path) -> Case:
         command = command.commands[name]
     if words == ["compare"]:
         words += ["--methods=random@8", "--seeds=1"]  # what is given below counts, being later
+    if words == ["map"]:
+        words += ["--cell=20"]
     for parameter in command.params:
         required = parameter.required or _is_argument(parameter)
         if not (required and rng.random() < 0.97) and rng.random() < 0.7:

@@ -151,7 +151,8 @@ def coverage_map(
     wanted = np.flatnonzero(np.linalg.norm(rx - place, axis=1) > COINCIDENCE)
     found = np.full((3, len(rx)), np.nan)
     size = DIFFUSE_BLOCK if study.trace.diffuse_reflection else BLOCK
-    for block in np.array_split(wanted, -(-len(wanted) // size)):
+    for start in range(0, len(wanted), size):
+        block = wanted[start : start + size]
         rows = pd.DataFrame({**_ends(place, rx[block]), **held})
         setup = setup.at(as_links(result, rows))
         told = interval(result, setup, level, _part(progress, int(block[0]), len(rx)))

@@ -316,6 +316,7 @@ def _commands(result: Result) -> str:
         (
             " ".join(map(shlex.quote, words)),
             "calibray report DIR     # this page again",
+            "calibray map DIR --tx X Y Z     # path loss over the whole scene",
             "calibray export DIR -o FOLDER     # the calibrated scene for Sionna RT, and its materials as tables",
         )
     )
