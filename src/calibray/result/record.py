@@ -16,7 +16,6 @@ from calibray.files import check_outputs, check_unchanged, write_text
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
-from calibray.paths import Paths
 from calibray.progress import Progress
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.result.rows import COLUMNS, read_rows
@@ -31,6 +30,7 @@ from calibray.tracing.enclosed import Enclosed
 
 if TYPE_CHECKING:
     from calibray.inference.validation import Validation
+    from calibray.paths import Paths
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
 """What a result is written to; users have files called links.csv and scene.xml themselves."""

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Final
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, Preparation, Track
-from calibray.scenes.outlines import led_outside, outlines
-from calibray.scenes.overhead import Overhead
 from calibray.scenes.source import find_scene
 
 if TYPE_CHECKING:
+    from calibray.measurements.preparation import Ground, Way
     from calibray.study.model import Study
 
 AS_THEY_ARE: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
@@ -40,7 +39,7 @@ def preparation(study: Study) -> Preparation:
         track=None
         if track is None
         else Track(str(study.track_path), track.time, track.longest_gap, track.clock),
-        ground=None if links.heights is None else Overhead.of(study.scene_source).ground,
+        ground=None if links.heights is None else _ground(study),
         wide=links.wide,
         where=links.where,
         transmitters=None if transmitters is None else str(transmitters),
@@ -50,8 +49,23 @@ def preparation(study: Study) -> Preparation:
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
         keep=list(dict.fromkeys([*groups, *([links.frequency] if links.frequency else [])])),
         inside=inside,
-        outside=None if inside is None else partial(led_outside, covered=outlines(study.scene_source)),
+        outside=None if inside is None else _led_outside(study),
     )
+
+
+# What looks into a scene's meshes takes SciPy along; only studies whose rows need that load it.
+
+
+def _ground(study: Study) -> Ground:
+    from calibray.scenes.overhead import Overhead
+
+    return Overhead.of(study.scene_source).ground
+
+
+def _led_outside(study: Study) -> Way:
+    from calibray.scenes.outlines import led_outside, outlines
+
+    return partial(led_outside, covered=outlines(study.scene_source))
 
 
 def scene_frame(study: Study) -> Frame:
@@ -95,7 +109,6 @@ def known_frame(study: Study) -> Frame | None:
         return Frame(crs, float(easting), float(northing))
     if origin is not None:
         return Frame.local(*origin)
-    # What makes scenes takes SciPy along; only studies that need a frame load it.
     from calibray.scenes.making import read_frame
 
     return read_frame(find_scene(study.scene_source)[0])

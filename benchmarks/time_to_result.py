@@ -1,0 +1,157 @@
+"""How long a user waits for a calibration, by what he waits for, beside the time of one trace.
+
+    CALIBRAY_DATA=../shared/data python benchmarks/time_to_result.py
+
+Each study runs in processes of its own with a cache folder of its own: `cold` has nothing compiled, `warm` finds what
+the first one compiled. Both trace. "search" and "inference" include what had to be compiled for them, "compile" says
+how much of both that was, by JAX's own events; "trace" goes from the launches to the path program, the scene in memory.
+Ratios are to be read: (search + inference) / trace. Wall time of an otherwise idle machine, processor time in brackets.
+The last table repeats the search from other seeds, and with all 512 starts: the optimum found, and the evaluations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+STUDIES = ("demo", "nist_boulder", "auckland_tower")
+PARTS = ("import", "open", "trace", "compile", "search", "inference")
+SEEDS = range(1000, 1025)
+"""Seeds that nothing was chosen on."""
+
+
+def study_path(name: str) -> Path:
+    """The study's file."""
+    if name != "demo":
+        return Path(__file__).parents[1] / "examples" / f"{name}.toml"
+    from calibray.scenarios import demo_study_path
+
+    return demo_study_path()
+
+
+class Clock:
+    """Wall and processor time of one part after the other."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, tuple[float, float]] = {}
+        self._wall, self._processor = time.perf_counter(), time.process_time()
+
+    def lap(self, part: str) -> None:
+        """End a part, and begin the next one."""
+        wall, processor = time.perf_counter(), time.process_time()
+        self.seconds[part] = wall - self._wall, processor - self._processor
+        self._wall, self._processor = wall, processor
+
+
+def once(name: str) -> dict[str, object]:
+    """One calibration in this process: seconds by part, and what was found."""
+    clock = Clock()
+    from jax import monitoring
+
+    from calibray.calibration.certainty import certainty
+    from calibray.calibration.methods import choose
+    from calibray.calibration.problem import Problem
+    from calibray.calibration.search import search
+    from calibray.calibration.weighing import weighed
+    from calibray.engines.kinds.replay import replay
+    from calibray.study import Setup, Study
+
+    compiled = [0.0]
+    monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **_: compiled.append(seconds * ("/jax/core/compile" in event))
+    )
+    clock.lap("import")
+    setup = Setup.open(Study.load(study_path(name)))
+    tracer = setup.tracer
+    clock.lap("open")
+    paths = tracer.trace(setup.links)
+    clock.lap("trace")
+    compiled.clear()
+    problem = weighed(Problem.of(setup, replay(setup, paths)))
+    trail = search(problem, choose(problem))
+    clock.lap("search")
+    told = certainty(problem, trail)
+    clock.lap("inference")
+    clock.seconds["compile"] = sum(compiled), 0.0
+    return {
+        "seconds": clock.seconds,
+        "interactions": paths.num_interactions,
+        "evaluations": [trail.rt_calls, told.calls],
+        "rmse_db": trail.best_rmse_db,
+    }
+
+
+def seeds(name: str) -> dict[str, object]:
+    """The optimum and the evaluations from other seeds, and from the first of them with all starts."""
+    from calibray.calibration.problem import Problem
+    from calibray.calibration.search import rounds
+    from calibray.engines.kinds.replay import replay
+    from calibray.optimizers import LeastSquares, least_squares
+    from calibray.study import Setup, Study
+
+    setup = Setup.open(Study.load(study_path(name)))
+    problem = Problem.of(setup, replay(setup, setup.trace()))
+    start = problem.parameters.to_search(problem.parameters.start)
+
+    def found(seed: int) -> tuple[float, int]:
+        optimizer = LeastSquares(*problem.parameters.search_bounds, seed=seed, x0=start)
+        for _ in rounds(optimizer, problem.evaluate):
+            pass
+        return optimizer.best.y, optimizer.evaluations
+
+    few = [found(seed) for seed in SEEDS]
+    least_squares.RETURNS = sys.maxsize
+    return {"few": few, "all": found(SEEDS[0])}
+
+
+def in_a_process(what: Callable[[str], object], name: str, cache: Path) -> dict:
+    """What a function of this file answers in a process of its own."""
+    command = [sys.executable, __file__, "--inside", what.__name__, "--studies", name]
+    environment = {**os.environ, "CALIBRAY_CACHE": str(cache)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+def main() -> None:
+    """Measure and print the tables."""
+    parser = argparse.ArgumentParser(description="How long a user waits for a calibration.")
+    parser.add_argument("--studies", nargs="+", default=STUDIES, choices=STUDIES)
+    parser.add_argument("--inside", choices=("once", "seeds"), help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.inside:
+        print(json.dumps(globals()[given.inside](given.studies[0])))
+        return
+    print(
+        f"{'study':15} {'':5}" + "".join(f"{part:>17}" for part in PARTS) + f"{'ratio':>7}  evaluations, RMSE"
+    )
+    for name in given.studies:
+        with tempfile.TemporaryDirectory() as folder:
+            for kind in ("cold", "warm"):
+                told = in_a_process(once, name, Path(folder))
+                seconds = told["seconds"]
+                ratio = (seconds["search"][0] + seconds["inference"][0]) / seconds["trace"][0]
+                parts = "".join(f"{seconds[part][0]:8.2f} ({seconds[part][1]:6.2f})" for part in PARTS)
+                calls = " + ".join(f"{count:,}" for count in told["evaluations"])
+                print(f"{name:15} {kind:5}{parts}{ratio:7.2f}  {calls}, {told['rmse_db']:.4f} dB", flush=True)
+    print(f"\n{'study':15} {'all starts':>24} {'until it comes back':>34} {'found within 0.001 dB':>22}")
+    for name in [name for name in given.studies if name != "auckland_tower"]:
+        with tempfile.TemporaryDirectory() as folder:
+            told = in_a_process(seeds, name, Path(folder))
+        best, evaluations = told["all"]
+        calls = [count for _, count in told["few"]]
+        hits = sum(rmse <= best + 1e-3 for rmse, _ in told["few"])
+        print(
+            f"{name:15} {best:.5f} dB, {evaluations:8,} {min(calls):23,} to {max(calls):6,} {hits:>11} of {len(SEEDS)}"
+        )
+
+
+if __name__ == "__main__":
+    main()
