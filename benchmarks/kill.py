@@ -155,16 +155,18 @@ def main() -> int:
             "  repeated  lost  same  s a run"
         )
         share = [chosen.kills // len(names) + (k < chosen.kills % len(names)) for k in range(len(names))]
-        well = [
-            disturb(one, Path(place), name, kills, chosen.seed + k, mounts)
-            for k, (name, kills) in enumerate(zip(names, share, strict=True))
-        ]
-        well += [
-            together((one, two), Path(place), name, chosen.seed)
-            for name in names
-            if STUDIES[name].engine != "replay"
-        ]
-        release(Path(place))
+        try:
+            well = [
+                disturb(one, Path(place), name, kills, chosen.seed + k, mounts)
+                for k, (name, kills) in enumerate(zip(names, share, strict=True))
+            ]
+            well += [
+                together((one, two), Path(place), name, chosen.seed)
+                for name in names
+                if STUDIES[name].engine != "replay"
+            ]
+        finally:
+            release(Path(place))
     print("all well" if all(well) else "NOT WELL")
     return 0 if all(well) else 1
 
