@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.reporting import trace as report
 from calibray.tracing import memory
 from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
 from calibray.tracing.settings import TraceSettings
@@ -135,9 +134,13 @@ def test_memory_is_the_least_that_system_and_container_have_left(tmp_path, monke
 
 def test_long_traces_are_announced():
     short = plan(MASTS[:1], TraceSettings(samples=1000, max_depth=2), 20_000_000, 1_000_000)
-    assert report.announcement(short, 1) == ""
+    assert short.announcement(1) == ""
     long = plan(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
-    assert report.announcement(long, 11) == (
+    assert long.announcement(11) == (
         "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
-        "about 0.9 GiB of memory, besides that of the scene and the paths found"
+        "about 0.9 GiB of memory, besides that of the scene and the paths found, "
+        "and 7 seconds on two cores"
     )
+    # Ten thousand times the rays take ten thousand times as long.
+    longer = plan(MASTS, TraceSettings(samples=40_000_000_000, max_depth=5), 20_000_000, 1_000_000)
+    assert longer.announcement(11).endswith("and 20 hours on two cores")

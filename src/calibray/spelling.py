@@ -61,3 +61,22 @@ def shortened(text: str, longest: int = LONGEST) -> str:
         return text
     half = (longest - 3) // 2
     return f"{text[:half]}...{text[-half:]}"
+
+
+def duration(seconds: float) -> str:
+    """A length of time in words, as coarse as an estimate.
+
+    Args:
+        seconds: The time [s].
+
+    Returns:
+        Seconds, minutes, hours or days.
+
+    Example:
+        >>> duration(26_700.0)
+        '7 hours'
+    """
+    for unit, length in (("days", 86_400.0), ("hours", 3_600.0), ("minutes", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:,.0f} {unit}"
+    return f"{seconds:.0f} seconds"

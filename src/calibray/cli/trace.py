@@ -42,7 +42,7 @@ def trace(
         check_file(out, study.files(), overwrite)
     setup = study.opened()
     links, tracer = setup.links, setup.tracer
-    if told := report.announcement(tracer.plan(links), len(links)):
+    if told := tracer.plan(links).announcement(len(links)):
         typer.echo(told, err=True)
     with progress_bars(log) as progress:
         paths = tracer.trace(links, progress)

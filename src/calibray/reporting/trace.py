@@ -15,31 +15,9 @@ if TYPE_CHECKING:
     from calibray.paths import Paths
     from calibray.tracing.convergence import Convergence
     from calibray.tracing.enclosed import Enclosed
-    from calibray.tracing.launches import Plan
-
-LONG: Final = 20_000_000
-"""Rays x interactions x receivers that take some seconds."""
 
 VISIBLE_DB: Final = 0.005
 """Change [dB] that is not 0 when shown to 0.01 dB."""
-
-
-def announcement(plan: Plan, links: int) -> str:
-    """What a long trace will take, in a line; the time that is left is told by the progress bar.
-
-    Args:
-        plan: The launches.
-        links: Number of links.
-
-    Returns:
-        The line; empty if one small launch does it all.
-    """
-    if len(plan.launches) == 1 and plan.lanes <= LONG:
-        return ""
-    return (
-        f"Tracing {links:,} links in {len(plan.launches):,} launches of up to {plan.lanes:,} rays x interactions x "
-        f"receivers; about {plan.memory / 2**30:.1f} GiB of memory, besides that of the scene and the paths found"
-    )
 
 
 def found(paths: Paths, row: NDArray[np.int64], enclosed: Enclosed | None) -> Table:

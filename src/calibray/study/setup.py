@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,11 @@ from calibray.tracing import cache
 from calibray.tracing.enclosed import Enclosed
 from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import Tracer, TracerFactory
+
+LONG: Final = 30.0
+"""A trace that takes longer is announced before it starts [s]."""
+
+_LOG: Final = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +190,9 @@ class Setup:
         )
         paths = cache.find(digest)
         if paths is None:
+            plan = self.tracer.plan(links)
+            if plan.seconds > LONG:
+                _LOG.warning("%s", plan.announcement(len(links)))
             paths = self.tracer.trace(links, progress, scene.materials)
             cache.keep(digest, paths)
         return paths

@@ -15,6 +15,7 @@ from typing import Final, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.spelling import duration
 from calibray.tracing.settings import TraceSettings
 
 LANE_BYTES: Final = 40
@@ -23,6 +24,10 @@ PATH_BYTES: Final = (650, 260)
 """Bytes of a path, and of each of its interactions, until it is compiled; measured by benchmarks/memory.py --paths."""
 BUFFER_BYTES: Final = (50, 30)
 """The same in the tracer's buffer."""
+RATE: Final = 3e7
+"""Rays x interactions x receivers a second that two cores of a processor trace, to say how long a trace will take."""
+SHORT: Final = 1.0
+"""A trace of one launch that takes less is not worth a line [s]."""
 GRID: Final = 0.01
 """Interaction points of one path found twice agree better, those of two seldom do [m]."""
 
@@ -100,6 +105,28 @@ class Plan:
     def memory(self) -> int:
         """Memory that tracing takes besides the paths found, estimated [bytes]."""
         return self.lanes * LANE_BYTES + self.buffer
+
+    @property
+    def seconds(self) -> float:
+        """About how long two cores of a processor take [s]."""
+        return len(self.launches) * self.lanes / RATE
+
+    def announcement(self, links: int) -> str:
+        """What a long trace will take, in a line.
+
+        Args:
+            links: Number of links.
+
+        Returns:
+            The line; empty if one small launch does it all.
+        """
+        if len(self.launches) == 1 and self.seconds < SHORT:
+            return ""
+        return (
+            f"Tracing {links:,} links in {len(self.launches):,} launches of up to {self.lanes:,} rays x interactions x "
+            f"receivers; about {self.memory / 2**30:.1f} GiB of memory, besides that of the scene and the paths found, "
+            f"and {duration(self.seconds)} on two cores"
+        )
 
 
 def plan(tx: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:

@@ -1,0 +1,223 @@
+"""Inputs that ask for more than a machine has: the memory each takes, and how soon it ends or says what it will cost.
+
+Run with: python benchmarks/bombs.py [--only WORD]
+
+Each is a small study with one thing made huge, given to the command line in a process of its own, which is stopped
+once it has said what it will cost. Memory is the largest of any process that the command started.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from fuzzing import world
+from fuzzing.mutations import toml
+from fuzzing.outcome import MEMORY
+
+SAYING, GIVEN_UP = 10.0, 120.0
+"""Within which a bomb ends or says what it will cost, and after which it is stopped [s]."""
+COST = re.compile(r"[\d.,]+ (GiB|MiB|GB|minutes|hours|days|seconds|RT calls|launches|runs|s left)\b")
+
+
+@dataclass(frozen=True)
+class Bomb:
+    """One input, and the command that is given it.
+
+    Attributes:
+        name: What is huge.
+        sections: Sections of the study in place of the harmless ones.
+        prepare: Changes the folder's files.
+        words: The command.
+    """
+
+    name: str
+    sections: dict[str, Any] = field(default_factory=dict)
+    prepare: Callable[[Path], object] = lambda _: None
+    words: tuple[str, ...] = ("run", "study.toml", "--out", "out")
+
+
+def changed(section: str, **keys: Any) -> dict[str, Any]:
+    """A section of the harmless study with some keys replaced."""
+    return {section: world.content()[section] | keys}
+
+
+def method(name: str, **options: Any) -> dict[str, Any]:
+    """A method with its options."""
+    return {"method": {"name": name, "seed": 0, "options": options}}
+
+
+def named(file: str, text: str) -> Callable[[Path], object]:
+    """Write a file of the folder anew."""
+    return lambda folder: (folder / file).write_text(text)
+
+
+def many_links(folder: Path) -> None:
+    """A table of a million links."""
+    rows = (f"{10 + k % 300 / 10},{k % 7 / 10},{65 + k % 20},a,1" for k in range(1_000_000))
+    (folder / "links.csv").write_text("\n".join(["x,y,loss,half,w", *rows, ""]))
+
+
+def entities(levels: int) -> str:
+    """A scene whose entities hold one another."""
+    inner = "".join(f'<!ENTITY e{k + 1} "{f"&e{k};" * 10}">' for k in range(levels))
+    return f'<!DOCTYPE s [<!ENTITY e0 "ha">{inner}]><scene version="2.1.0"><bsdf id="&e{levels};"/></scene>'
+
+
+def parameters(count: int) -> dict[str, Any]:
+    """A study of many parameters of materials that the scene lacks."""
+    return {"parameters": {f"wall-{k}.conductivity": {"bounds": [0.001, 1.0]} for k in range(count)}}
+
+
+def program(line: str) -> tuple[dict[str, Any], Callable[[Path], object]]:
+    """An external program that does something before it answers."""
+    return changed("engine", name="command"), named("answer.sh", line + "\n" + world.SCRIPT)
+
+
+PLY = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
+PLY += "property float x\nproperty float y\nproperty float z\n"
+PLY += "element face 4000000000\nproperty list uchar int vertex_indices\nend_header\n"
+
+BOMBS = (
+    Bomb("filter: a tower of powers", changed("links", where="x > 7**7**7**7")),
+    Bomb("filter: 100,000 words", changed("links", where=" or ".join(["x > 1"] * 100_000))),
+    Bomb("method: a budget of 10^12", method("random", budget=10**12)),
+    Bomb("method: a population of 10^9", method("gwo", population=10**9, iterations=10)),
+    Bomb("method: 10^9 iterations", method("gwo", population=10, iterations=10**9)),
+    Bomb("method: 10^9 starts", method("least-squares", starts=10**9)),
+    Bomb("trace: 10^15 samples", changed("trace", samples=10**15)),
+    Bomb("trace: 10^11 samples", changed("trace", samples=10**11)),
+    Bomb("trace: depth 10^6", changed("trace", max_depth=10**6)),
+    Bomb("trace: depth 40, 10^7 samples", changed("trace", max_depth=40, samples=10**7)),
+    Bomb("links: a million", changed("trace", samples=10**6), many_links),
+    Bomb("links: one row of 100 MB", {}, named("links.csv", "x,y,loss,half,w\n" + "1" * 10**8 + ",1,1,a,1\n")),
+    Bomb("parameters: 10,000", parameters(10_000)),
+    Bomb("hold-out: 10^9 blocks", {"holdout": {"blocks": 10**9}}),
+    Bomb("study: lists 100,000 deep", {}, named("study.toml", f"version = {'[' * 100_000}{']' * 100_000}\n")),
+    Bomb("study: 50 MB of one key", {}, named("study.toml", f'version = 1\nscene = "{"x" * 5 * 10**7}"\n')),
+    Bomb("scene: entities in entities", {}, named("scene.xml", entities(30))),
+    Bomb("scene: 100,000 levels", {}, named("scene.xml", "<a>" * 100_000 + "</a>" * 100_000)),
+    Bomb("mesh: four thousand million vertices", {}, named("meshes/house.ply", PLY)),
+    Bomb("antenna: a million angles", {}, named("horn.csv", world.horn() + "0.5,0.5,1\n" * 10**6)),
+    Bomb("program: 2 GB of errors", *program("head -c 2000000000 /dev/zero >&2")),
+    Bomb("program: 2 GB of output", *program("head -c 2000000000 /dev/zero")),
+    Bomb("program: an answer of 2 GB", *program("head -c 2000000000 /dev/zero > \"$2\"; exit")),
+    Bomb("program: JSON 10^6 deep", *program("head -c 1000000 /dev/zero | tr '\\0' '[' > \"$2\"; exit")),
+    Bomb("compare: 10^9 seeds", {}, words=("compare", "study.toml", "--methods", "random", "--seeds", "1000000000")),
+    Bomb("validate: 10^9 blocks", {}, words=("validate", "study.toml", "--blocks", "1000000000")),
+    Bomb("plan: a file without an end", {}, words=("scene", "plan", "/dev/full", "--out", "made")),
+)  # fmt: skip
+
+
+def tree(root: int) -> list[int]:
+    """A process and all that it started."""
+    parents: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            parents.setdefault(int(words[1]), []).append(int(entry.name))
+    found = [root]
+    for process in found:
+        found += parents.get(process, [])
+    return found
+
+
+def memory(process: int) -> int:
+    """The most memory that a process has had [bytes]."""
+    try:
+        told = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
+    except OSError:
+        return 0
+    return 0 if told is None else 1024 * int(told[1])
+
+
+def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:
+    """Give a bomb to the command line: what came of it, after how long [s], the memory [bytes], and what was said."""
+    world.write(folder)
+    (folder / "study.toml").write_text(toml(world.content(**bomb.sections)))
+    bomb.prepare(folder)
+    said, started, most = folder / "said.txt", time.monotonic(), 0
+    with said.open("wb") as stream:
+        command = [sys.executable, "-c", "from calibray.cli import main; main()", *bomb.words]
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+            start_new_session=True,
+        )
+        came, after = "", 0.0
+        while process.poll() is None and time.monotonic() - started < GIVEN_UP and not came:
+            most = max(most, *map(memory, tree(process.pid)))
+            if COST.search(said.read_text(errors="replace")[-5000:]):
+                came = "announced"
+            time.sleep(0.05)
+        after = time.monotonic() - started
+        if process.poll() is None:
+            came = came or "HANGS"
+            # The peak goes on for a while: what was announced is not yet what it takes.
+            until = time.monotonic() + (SAYING if came == "announced" else 0.0)
+            while process.poll() is None and time.monotonic() < until:
+                most = max(most, *map(memory, tree(process.pid)))
+                time.sleep(0.05)
+            for each in reversed(tree(process.pid)):
+                try:
+                    os.kill(each, signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
+            process.wait()
+        else:
+            process.wait()
+            came = {0: "done", 1: "failed", 2: "refused"}.get(
+                process.returncode, f"STATUS {process.returncode}"
+            )
+    text = said.read_text(errors="replace")
+    if "Traceback" in text:
+        came = "TRACEBACK"
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    costly = [line for line in lines if COST.search(line)] if came == "announced" else lines
+    return came, after, most, (costly or [""])[-1]
+
+
+def main() -> int:
+    """Print a line for each; 0 if all ended or said their cost in time, within the memory."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="only those whose name holds this")
+    only = parser.parse_args().only
+    well = True
+    print(f"{'':40}{'':>10}{'s':>7}{'MiB':>7}  said")
+    with tempfile.TemporaryDirectory() as place:
+        os.environ["CALIBRAY_CACHE"] = f"{place}/cache"
+        for k, bomb in enumerate(bomb for bomb in BOMBS if only in bomb.name):
+            folder = Path(place) / str(k)
+            folder.mkdir()
+            came, after, most, line = explode(bomb, folder)
+            bad = came.isupper() or came.startswith("STATUS") or most > MEMORY
+            bad |= after > SAYING and came == "announced"
+            well &= not bad
+            print(
+                f"{bomb.name:40}{came:>10}{after:7.1f}{most / 2**20:7.0f}  {'(!) ' if bad else ''}{line[:110]}",
+                flush=True,
+            )
+    print("all well" if well else "NOT WELL")
+    return 0 if well else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
