@@ -32,6 +32,9 @@ CLEAR: Final = 2.0
 FEW: Final = 8
 """Links below which trends are not looked for."""
 
+EVEN_DB: Final = 0.1
+"""Mean residual below which classes of links are not told apart [dB]."""
+
 PLACES: Final = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
 
 
@@ -230,6 +233,8 @@ def _spread_said(known: dict[str, pd.DataFrame], name: str, words: str) -> str:
     if not len(many):
         return ""
     worst = many.iloc[int(np.argmax(many["mean_db"].abs()))]
+    if abs(worst["mean_db"]) < EVEN_DB:
+        return ""
     label = f"{worst[name]:g}" if isinstance(worst[name], float) else str(worst[name])
     clear = (
         ""

@@ -1,0 +1,92 @@
+"""Downtown Boulder: what path loss and delay spread say of the walls' scattering coefficient.
+
+    CALIBRAY_DATA=FOLDER python benchmarks/case_studies.py --samples 60000
+
+The links are traced once with diffuse reflection. For each scattering coefficient S of the walls, the paths are
+replayed: the RMSE of path loss with an offset for links in sight and one for those out of sight, and the RMS delay
+spread in sight, from the power delay profile in bins of 1 ns, those above 132 dB of path loss or 30 dB below the
+strongest left out, as the sounder left them out. Beside it stands the measured one (delay.csv). Without the campaign
+nothing is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from calibray.fields import path_loss
+from calibray.fields.channel import power_delay_profile
+from calibray.study import Study
+from calibray.tables import Table, numbers
+from calibray.tables.text import render
+
+STUDY = Path(__file__).parents[1] / "examples" / "nist_boulder.toml"
+WALLS, TRACED = "walls", 0.4
+"""The material that scatters, and its coefficient while paths are sampled."""
+COEFFICIENTS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9)
+FLOOR_DB, DYNAMIC_DB, BIN_S = 132.0, 30.0, 1e-9
+
+
+def delay_spread(power: np.ndarray, delay: np.ndarray) -> np.ndarray:
+    """RMS delay spread of profiles as the sounder kept them [L], [s]."""
+    level = -10 * np.log10(np.maximum(power, 1e-40))
+    kept = (level <= FLOOR_DB) & (level <= level.min(axis=1, keepdims=True) + DYNAMIC_DB)
+    share = np.where(kept, power, 0.0)
+    share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)
+    mean = share @ delay
+    return np.sqrt(np.maximum(share @ delay**2 - mean**2, 0.0))
+
+
+def offset_rmse(error: np.ndarray, group: np.ndarray) -> float:
+    """RMSE with the mean of every group taken off [dB]."""
+    for label in np.unique(group):
+        error = np.where(group == label, error - error[group == label].mean(), error)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def main() -> None:
+    """Print the table."""
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--samples", type=int, default=60_000, help="rays sent out by the transmitter")
+    samples = options.parse_args().samples
+    data = Path(os.environ.get("CALIBRAY_DATA", STUDY.parent / "../../shared/data")) / "nist_boulder"
+    if not data.is_dir():
+        print(f"no campaign under {data}: not measured")
+        return
+    content = Study.load(STUDY).content()
+    content["trace"] |= {"diffuse_reflection": True, "max_depth": 3, "samples": samples}
+    content["materials"]["walls"] |= {"scattering_coefficient": TRACED}
+    setup = Study.from_content(content, STUDY).opened()
+    paths, frame = setup.trace(), setup.links.frame
+    sets = frame["set"].to_numpy(str)
+    measured = (
+        pd.read_csv(data / "delay.csv").set_index("id").loc[frame["id"], "rms_delay_spread_ns"].to_numpy()
+    )
+    edges = np.arange(0.0, paths.delay.max() + 2 * BIN_S, BIN_S)
+    rows = []
+    for value in COEFFICIENTS:
+        walls = replace(paths.materials[WALLS], scattering_coefficient=value)
+        materials = {**paths.materials, WALLS: walls}
+        error = path_loss(paths, materials) - setup.links.path_loss_db
+        reached = np.isfinite(error)
+        spread = 1e9 * delay_spread(power_delay_profile(paths, edges, materials), edges[:-1] + BIN_S / 2)
+        sight = reached & (sets == "LOS")
+        alone = [f"{error[reached & (sets == label)].mean():+.1f}" for label in ("LOS", "NLOS")]
+        rows.append((
+            f"{value:g}", f"{offset_rmse(error[reached], sets[reached]):.2f}", *alone,
+            f"{spread[sight].mean():.1f}", f"{measured[sight].mean():.1f}",
+        ))  # fmt: skip
+    columns = (
+        numbers("walls' S"), numbers("RMSE with offsets", "dB"), numbers("mean error in sight", "dB"),
+        numbers("out of sight", "dB"), numbers("delay spread in sight", "ns"), numbers("measured", "ns"),
+    )  # fmt: skip
+    print(render(Table(f"{paths.num_paths:,} paths of {paths.num_links} links", columns, tuple(rows))))
+
+
+if __name__ == "__main__":
+    main()
