@@ -53,5 +53,6 @@ def test_the_third_finds_the_offset_that_was_not_declared(monkeypatch, cache, ca
         left["cable"], abs=3 * left["without"].free_offset_error_db
     )
     assert left["result"].offsets_db[""] == pytest.approx(left["cable"], abs=1.0)
+    assert len(left["suggested"]) == 2
     assert left["result"].rmse_db < left["without"].rmse_db
     assert "offset" in capsys.readouterr().out
