@@ -95,6 +95,7 @@ def test_a_frame_of_its_own_is_centred_on_the_buildings(extract):
         ("<osm version='0.6'></osm>", "no complete building"),
         ("no XML", "cannot be read"),
         ("<osm version='0.6'><node id='1'", "cannot be read"),
+        ("<osm version='0.6'><node id='1' version='1' lat='50.0x' lon='9'/></osm>", "cannot be read"),
     ],
 )
 def test_a_file_that_is_no_extract_is_refused(tmp_path, text, message):
@@ -168,6 +169,25 @@ def test_a_vector_file_without_what_is_named_is_refused(tmp_path, change, messag
     path = layer(tmp_path / "t.gpkg", [1.0, 2.0, 3.0], "GPKG", word=["high"] * 3, negative=[1.0, -1.0, 2.0])
     with pytest.raises(InputError, match=message):
         read_footprints(path, **{"height": "hoehe", **change})
+
+
+@pytest.mark.filterwarnings("ignore")  # GDAL's own, of what it passes on
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [(b"[0, 0], [1, 0], [1, 1], [0, 0]", b"[0, 0], [1, 0], [1, 1], [0, 2]"), (b'"h"', b'"\x85"')],
+    ids=["open ring", "encoding"],
+)
+def test_geojson_that_cannot_be_used_is_refused(tmp_path, old, new):
+    sound = (
+        b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"h": 5}, "geometry": '
+        b'{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}}]}'
+    )
+    path = tmp_path / "town.geojson"
+    path.write_bytes(sound)
+    assert len(read_footprints(path, 5.0)[0]) == 1
+    path.write_bytes(sound.replace(old, new))
+    with pytest.raises(InputError, match=r"town\.geojson: cannot be read"):
+        read_footprints(path, 5.0)
 
 
 def test_a_vector_file_needs_a_reference_system(tmp_path):

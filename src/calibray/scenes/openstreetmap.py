@@ -54,7 +54,7 @@ def read_openstreetmap(
                 tags.append({tag.k: tag.v for tag in item.tags})
             elif item.is_way() or item.is_relation():
                 announced += item.is_relation() or item.is_closed()
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise InputError(f"extract {path}: cannot be read ({error}); give an .osm or .osm.pbf file") from None
     if not outlines:
         raise InputError(f"extract {path}: holds no complete building; choose an extract that covers some")

@@ -82,7 +82,10 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
         raise InputError(f"footprints {path}: does not exist; check the path")
     try:
         meta, _, geometry, fields = pyogrio.raw.read(path, layer=layer)
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        outlines = shapely.from_wkb(geometry)
+    except (
+        pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, shapely.GEOSException, UnicodeDecodeError,
+    ) as error:  # fmt: skip
         raise InputError(
             f"footprints {path}: cannot be read ({error}); give GeoJSON, a Shapefile or a GeoPackage"
         ) from None
@@ -90,7 +93,6 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
         raise InputError(
             f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
         )
-    outlines = shapely.from_wkb(geometry)
     is_polygon = np.isin(shapely.get_type_id(outlines), (3, 6))
     if not is_polygon.any():
         raise InputError(f"footprints {path}: holds {len(outlines)} features and no polygon among them")
