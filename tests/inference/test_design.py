@@ -100,3 +100,12 @@ def test_no_more_points_than_candidates_and_none_twice():
     point = gaussian(0.1)
     found = choose(beliefs(point), *linear(point, np.ones((3, 1))), independent(1.0, 3), 9)
     assert sorted(each.index for each in found) == [0, 1, 2]
+
+
+def test_where_draws_agree_alike_the_steeper_candidate_comes_first():
+    """Of a parameter that is hardly known curvature tells what scatter over its whole range does not."""
+    point = gaussian(0.1)
+    predicted, slope = np.zeros((DRAWS, 2)), np.zeros((DRAWS, 2, 1))
+    slope[:, 1] = 30.0
+    found = choose(beliefs(point), predicted, slope, independent(3.0, 2), 1)
+    assert found[0].index == 1
