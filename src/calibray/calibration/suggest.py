@@ -170,9 +170,10 @@ class _Model:
         coefficients, _ = objective.nuisance.filled(
             objective.coefficients(self.told.modelled), objective.weight > 0
         )
-        errors, shared = Errors(self.noise_db, common, links.rx), self._shared()
+        place, shared = np.hstack([links.rx, links.tx]), self._shared()
+        errors = Errors(self.noise_db, common, place)
         if shared is not None:
-            errors = Errors(shared.own_db, common, links.rx, shared.shared_db, shared.range_m)
+            errors = Errors(shared.own_db, common, place, shared.shared_db, shared.range_m)
         following = objective.following(*self._replayed(self.engine))
         return loss + coefficients @ design.T, slope + design @ following, errors
 
@@ -242,7 +243,8 @@ class _Model:
         values = np.array([[self.result.parameters[name] for name in problem.parameters.names]])
         told = problem.evaluate(problem.parameters.to_search(values))
         errors = told.residuals[0, : objective.num_counted]
-        return shared_errors(errors, problem.setup.links.rx[objective.weight > 0])
+        links = problem.setup.links
+        return shared_errors(errors, np.hstack([links.rx, links.tx])[objective.weight > 0])
 
 
 def _table(

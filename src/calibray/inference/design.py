@@ -40,7 +40,7 @@ class Errors:
     Attributes:
         own_db: Standard deviation of each one's own part [dB].
         common: What they share, a column for each unknown: times its standard deviation [c, r], [dB].
-        position: Where their receivers stand [c, 3], [m].
+        position: Where they stand [c, k], [m]: their receivers, or both ends.
         shared_db: Standard deviation of what neighbours share [dB]; 0 for nothing.
         range_m: Distance at which that has fallen to 1/e [m].
     """

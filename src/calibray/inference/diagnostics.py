@@ -24,7 +24,7 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 
     Args:
         errors: Errors at the best fit [m], [dB].
-        position: Positions of the receivers [m, 3], [m].
+        position: Where the links stand [m, k], [m]: their receivers, or both ends.
 
     Returns:
         Their correlation; None where they do not show one.
@@ -43,13 +43,13 @@ def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) ->
 def variogram(
     errors: NDArray[np.float64], position: NDArray[np.float64], bins: int = 8
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Half the mean square difference of errors over the distance between receivers.
+    """Half the mean square difference of errors over the distance between links.
 
     Where it rises from little to much, neighbours share their errors; where it is level, they do not.
 
     Args:
         errors: Errors [m], [dB].
-        position: Positions of the receivers [m, 3], [m].
+        position: Where the links stand [m, k], [m]: their receivers, or both ends.
         bins: Classes of distance, of about equally many pairs each.
 
     Returns:

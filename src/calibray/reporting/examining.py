@@ -197,7 +197,7 @@ def power(table: pd.DataFrame) -> Figure:
 
 @styled()
 def neighbours(table: pd.DataFrame) -> Figure:
-    """Semivariance of residuals over the distance between receivers.
+    """Semivariance of residuals over the distance between links.
 
     Args:
         table: The diagnostics' table "neighbours".
@@ -205,7 +205,7 @@ def neighbours(table: pd.DataFrame) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Distance between receivers [m]", "Semivariance of residuals [dB²]")
+    figure, axes = plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
     axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=BLUE)
     axes.set(xlim=(0, None), ylim=(0, None))
     return figure

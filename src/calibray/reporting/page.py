@@ -63,8 +63,8 @@ CAPTIONS: Final = {
     "held-out-blocks": "RMSE on each block that was held out, by model.",
     "power": "What the links' power passes by: share of it on paths that meet a material, by kind of interaction. What "
     "a path meets counts in full.",
-    "neighbours": "Half the mean square difference of residuals over the distance between receivers: where it rises, "
-    "neighbours share their errors.",
+    "neighbours": "Half the mean square difference of residuals over the distance between links, both ends counted: "
+    "where it rises, neighbours share their errors.",
     "leverage": "Residuals over leverage: near 1 a link decides something alone, and its residual tells nothing.",
     "residual-by-depth": "Mean residual by interactions of the strongest path, with two standard errors; links in "
     "brackets.",

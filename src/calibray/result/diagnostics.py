@@ -49,7 +49,8 @@ def diagnostics(result: Result) -> dict[str, pd.DataFrame]:
         deviation of the residuals [dB], model minus measurement, of the links calibrated on. "leverage": every such
         link's share in deciding the unknowns. "power": share of the links' power by material and kind of interaction.
         "trade_offs": correlation of every two unknowns over the draws. "neighbours": semivariance of residuals over the
-        distance between receivers. "moved": where every parameter came from and went to, and what of its range is left.
+        distance between links, both ends counted. "moved": where every parameter came from and went to, and what of its
+        range is left.
     """
     found = {
         "distance": _over_distance(result),
@@ -184,7 +185,8 @@ def _neighbours(result: Result) -> pd.DataFrame:
     ends = _ends(links)
     if ends is None or len(left) < FEW:
         return pd.DataFrame()
-    distance, half, pairs = variogram(left, ends[1])
+    # At one receiver the links of two transmitters are no neighbours.
+    distance, half, pairs = variogram(left, np.hstack(ends))
     return pd.DataFrame({"distance_m": distance, "semivariance_db2": half, "pairs": pairs})
 
 
@@ -253,8 +255,8 @@ def _neighbours_said(known: dict[str, pd.DataFrame]) -> str:
     share = 1.0 - nearest["semivariance_db2"] / level if level > 0 else 0.0
     # A semivariance of so many pairs is known to about this share of itself.
     if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
-        return f"receivers {nearest['distance_m']:.0f} m apart share no more of their errors than others do"
-    return f"receivers {nearest['distance_m']:.0f} m apart share {share:.0%} of the variance of their errors"
+        return f"links {nearest['distance_m']:.0f} m apart share no more of their errors than others do"
+    return f"links {nearest['distance_m']:.0f} m apart share {share:.0%} of the variance of their errors"
 
 
 def _leverage_said(known: dict[str, pd.DataFrame]) -> str:
