@@ -16,9 +16,10 @@ settings.load_profile("calibray")
 
 def pytest_configure(config: pytest.Config) -> None:
     """What XLA compiles is kept in pytest's cache: workers share it, and the next run takes it from there."""
-    if config.cache is not None:
+    kept = getattr(config, "cache", None)  # not there with -p no:cacheprovider
+    if kept is not None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv(caching.VARIABLE, str(config.cache.mkdir("calibray")))
+            patch.setenv(caching.VARIABLE, str(kept.mkdir("calibray")))
             import calibray.fields  # noqa: F401
 
 
