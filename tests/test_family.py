@@ -15,7 +15,6 @@ from calibray.scenarios.direct import Direct
 from calibray.scenarios.family import LINKS, NOISE_DB, PARAMETERS, problem
 from calibray.scenarios.office import office_site
 from calibray.scenarios.sites import district_site
-from calibray.tracing import cache
 
 MATERIALS = {"walls": Material(4.3, 0.08, 0.18, 0.35), "glass": Material(6.1, 0.02, 0.009, 0.5)}
 NAMES = (
@@ -37,7 +36,7 @@ def direct():
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("CALIBRAY_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield problem(2)
 
 
