@@ -196,4 +196,4 @@ def _by_kinds(paths: Paths) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]
         kinds[deep, step] = paths.kind[paths.first[:-1][deep] + step]
     sequences, owner = np.unique(kinds, axis=0, return_inverse=True)
     index = [np.flatnonzero(owner.reshape(-1) == each) for each in range(len(sequences))]
-    return [(some, paths.first[some] + np.arange(depth[some[0]])[:, None]) for some in index]
+    return [(some, paths.first[some] + np.arange(int(depth[some[0]]))[:, None]) for some in index]
