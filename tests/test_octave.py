@@ -12,8 +12,11 @@ import pytest
 
 from calibray import engines
 from calibray.calibration import calibrate
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import rounds
 from calibray.errors import EngineError
 from calibray.measurements import read_measurements
+from calibray.optimizers import LeastSquares
 from calibray.study import Study
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "octave_canyon"
@@ -48,6 +51,28 @@ def test_a_calibration_on_the_program_ends(tmp_path):
         result = calibrate(study, out=tmp_path, executor=executor)
     assert result.rt_calls == 6
     assert result.rmse_db < result.initial_rmse_db
+
+
+def test_a_simpler_program_is_calibrated_by_space_mapping_in_six_calls():
+    """The optimum is that of the replay with one reflection and surfaces of one face, which is the program's model."""
+    study = Study.load(EXAMPLE / "simple.toml")
+    content = study.content()
+    method = content["method"] | {"options": {"budget": 6}}
+    mapped = calibrate(Study.from_content(content | {"method": method}, study.path))
+    assert mapped.rt_calls == 6
+    same = {
+        "materials": {name: {"thickness": 100.0} for name in ("walls", "ground")},
+        "trace": {"max_depth": 1},
+        "engine": {"name": "replay"},
+        "method": {"name": "random", "options": {"budget": 1}},
+    }
+    setup = Study.from_content(content | same, study.path).opened()
+    half_space = Problem.of(setup, engines.make(setup))
+    search = LeastSquares(*half_space.parameters.search_bounds, starts=8)
+    for _ in rounds(search, half_space.evaluate):
+        pass
+    assert search.best.y == pytest.approx(0.4678, abs=1e-3)
+    assert mapped.rmse_db - search.best.y < 0.01 < mapped.history.best_db[0] - search.best.y
 
 
 def test_a_request_that_the_program_cannot_serve_is_refused_in_its_own_words():

@@ -14,7 +14,7 @@ SIGNATURES = {
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
-    "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite",
+    "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite, cheap",
     "report": "result, file, figures, overwrite, progress",
     "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, anyway",
     "save_map": "coverage, folder, inputs, overwrite",

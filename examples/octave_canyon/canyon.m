@@ -1,6 +1,7 @@
-function canyon(request_file, response_file)
+function canyon(request_file, response_file, walls)
   % Path loss in a straight street canyon by the image method: the direct path and one reflection each off the ground and
   % both walls. Plain code for MATLAB and GNU Octave 7 or later; docs/command-engine.md describes the two files.
+  % With 'half-space' as third argument it is a simpler model: nothing comes back from behind a surface.
   request = jsondecode(fileread(request_file));
   if ~strcmp(request.schema, 'calibray.request') || request.version ~= 1
     error('%s version %d: this program reads calibray.request version 1', request.schema, request.version);
@@ -11,7 +12,7 @@ function canyon(request_file, response_file)
   if ~strcmp(request.antennas.tx.pattern, 'iso') || ~strcmp(request.antennas.rx.pattern, 'iso')
     error('only isotropic antennas are programmed');
   end
-  loss = path_loss(request);
+  loss = path_loss(request, nargin > 2 && strcmp(walls, 'half-space'));
   if any(isnan(loss))
     error('path loss of link %d is not a number', find(isnan(loss), 1));  % jsonencode would write null: no path
   end
@@ -20,7 +21,7 @@ function canyon(request_file, response_file)
   fclose(file);
 end
 
-function loss = path_loss(request)
+function loss = path_loss(request, simple)
   % Path loss of every link [dB], +Inf without a path.
   wavelength = 299792458 / request.frequency;
   planes = {  % point, normal into the street, material
@@ -35,7 +36,7 @@ function loss = path_loss(request)
     gains = direct(tx, rx, wavelength);
     for k = 1:size(planes, 1)
       material = find_material(request.materials, planes{k, 3});
-      gains(end + 1) = reflected(tx, rx, planes{k, 1}, planes{k, 2}, material, request.frequency, wavelength);
+      gains(end + 1) = reflected(tx, rx, planes{k, 1}, planes{k, 2}, material, request.frequency, wavelength, simple);
     end
     if strcmp(request.combining, 'coherent')
       power = abs(sum(gains))^2;
@@ -52,12 +53,12 @@ function gain = direct(tx, rx, wavelength)
   gain = propagation(distance, wavelength) * dot(vertical(k), vertical(k));
 end
 
-function gain = reflected(tx, rx, point, normal, material, frequency, wavelength)
+function gain = reflected(tx, rx, point, normal, material, frequency, wavelength, simple)
   image = tx - 2 * dot(tx - point, normal) * normal;  % the transmitter behind the mirror
   distance = norm(rx - image);
   out = (rx - image) / distance;                       % direction after the reflection
   in = out - 2 * dot(out, normal) * normal;            % and before it
-  [te, tm] = slab(-dot(in, normal), material, frequency, wavelength);
+  [te, tm] = slab(-dot(in, normal), material, frequency, wavelength, simple);
   across = cross(in, normal);
   if norm(across) < 1e-12
     across = cross(in, [1 0 0] + [0 1 0] * (abs(in(1)) > 0.9));
@@ -68,14 +69,14 @@ function gain = reflected(tx, rx, point, normal, material, frequency, wavelength
   gain = propagation(distance, wavelength) * sum(vertical(out) .* field);
 end
 
-function [te, tm] = slab(cosine, material, frequency, wavelength)
+function [te, tm] = slab(cosine, material, frequency, wavelength, simple)
   % ITU-R P.2040-3: complex permittivity eq. 9, single interface eq. 37, slab eq. 43 and 44.
   vacuum_permittivity = 8.8541878128e-12;
   eta = material.relative_permittivity - 1j * material.conductivity / (2 * pi * frequency * vacuum_permittivity);
   root = sqrt(eta - (1 - cosine^2));
   q = 2 * pi * material.thickness / wavelength * root;
   single = [(cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)];
-  twice = exp(-2j * q);
+  twice = exp(-2j * q) * ~simple;
   both = single .* (1 - twice) ./ (1 - single.^2 * twice);
   te = both(1);
   tm = both(2);

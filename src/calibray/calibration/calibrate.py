@@ -40,6 +40,7 @@ def calibrate(
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
     overwrite: bool = False,
+    cheap: Study | Setup | None = None,
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
@@ -54,6 +55,8 @@ def calibrate(
         progress: Called as the work goes on.
         overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.
+        cheap: A study of the same links and materials, whose replay is the cheap model of an engine that can only be
+            called; the study itself if None.
 
     Returns:
         The result.
@@ -84,7 +87,7 @@ def calibrate(
     traced = time.perf_counter()
     problem = weighed(heard(problem, progress), progress)
     paused = time.perf_counter()
-    helper = aid(problem, progress)
+    helper = aid(problem, progress, None if cheap is None else cheap.opened())
     traced += time.perf_counter() - paused
     trail = search(problem, choose(problem, helper.model), progress)
     problem, trail, gap = settle(problem, trail, progress)

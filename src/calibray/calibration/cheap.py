@@ -24,6 +24,7 @@ from calibray.optimizers.cheap_model import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.progress import Progress
+from calibray.study import Setup
 
 HELPED: Final = ("space-mapping", "sgwo-im-screened")
 """The methods that take a cheap model."""
@@ -199,12 +200,13 @@ class Aid:
     remark: str = ""
 
 
-def aid(problem: Problem, progress: Progress | None = None) -> Aid:
+def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None = None) -> Aid:
     """The replay of a problem's own scene, where its method has a use for it.
 
     Args:
         problem: The problem.
         progress: Called with the stage "tracing" after every launch.
+        scene: A study of the same links, whose trace is replayed in place of the problem's own.
 
     Returns:
         The model, or why there is none.
@@ -215,9 +217,10 @@ def aid(problem: Problem, progress: Progress | None = None) -> Aid:
     if not wanted or not setup.study.engine.dear or problem.observable is not PATH_LOSS:
         return Aid()
     try:
-        paths = setup.trace(progress=progress)
+        scene = setup if scene is None else scene
+        paths = scene.trace(progress=progress)
         parameters = with_constants(problem.parameters, paths.materials, setup.links.frequency is None)
-        engine = replay(replace(setup, parameters=parameters), paths)
+        engine = replay(replace(scene, parameters=parameters), paths)
         model = ReplayedModel(engine, len(problem.parameters), ProblemRows(problem))
     except (InputError, EngineError, ImportError) as error:
         reason = " ".join(str(error).split())

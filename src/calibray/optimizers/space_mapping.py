@@ -11,8 +11,10 @@ minimum is the first call. After every call the cheap model is corrected until i
   of an exploitation that repeats itself.
 
 The cheap model is trusted only while it helps. Each point is predicted from all the others, once by the corrected model
-and once by the same process without a cheap model; where the latter errs less, the cheap model explains nothing, and
-the vector surrogate goes on with all that was told. So it does from the first call where there is no cheap model.
+and once by the same process without a cheap model. Where the sum of squared errors is more than `MISLED` times as large
+with it, twice in a row, the cheap model misleads, and the vector surrogate goes on with all that was told. So it does
+from the first call where there is no cheap model. One such verdict says little: a first point far from three others
+cannot be told from them (slabs for half-spaces: 0.02, 8 and 0.01 after three, four and five calls).
 
 J. W. Bandler et al., "Space mapping: the state of the art", IEEE Trans. Microw. Theory Tech. 52 (2004) 337.
 """
@@ -74,6 +76,12 @@ REACHES: Final = (0.02, 1.0)
 
 JUDGED: Final = 3
 """Calls from which on the cheap model is judged."""
+
+MISLED: Final = 2.0
+"""Ratio of the sums of squared errors beyond which it is doubted."""
+
+DOUBTS: Final = 2
+"""Doubts in a row after which it is given up."""
 
 
 @final
@@ -148,7 +156,7 @@ class SpaceMapping(Optimizer):
         return self._corrected
 
     def _search(self, archive: Archive) -> Search:
-        model, left, turn = self._model, self._budget, 0
+        model, left, turn, doubts = self._model, self._budget, 0, 0
         if model is None:
             yield from self._without(archive, left)
             return
@@ -164,7 +172,9 @@ class SpaceMapping(Optimizer):
                     model, self.box, unit, residuals, cloud, self._trials(model, len(unit)),
                     noisy=self.noisy, before=self._corrected,
                 )  # fmt: skip
-                if len(unit) >= JUDGED and not helps(self._corrected):
+                misled = len(unit) >= JUDGED and misleads(self._corrected)
+                doubts = doubts + 1 if misled else 0
+                if doubts == DOUBTS:
                     self._corrected = None
                     yield from self._without(archive, left)
                     return
@@ -251,19 +261,20 @@ class SpaceMapping(Optimizer):
             self._reach = float(np.clip(self._reach * (2.0 if better else 0.5), *REACHES))
 
 
-def helps(corrected: Corrected) -> bool:
-    """Tell whether a cheap model explains anything.
+def misleads(corrected: Corrected) -> bool:
+    """Tell whether a cheap model misleads.
 
     Args:
         corrected: The cheap model, corrected by three points or more.
 
     Returns:
-        Whether points are predicted from all the others better with it than without.
+        Whether points are predicted from all the others far worse with it than without.
     """
     unit, residuals = corrected.rest.seen.unit, corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)
     alone = discrepancy.fit(Seen(unit, np.zeros((len(unit), 0))), residuals, scale)
-    return float(np.sum(corrected.rest.left_out() ** 2)) < float(np.sum(alone.left_out() ** 2))
+    with_it, without = (float(np.sum(rest.left_out() ** 2)) for rest in (corrected.rest, alone))
+    return with_it > MISLED * without
 
 
 def _answered(archive: Archive) -> Evaluations | None:
