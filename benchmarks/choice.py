@@ -59,7 +59,7 @@ def nested(problem: Problem, count: int) -> tuple[Table, str]:
         inner = validated(part)
         for name, model in models(part, np.zeros((0, len(problem.parameters)))).items():
             errors.setdefault(name, np.full(len(links), np.nan))[here] = (model - objective.measured)[here]
-        best = inner.best
+        best = inner.chosen
         chosen.append(best)
         mine[here] = errors[best][here]
         judged = mine[here][np.isfinite(mine[here])]

@@ -217,7 +217,7 @@ def main() -> None:
             print(f"{name}: {count} of {len(tasks)}", end="\r", file=sys.stderr)
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
-        print(markdown.render(table) if given.markdown else render(table))
+        print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))
     control = [entry["control"] for line in lines if line["world"] == "random" for entry in line["parameters"]
                if entry["verdict"] != "not identifiable"]  # fmt: skip
     if control and np.mean(control) > LEVELS[0] - 0.04:

@@ -10,7 +10,7 @@ from calibray.calibration.validate import TX_OFFSET, fitted_twins
 from calibray.inference.nuisance import OFFSET
 from calibray.inference.objective import Objective
 from calibray.inference.rivals import fitted_law
-from calibray.inference.validation import FIELD, KRIGING, LAW, Validation
+from calibray.inference.validation import LAW, Validation
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.study import Study
 
@@ -28,8 +28,7 @@ def choose_model(problem: Problem, validation: Validation, best: NDArray[np.floa
     Returns:
         The model.
     """
-    figures = validation.table["rmse_db"].drop([KRIGING, FIELD], errors="ignore")
-    name = str(figures.idxmin())
+    name = validation.chosen
     count = int(np.count_nonzero(validation.block >= 0))
     basis = f"{name}, errors on {len(validation.labels)} blocks held out in turn"
     size = validation.scale(name)

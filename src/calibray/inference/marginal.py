@@ -48,6 +48,9 @@ SPREADS: Final = (0.07, 0.15, 0.3)
 STEPS: Final = 25
 """Steps to the mode of Student's t."""
 
+DEPARTURE: Final = 2.0
+"""Weight of each departure from independent Gaussian errors, beside theirs of one: measured errors rarely are."""
+
 NEGLIGIBLE: Final = 1e-3
 """Weight of a model below which it is left out."""
 
@@ -85,7 +88,7 @@ def noise_models(
     spread: float | None = None,
     offset: bool = True,
 ) -> tuple[NoiseModel, ...]:
-    """The models of noise that are tried, each kind with the same weight.
+    """The models of noise that are tried, each departure from independent Gaussian errors weighed alike.
 
     Args:
         position: Where the links' ends stand [m, 3 or 6], [m].
@@ -110,9 +113,10 @@ def noise_models(
             [NoiseModel(DIFFERING, 1.0, spread=s) for s in (SPREADS if spread is None else (spread,))]
         )
     choices = (False, True) if offset else (False,)
+    size = [1.0 if group[0].kind == GAUSSIAN else DEPARTURE for group in found]
     return tuple(
-        replace(model, weight=1.0 / (len(choices) * len(found) * len(group)), offset=extra)
-        for group in found
+        replace(model, weight=part / (sum(size) * len(choices) * len(group)), offset=extra)
+        for part, group in zip(size, found, strict=True)
         for model in group
         for extra in choices
     )

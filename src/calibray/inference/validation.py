@@ -66,6 +66,11 @@ class Validation:
         return str(self.table["rmse_db"].idxmin())
 
     @property
+    def chosen(self) -> str:
+        """The best model that predictions can go by: kriging is about measured places, which blocks are not."""
+        return str(self.table["rmse_db"].drop([KRIGING, FIELD], errors="ignore").idxmin())
+
+    @property
     def nested_rmse_db(self) -> float:
         """RMSE of the model that is best on the other blocks: what choosing is worth, [dB]."""
         chosen = np.full(len(self.block), np.nan)
