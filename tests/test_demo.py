@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from calibray import engines
 from calibray.calibration.problem import Problem
 from calibray.cli.app import app
-from calibray.comparison.experiment import METHODS, run_demo
+from calibray.comparison import experiment
+from calibray.comparison.experiment import MAPPING, METHODS, run_demo
 from calibray.comparison.paper import tables
 from calibray.reporting.demo import FIGURES, write
 from calibray.scenarios import demo_study_path
@@ -22,7 +23,9 @@ from calibray.study import Study
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    finished = run_demo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "MAPPED", 1)  # each is a trace
+        finished = run_demo()
     write(finished, out)
     return finished, out
 
@@ -68,6 +71,14 @@ def test_methods_of_the_paper_improve_on_the_start_and_not_on_the_optimum(demo):
         assert finished.optimum_db - 1e-9 <= result.rmse_db < result.initial_rmse_db - 1
 
 
+def test_space_mapping_runs_on_the_ray_tracer_itself(demo):
+    finished, _ = demo
+    mapped = finished.results[MAPPING]
+    assert mapped.rt_calls == 1
+    assert mapped.cheap_calls > 100
+    assert finished.optimum_db - 1e-3 < mapped.rmse_db < mapped.initial_rmse_db
+
+
 def test_soil_is_called_not_identifiable_and_concrete_is(demo):
     intervals = demo[0].results["auto"].intervals
     assert intervals["soil.relative_permittivity"].verdict == "not identifiable"
@@ -86,7 +97,7 @@ def test_files_exist_and_open(demo):
     assert content["methods"]["auto"]["excess_rmse_db"] == 0
     for method in finished.results:
         assert (out / method / "result-scene.xml").is_file()
-    assert [len(table.rows) for table in tables(finished)] == [3, 3, 3, 3]
+    assert [len(table.rows) for table in tables(finished)] == [4, 3, 4, 3]
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):

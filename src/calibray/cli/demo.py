@@ -24,7 +24,7 @@ def demo(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run the paper's experiment in the embedded district: GWO, SGWO-IM and auto, with its tables and figures."""
+    """Run the paper's experiment in the embedded district, and space mapping and auto beside it: tables and figures."""
     from calibray.cli.progress import progress_bars
     from calibray.comparison.experiment import run_demo
     from calibray.comparison.paper import tables

@@ -41,7 +41,7 @@ PALETTE: Final = (
 )
 """For lines beyond the named ones."""
 
-COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "auto": ORANGE}
+COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
 """The paper's methods, and what Calibray itself does."""
 
 _VARIABLES: Final = {INK: "--ink", FAINT: "--faint", LINE: "--line", PAPER: "--paper", BLUE: "--accent"}
