@@ -33,6 +33,9 @@ SIZES: Final = ((512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
 SEARCHES: Final = 64
 """Local searches for the minima, where the method kept none."""
 
+KNOWN: Final = 200
+"""Minima by least squares that may be such."""
+
 BASINS: Final = 24
 """Minima that draws start around."""
 
@@ -133,9 +136,13 @@ def _from_draws(
     if size is None:
         reason = "by the curvature at the optimum alone: draws would cost more than five calibrations"
         return replace(offset, intervals={name: replace(each, reason=reason) for name, each in local.items()})
-    starts = np.concatenate([likely[:BASINS], shifted[:BASINS]])
     explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
-    explaining = explaining.reduced(starts)
+    # What fits worse by least squares may fit best where errors are alike or have heavy tails.
+    known = np.concatenate([minima[np.argsort(square)[:KNOWN]], shifted[:BASINS]])
+    explained = explaining(known)
+    order = np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")
+    starts = known[order[:BASINS]]
+    explaining = explaining.without_negligible(explained)
     batch, turns = size
     done = 0
 

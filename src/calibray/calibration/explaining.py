@@ -73,9 +73,9 @@ class Explaining:
         marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models)
         return cls(problem, marginal, design[:, held] @ coefficients[held], scale, counted)
 
-    def reduced(self, points: NDArray[np.float64]) -> Explaining:
-        """The same without models that explain nothing at points that are as good as any [k, d]."""
-        return replace(self, marginal=self.marginal.reduced(self(points)))
+    def without_negligible(self, explained: NDArray[np.float64]) -> Explaining:
+        """The same without models that explain little at any of some points, as this told of them [k, models]."""
+        return replace(self, marginal=self.marginal.reduced(explained))
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of the posterior under every model, but for one constant [n, models].
