@@ -299,7 +299,10 @@ def _placed(
     for end, place in (("tx", tx), ("rx", rx)):
         try:
             if steps.frame is not None:
-                rows = with_scene_positions(rows, end, steps.frame, *place, ground=steps.ground)
+                longitude, latitude, height = place
+                rows = with_scene_positions(
+                    rows, end, steps.frame, longitude, latitude, height, ground=steps.ground
+                )
                 continue
             position = positions(table, end, place)
             if steps.ground is not None:

@@ -94,8 +94,8 @@ def draft(
     Raises:
         InputError: A file cannot be read, or something cannot be told from the files and was not given.
     """
-    files = [Path(file) if file else None for file in (transmitters, track)]
-    made = _Drafting(scene, Path(links), Path(target), *files, frequency, tx)
+    sites, route = (Path(file) if file else None for file in (transmitters, track))
+    made = _Drafting(scene, Path(links), Path(target), sites, route, frequency, tx)
     content = made.content()
     text = toml(content, {each.what: each.reason for each in made.assumed})
     study = Study.from_content(tomllib.loads(text), target)
