@@ -6,6 +6,7 @@ an interaction belongs to follows from where it happens.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -105,7 +106,8 @@ def make(name: str, folder: Path) -> District:
         setup = Study.load(demo_study_path()).opened()
         footprints = tuple(building.footprint for building in district())
     else:
-        setup, footprints = _drawn(int(name.removeprefix("district-")), folder / name)
+        # A folder for each process: another one may be writing the same district.
+        setup, footprints = _drawn(int(name.removeprefix("district-")), folder / f"{name}-{os.getpid()}")
     return District(name, Problem.of(setup, engines.make(setup, "replay")), footprints)
 
 
