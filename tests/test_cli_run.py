@@ -126,7 +126,8 @@ def test_output_is_plain_text(ran):
 def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeypatch):
     """The program is all that is asked; every call is in the ledger, and started again the run asks nothing."""
     write_study(
-        tmp_path, programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 18}}}
+        tmp_path,
+        programs.content(tmp_path) | {"method": {"name": "auto", "model": "none", "options": {"budget": 18}}},
     )
 
     def refuse(*_: object) -> None:

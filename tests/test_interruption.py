@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import sys
 import time
 from contextlib import closing
 from pathlib import Path
 
+import pytest
+from rich.console import Console
+
 import programs
+from calibray import interruption
+from calibray.cli.progress import progress_bars
 from calibray.engines import open_ledger
 from test_cli_run import write_study
 
@@ -58,6 +66,23 @@ def in_terminal(words: list[object], out: Path, until: int) -> tuple[int, str]:
     finally:
         process.kill()
         os.close(own)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_an_interruption_that_a_library_drops_comes_at_the_next_step(terminal, monkeypatch):
+    monkeypatch.setattr(interruption, "GRACE", 0.0)
+    console = Console(file=io.StringIO(), force_terminal=terminal)
+
+    def work():
+        with progress_bars(console) as progress:
+            progress("tracing", 0, 2)
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            progress("tracing", 1, 2)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_ctrl_c_tells_what_was_kept_and_how_to_go_on(tmp_path):

@@ -119,7 +119,7 @@ def test_a_comparison_finds_its_runs(folder, monkeypatch):
     assert again.calls == found.find("random", 24, 1).calls
     assert again.best == pytest.approx(found.find("random", 24, 1).best, abs=TRACED_DB)
 
-    monkeypatch.setattr(comparison, "_code", lambda: code)
+    monkeypatch.setattr(comparison, "code", lambda: code)
     monkeypatch.setattr(comparison, "run_contender", None)
     monkeypatch.setattr(comparison, "_optimum", None)
     finished = comparison.compare(
@@ -135,4 +135,4 @@ def test_a_comparison_finds_its_runs(folder, monkeypatch):
 
 
 def test_the_optimizers_code_has_a_fingerprint():
-    assert comparison._code() != hashlib.sha256().hexdigest()[:16]
+    assert comparison.code() != hashlib.sha256().hexdigest()[:16]

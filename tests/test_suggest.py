@@ -125,7 +125,8 @@ def test_what_is_expected_comes_about(folder, result, table):
         content["links"] = {**content["links"], "file": "more.csv"}
         interval = cb.calibrate(Study.from_content(content, folder / "study.toml")).intervals[NAME]
         widths.append(interval.upper - interval.lower)
-    assert np.mean(widths) == pytest.approx(found[f"{NAME}_width"].iloc[-1], rel=0.35)
+    # What is expected takes errors for independent and Gaussian, the intervals average over other kinds as well.
+    assert np.mean(widths) == pytest.approx(found[f"{NAME}_width"].iloc[-1], rel=0.5)
 
 
 def test_a_site_never_measured_tells_little(result, table):

@@ -1,9 +1,17 @@
-"""Ctrl-C in the midst of compiled code, which libraries take for a failure of their own."""
+"""Ctrl-C in the midst of compiled code, which libraries take for a failure of their own, or drop."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import Final
+
+GRACE: Final = 1.0
+"""Time that an interruption may take to reach whoever keeps what was computed [s]."""
 
 
 @contextmanager
@@ -28,3 +36,32 @@ def interruptible() -> Iterator[None]:
                 raise KeyboardInterrupt from None
             cause = cause.__cause__ or cause.__context__
         raise
+
+
+@contextmanager
+def noticed() -> Iterator[Callable[[], None]]:
+    """See to it that Ctrl-C is not lost where it falls into a callback of a library, which drops exceptions.
+
+    Yields:
+        What to call now and then; it raises KeyboardInterrupt where one was dropped before. Outside the main thread, or
+        where interruptions are ignored or seen to otherwise, it does nothing.
+    """
+    pressed: list[float] = []
+
+    def press(_: int, __: FrameType | None) -> None:
+        pressed.append(time.monotonic())
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if pressed and time.monotonic() - pressed[-1] > GRACE:
+            raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
+        yield lambda: None
+        return
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)

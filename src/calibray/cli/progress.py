@@ -12,6 +12,7 @@ from typing import Final
 from rich import progress as rich_progress
 from rich.console import Console
 
+from calibray.interruption import noticed
 from calibray.progress import Progress
 
 EVERY: Final = 5.0
@@ -33,8 +34,14 @@ def progress_bars(console: Console, every: float | None = None) -> Iterator[Prog
     Yields:
         What to call with the stage's name, how much is done, and out of how much.
     """
-    with _bars(console) if console.is_terminal else _lines(console, every or EVERY) as report:
-        yield report
+    told = _bars(console) if console.is_terminal else _lines(console, every or EVERY)
+    with told as report, noticed() as check:
+
+        def progress(stage: str, done: int, total: int | None) -> None:
+            check()
+            report(stage, done, total)
+
+        yield progress
 
 
 @contextmanager
