@@ -10,9 +10,13 @@ from calibray.optimizers.landscapes import Landscape, rosenbrock
 
 LANDSCAPE = rosenbrock()
 CASES = sorted(METHODS.items())
+# What they think between evaluations grows with the evaluations told: a promise is seen in thirty as well.
+THOUGHTFUL = {METHODS[name] for name in ("vector-surrogate", "space-mapping", "gaussian-process")}
 
 
 def make(method: type[Optimizer], landscape: Landscape = LANDSCAPE, **settings) -> Optimizer:
+    if method in THOUGHTFUL:
+        settings = {"budget": 30, **settings}
     return method(landscape.lower, landscape.upper, **settings)
 
 
