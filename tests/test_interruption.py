@@ -85,6 +85,19 @@ def test_an_interruption_that_a_library_drops_comes_at_the_next_step(terminal, m
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_an_interruption_waits_for_what_must_not_be_left_half_made():
+    done = []
+
+    def work():
+        with interruption.deferred():
+            signal.raise_signal(signal.SIGINT)
+            done.append("whole")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["whole"]
+
+
 def test_ctrl_c_tells_what_was_kept_and_how_to_go_on(tmp_path):
     method = {"name": "auto", "options": {"budget": 18}}
     write_study(

@@ -290,7 +290,9 @@ def test_missing_misshapen_or_mistyped_dataset(paths: Paths, tmp_path: Path, nam
     ("interactions/rotation", 0, 0.5), ("paths/delay", 0, -1e-9), ("paths/spreading", 0, -1.0),
     ("diffuse/solid_angle", 0, -1.0), ("diffraction/sin_edge", 0, 1.5), ("paths/departure", 0, 7.0),
     ("materials/relative_permittivity", 0, 0.5), ("materials/name", 0, "glass"), ("materials/name", 0, ""),
-    ("materials/scattering_pattern", 0, "shiny"),
+    ("materials/scattering_pattern", 0, "shiny"), ("paths/tx_field_real", 0, 1e300), ("paths/rx_field_imag", 0, -1e300),
+    ("paths/delay", 0, 1e300), ("paths/spreading", 0, 1e300), ("links/rx_position", 0, 1e300),
+    ("diffuse/solid_angle", 0, 1e300), ("diffraction/distance", 0, 1e300),
 ])  # fmt: skip
 def test_value_that_no_trace_gives(
     paths: Paths, tmp_path: Path, name: str, index: int, value: float | str

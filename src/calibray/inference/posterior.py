@@ -16,7 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
-from scipy.stats import qmc
+
+from calibray.optimizers.sampling import design
 
 TAILS: Final = 5.0
 """Degrees of freedom of the kernels: heavier tails than those of most posteriors."""
@@ -98,7 +99,7 @@ def sample(
     random, width, dimension = np.random.default_rng(seed), upper - lower, len(lower)
     spread = covariance / np.outer(width, width) * 1.5**2 + 1e-12 * np.eye(dimension)
     basins = _Kernels.of((minima - lower) / width, spread)
-    even = qmc.Sobol(dimension, rng=random).random(batch)
+    even = design("sobol", batch, dimension, random)
     unit = np.concatenate([even, inside(basins.draw(batch, random))])
     found = density(lower + unit * width)
     proposals, share = [basins], [float(batch), float(batch)]

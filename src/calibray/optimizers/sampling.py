@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import qmc
 
+from calibray.interruption import deferred
 from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
@@ -36,8 +37,11 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
         return rng.random((count, dimension))
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
+    # SciPy drops an interruption while it reads its direction numbers, and goes on without them.
+    with deferred():
+        sequence = qmc.Sobol(dimension, rng=rng)
     # Sobol points are balanced in blocks of a power of two only, and SciPy warns about other counts.
-    return qmc.Sobol(dimension, rng=rng).random_base2((count - 1).bit_length())[:count]
+    return sequence.random_base2((count - 1).bit_length())[:count]
 
 
 def maximin_design(

@@ -66,28 +66,32 @@ class Content:
 
 _COSINE = (-1 - _SLACK, 1 + _SLACK)
 _ANGLE = (-2 * pi - _SLACK, 2 * pi + _SLACK)
+# Far beyond any antenna (120 dB), scene and path, and far from where sums of powers overflow.
+_FIELD = (-1e6, 1e6)
+_LENGTH = 1e9  # [m]
+_POSITION = (-_LENGTH, _LENGTH)
 
 DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     {
         "materials/name": Dataset(("M",), "O"),
         **{f"materials/{name}": Dataset(("M",)) for name in FIELDS},
         "materials/scattering_pattern": Dataset(("M",), "O"),
-        "links/tx_position": Dataset(("L", 3)),
-        "links/rx_position": Dataset(("L", 3)),
+        "links/tx_position": Dataset(("L", 3), "f", *_POSITION),
+        "links/rx_position": Dataset(("L", 3), "f", *_POSITION),
         "paths/link": Dataset(("P",), "i"),
         "paths/first": Dataset(("P + 1",), "i"),
-        "paths/delay": Dataset(("P",), lower=0.0),
-        "paths/spreading": Dataset(("P",), lower=0.0),
+        "paths/delay": Dataset(("P",), "f", 0.0, 1e3),
+        "paths/spreading": Dataset(("P",), "f", 0.0, 1e9),
         "paths/departure": Dataset(("P", 2), "f", *_ANGLE),
         "paths/arrival": Dataset(("P", 2), "f", *_ANGLE),
-        **{f"paths/tx_field_{part}": Dataset(("P", "T", 2)) for part in ("real", "imag")},
-        **{f"paths/rx_field_{part}": Dataset(("P", "R", 2)) for part in ("real", "imag")},
+        **{f"paths/tx_field_{part}": Dataset(("P", "T", 2), "f", *_FIELD) for part in ("real", "imag")},
+        **{f"paths/rx_field_{part}": Dataset(("P", "R", 2), "f", *_FIELD) for part in ("real", "imag")},
         "interactions/kind": Dataset(("I",), "i"),
         "interactions/material": Dataset(("I",), "i"),
         "interactions/cos_incidence": Dataset(("I",), "f", *_COSINE),
         "interactions/rotation": Dataset(("I", 2), "f", *_COSINE),
         "diffuse/rotation": Dataset(("D", 2), "f", *_COSINE),
-        "diffuse/solid_angle": Dataset(("D",), lower=0.0),
+        "diffuse/solid_angle": Dataset(("D",), "f", 0.0, 1e9),
         "diffuse/cos_scattered": Dataset(("D",), "f", *_COSINE),
         "diffuse/cos_specular": Dataset(("D",), "f", *_COSINE),
         "diffuse/cos_backward": Dataset(("D",), "f", *_COSINE),
@@ -96,7 +100,7 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
         "diffraction/azimuth_in": Dataset(("W",), "f", *_ANGLE),
         "diffraction/azimuth_out": Dataset(("W",), "f", *_ANGLE),
         "diffraction/sin_edge": Dataset(("W",), "f", 0.0, _COSINE[1]),
-        "diffraction/distance": Dataset(("W",), lower=0.0),
+        "diffraction/distance": Dataset(("W",), "f", 0.0, _LENGTH),
         "diffraction/rotations": Dataset(("W", 4, 2), "f", *_COSINE),
     }
 )
