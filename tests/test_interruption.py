@@ -85,6 +85,19 @@ def test_an_interruption_that_a_library_drops_comes_at_the_next_step(terminal, m
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("failure", [RuntimeError, SystemError, ImportError])
+def test_an_interruption_that_a_library_took_for_its_own_failure_is_one(failure):
+    @interruption.interruptible()
+    def work():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise failure("while initializing") from error
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+
+
 def test_an_interruption_waits_for_what_must_not_be_left_half_made():
     done = []
 

@@ -25,11 +25,12 @@ def interruptible() -> Iterator[None]:
         KeyboardInterrupt: An error was raised because of one.
         RuntimeError: An error was raised for another reason.
         SystemError: The same, of an import.
+        ImportError: The same, of a library's own import.
     """
     try:
         yield
-    # Dr.Jit raises the one in a loop, the interpreter the other in an import.
-    except (RuntimeError, SystemError) as error:
+    # Dr.Jit raises the first in a loop, the interpreter the second in an import, and Mitsuba the third in its own.
+    except (RuntimeError, SystemError, ImportError) as error:
         cause: BaseException | None = error
         while cause is not None:
             if isinstance(cause, KeyboardInterrupt):
