@@ -1,24 +1,27 @@
 """Whether the model chosen by held-out blocks is the right one where nothing was fitted or chosen.
 
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml examples/auckland_tower.toml
-    python benchmarks/choice.py --chance 100 --workers 2
+    python benchmarks/choice.py --chance 100 --workers 2 --out chance.jsonl
 
 Nested: each block is held out in turn; all models are validated on blocks of the rest, the one that is best there is
 fitted to the rest, and judged by the block, which had no say. Beside its pooled RMSE stands every model's own, and how
 often the block's links lie in the 90 % interval as wide as the chosen model's errors on the inner blocks.
 
 With `--chance`, the twin without a chance: measurements from a log-distance law with noise, in the demo district. The
-sentence must say that calibration did not help; the script fails where it does so in fewer than 95 of 100.
+sentence must say that calibration did not help; the script fails where it does so in fewer than 95 of 100. Each
+repetition is a line of the file `--out`; a run that was stopped goes on where it stood.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from scipy.special import stdtrit
@@ -80,13 +83,28 @@ def _demo() -> Problem:
     return opened(str(demo_study_path()))
 
 
-def without_a_chance(seed: int) -> str:
-    """What is said of a twin whose measurements follow distance alone."""
+def without_a_chance(seed: int) -> tuple[int, str]:
+    """The seed, and what is said of a twin whose measurements follow distance alone."""
     problem = _demo()
     links, random = problem.setup.links, np.random.default_rng([seed, 5])
     law = INTERCEPT_DB + SLOPE_DB * np.log10(links.distance)
     measured = law + NOISE_DB * random.standard_normal(len(links))
-    return validated(replace(problem, objective=replace(problem.objective, measured=measured))).sentence
+    return seed, validated(replace(problem, objective=replace(problem.objective, measured=measured))).sentence
+
+
+def said_without_a_chance(count: int, workers: int, out: Path | None) -> list[str]:
+    """What is said in so many repetitions; those that the file holds already are read from it."""
+    lines = out.read_text().splitlines() if out is not None and out.exists() else []
+    said = {line["seed"]: line["sentence"] for line in map(json.loads, lines)}
+    left = [seed for seed in range(count) if seed not in said]
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for turn, (seed, sentence) in enumerate(pool.map(without_a_chance, left), start=1):
+            said[seed] = sentence
+            print(f"repetition {turn} of {len(left)}: {sentence}", file=sys.stderr)
+            if out is not None:
+                with out.open("a") as file:
+                    file.write(json.dumps({"seed": seed, "sentence": sentence}) + "\n")
+    return [said[seed] for seed in range(count)]
 
 
 def main() -> None:
@@ -96,17 +114,14 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=4)
     parser.add_argument("--chance", type=int, default=0, help="repetitions of the twin without a chance")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="file of the repetitions")
     given = parser.parse_args()
     for file in given.studies:
         table, chosen = nested(opened(file), given.blocks)
         print(render(table, f"Chosen for each block: {chosen}."))
     if not given.chance:
         return
-    if given.workers > 1:
-        with ProcessPoolExecutor(given.workers, multiprocessing.get_context("spawn")) as pool:
-            said = list(pool.map(without_a_chance, range(given.chance)))
-    else:
-        said = [without_a_chance(seed) for seed in range(given.chance)]
+    said = said_without_a_chance(given.chance, given.workers, given.out)
     right = sum(sentence.startswith("Calibration did not") for sentence in said)
     print(f"A twin without a chance is called so in {right} of {given.chance} repetitions.")
     if right < 0.95 * given.chance:

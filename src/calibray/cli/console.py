@@ -19,3 +19,11 @@ Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files there that Calibray did not write.")
 ]
 """Whether output may take the place of a user's file; an input is never replaced."""
+
+Anyway = Annotated[
+    bool,
+    typer.Option(
+        "--anyway", help="Go on although a file of the result, the scene or an antenna changed since."
+    ),
+]
+"""Whether a result is used although what it was calibrated with changed."""

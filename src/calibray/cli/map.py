@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Anyway, Overwrite, log
 from calibray.errors import InputError
 
 
@@ -61,12 +61,7 @@ def map(
         Path | None,
         typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into instead of DIR."),
     ] = None,
-    anyway: Annotated[
-        bool,
-        typer.Option(
-            "--anyway", help="Predict although a file of the result, the scene or an antenna changed since."
-        ),
-    ] = False,
+    anyway: Anyway = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Anyway, Overwrite, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,12 +44,7 @@ def predict(
             "upper_db and basis.",
         ),
     ] = None,
-    anyway: Annotated[
-        bool,
-        typer.Option(
-            "--anyway", help="Predict although a file of the result, the scene or an antenna changed since."
-        ),
-    ] = False,
+    anyway: Anyway = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
@@ -57,15 +52,13 @@ def predict(
 
     from calibray.cli.progress import progress_bars
     from calibray.files import check_table, write_table
-    from calibray.measurements import read_links
+    from calibray.inference.prediction import as_links
     from calibray.result import Result
     from calibray.tables.text import rows_text
 
     result = Result.load(folder, anyway=anyway)
     study = result.study
-    links = read_links(
-        links_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
-    )
+    links = as_links(result, links_file)
     _refuse_columns(links_file, links.frame, PREDICTED[: 1 if level is None else None])
     if out is not None:
         check_table(out, [links_file, *study.files()], overwrite)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Anyway, Overwrite, log
 
 
 def suggest(
@@ -28,12 +28,7 @@ def suggest(
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="CSV or Parquet file to write as well.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    anyway: Annotated[
-        bool,
-        typer.Option(
-            "--anyway", help="Go on although a file of the result, the scene or an antenna changed since."
-        ),
-    ] = False,
+    anyway: Anyway = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
@@ -41,15 +36,13 @@ def suggest(
     from calibray.calibration.suggest import suggest as find
     from calibray.cli.progress import progress_bars
     from calibray.files import check_table, write_table
-    from calibray.measurements import read_links
+    from calibray.inference.prediction import as_links
     from calibray.result import Result
     from calibray.tables.text import render
 
     result = Result.load(folder, anyway=anyway)
     study = result.study
-    links = read_links(
-        candidates_file, group=study.offset.per if study.offset else None, frequency=study.links.frequency
-    )
+    links = as_links(result, candidates_file)
     if out is not None:
         check_table(out, [candidates_file, *study.files()], overwrite)
     with progress_bars(log) as progress:

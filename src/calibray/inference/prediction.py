@@ -15,7 +15,7 @@ from calibray import fields
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
-from calibray.measurements import Measurements, links_from_frame
+from calibray.measurements import Measurements, links_from_frame, read_links
 from calibray.progress import Progress
 from calibray.study import Setup
 
@@ -187,25 +187,26 @@ def _framed(
     )
 
 
-def as_links(result: Result, links: Measurements | pd.DataFrame) -> Measurements:
-    """Links to predict at, of a table.
+def as_links(result: Result, links: Measurements | pd.DataFrame | Path) -> Measurements:
+    """Links to predict at, of a table or a file of one.
 
     Args:
         result: The calibration.
-        links: The links, or a table as `predict` takes it.
+        links: The links, a table as `predict` takes it, or a CSV or Parquet file that holds one.
 
     Returns:
         The links, grouped as the study's offset is, with carriers if it has a column of them.
 
     Raises:
-        InputError: A column is missing, or a position is not finite.
+        InputError: The file cannot be read, a column is missing, or a position is not finite.
     """
     if isinstance(links, Measurements):
         return links
     study = result.study
-    return links_from_frame(
-        links, group=study.offset.per if study.offset else None, frequency=study.links.frequency
-    )
+    group, frequency = study.offset.per if study.offset else None, study.links.frequency
+    if isinstance(links, Path):
+        return read_links(links, group, frequency)
+    return links_from_frame(links, group, frequency)
 
 
 def _residual(result: Result) -> tuple[float, str]:
