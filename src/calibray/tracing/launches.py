@@ -1,9 +1,10 @@
 """How a trace is cut into launches that fit into memory, whatever number of samples and receivers is asked for.
 
-A launch sends rays from one transmitter and looks for paths to some receivers. The tracer keeps a few numbers for every
-ray, interaction and receiver, a *lane*, so the receivers of a transmitter are shared out; if one receiver is too much
-already, the rays are. Sionna's rays lie on a lattice of directions that a seed does not change: a launch takes a share
-of the lattice of all rays, and the launches together send out the rays that one would.
+A launch sends rays from one transmitter and looks for paths to some receivers, or the other way round
+(`starts_at_receivers`); what is said of transmitters here holds for whichever end sends. The tracer keeps a few numbers
+for every ray, interaction and receiver, a *lane*, so the receivers of a transmitter are shared out; if one receiver is
+too much already, the rays are. Sionna's rays lie on a lattice of directions that a seed does not change: a launch takes
+a share of the lattice of all rays, and the launches together send out the rays that one would.
 """
 
 from __future__ import annotations
@@ -129,11 +130,29 @@ class Plan:
         )
 
 
-def plan(tx: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:
-    """Cut a trace into launches.
+def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
+    """Whether rays are sent out by the receivers: they are, where there are fewer of them than transmitters.
+
+    A path is the same in both directions, and is turned around after it was found. Diffuse reflection is not: how a
+    ray is scattered, and how likely the tracer was to choose it, is told for one direction alone. Such traces start at
+    the transmitters.
 
     Args:
         tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+        settings: The tracer's switches.
+
+    Returns:
+        True where the receivers send.
+    """
+    return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
+
+
+def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:
+    """Cut a trace into launches.
+
+    Args:
+        source: The end of every link that sends out the rays [L, 3], [m].
         settings: The tracer's switches.
         lanes: Rays times interactions times receivers that a launch may have.
         buffer: Paths that the buffer of a launch holds at first.
@@ -144,7 +163,7 @@ def plan(tx: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: i
     depth = max(settings.max_depth, 1)
     together = max(1, lanes // (settings.samples * depth))
     pieces = min(settings.samples, -(-settings.samples * depth // lanes)) if settings.max_depth else 1
-    positions, group = np.unique(tx, axis=0, return_inverse=True)
+    positions, group = np.unique(source, axis=0, return_inverse=True)
     members = np.split(
         np.argsort(group.reshape(-1), kind="stable"), np.cumsum(np.bincount(group.reshape(-1)))[:-1]
     )

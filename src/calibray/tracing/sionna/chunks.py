@@ -20,7 +20,7 @@ from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
 
 @dataclass(frozen=True)
 class Chunk:
-    """Paths from one transmitter to some receivers, in Sionna's own buffer; `link` is the link of every path [P]."""
+    """Paths in Sionna's own buffer, between one position and some others; `link` is the link of every path [P]."""
 
     buffer: PathsBuffer
     source: mi.Point3f

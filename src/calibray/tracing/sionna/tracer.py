@@ -34,7 +34,7 @@ from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
-from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan
+from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan, starts_at_receivers
 from calibray.tracing.memory import available
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -42,6 +42,7 @@ from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
+from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.stored import Trace
 
 LANES: Final = 20_000_000
@@ -120,7 +121,8 @@ class Tracer:
         Raises:
             InputError: There is no link, a position is not finite, or a link's ends coincide.
         """
-        return plan(positions(links)[0], self.settings, LANES, BUFFER)
+        tx, rx = positions(links)
+        return plan(rx if starts_at_receivers(tx, rx, self.settings) else tx, self.settings, LANES, BUFFER)
 
     @interruptible()
     def trace(
@@ -182,6 +184,8 @@ class Tracer:
             EngineError: There are more paths than fit into memory.
         """
         tx, rx = positions(links)
+        backwards = starts_at_receivers(tx, rx, self.settings)
+        ends = tx if backwards else rx
         constants = self.give(materials or {})
         room = paths_that_fit(available(), self.settings.max_depth)
         chunks: list[Chunk] = []
@@ -190,7 +194,7 @@ class Tracer:
         if progress is not None:
             progress("tracing", 0, len(rx))
         for launch in self.plan(links).launches:
-            pieces.append(self._trace_launch(launch, rx[launch.links], room - found))
+            pieces.append(self._trace_launch(launch, ends[launch.links], room - found, backwards))
             found += len(pieces[-1].link)
             if launch.last:
                 chunks += without_repeats(pieces)
@@ -254,7 +258,9 @@ class Tracer:
             dr.eval(ray)
         return odd.reshape(len(points), -1).mean(axis=1) > 0.5
 
-    def _trace_launch(self, launch: Launch, targets: NDArray[np.float64], room: int) -> Chunk:
+    def _trace_launch(
+        self, launch: Launch, targets: NDArray[np.float64], room: int, backwards: bool
+    ) -> Chunk:
         settings, size = self.settings, BUFFER
         # A path a lane, and the direct ones.
         most = (launch.rays * settings.max_depth + 1) * len(targets) + 2
@@ -289,6 +295,8 @@ class Tracer:
             size = min(4 * size, most)
         buffer.shrink()
         buffer.detach_geometry()
+        if backwards:
+            buffer, src, tgt = turned_around(buffer, tgt), tgt, src
         if buffer.buffer_size:
             buffer = self._images(
                 scene=mitsuba_scene(self._scene),
@@ -302,7 +310,8 @@ class Tracer:
             buffer.schedule()
             # At once: what is left to be computed would hold on to all candidates and the whole buffer.
             dr.eval()
-        return Chunk(buffer, src, tgt, launch.links[np.array(buffer.target_indices, dtype=np.int64)])
+        end = buffer.source_indices if backwards else buffer.target_indices
+        return Chunk(buffer, src, tgt, launch.links[np.array(end, dtype=np.int64)])
 
     def compile(
         self,
@@ -384,7 +393,7 @@ class Tracer:
             return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
         buffer = chunk.buffer
         valid = mi.Bool(buffer.valid)
-        count = dr.width(chunk.target)
+        ends = dr.width(chunk.source), dr.width(chunk.target)
         found: Any = self._fields(
             wavelength=self._scene.wavelength,
             paths=buffer,
@@ -392,8 +401,8 @@ class Tracer:
             diffraction=self.settings.diffraction,
             src_positions=chunk.source,
             tgt_positions=chunk.target,
-            src_orientations=points(np.array([self.tx_antenna.orientation])),
-            tgt_orientations=points(np.tile(self.rx_antenna.orientation, (count, 1))),
+            src_orientations=points(np.tile(self.tx_antenna.orientation, (ends[0], 1))),
+            tgt_orientations=points(np.tile(self.rx_antenna.orientation, (ends[1], 1))),
             src_antenna_patterns=self._tx_patterns,
             tgt_antenna_patterns=self._rx_patterns,
         )
