@@ -3,8 +3,10 @@
     python benchmarks/family.py --workers 2                      # development: seeds 0 to 19
     python benchmarks/family.py --seeds 1000:1020 --workers 2    # judging: run once, reported whatever it says
 
-needs `pip install "calibray[optimizers,scenes]"` and a tracer. Finished runs are kept under out/family; a killed
-benchmark goes on where it stopped. Excesses can be compared between machines; seconds cannot.
+needs `pip install "calibray[optimizers,scenes]"` and a tracer. Every finished run is kept under out/family at once; a
+killed benchmark goes on where it stopped, and one with more seeds, methods or `--repeats` makes what is missing alone.
+Problems that cannot be made and runs that fail are named below the tables. Excesses can be compared between machines;
+seconds cannot.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -21,17 +23,22 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+from calibray.calibration.cheap import HELPED
 from calibray.cli.console import log
 from calibray.cli.progress import progress_bars
-from calibray.comparison.family import compare_family, seed_range
+from calibray.comparison.comparison import quantile
+from calibray.comparison.family import FamilyComparison, compare_family, seed_range
 from calibray.comparison.family_tables import tables
-from calibray.tables import markdown
+from calibray.comparison.labels import label
+from calibray.tables import Column, Table, markdown, numbers
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (
     "space-mapping@30", "vector-surrogate", "sgwo-im", "sgwo-im-screened", "gwo", "gaussian-process", "cma-es",
     "differential-evolution", "dfo-ls", "random", "latin-hypercube", "sobol",
 )  # fmt: skip
+
+AUTO = "vector-surrogate"  # what `auto` is without a cheap model
 
 
 def main() -> None:
@@ -47,14 +54,67 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=ROOT / "out/family", help="folder that keeps the runs")
     chosen = parser.parse_args()
+    finished = []
     for kind in chosen.families:
         with progress_bars(log) as progress:
-            finished = compare_family(
+            part = compare_family(
                 kind, seed_range(chosen.seeds), chosen.methods, budget=chosen.budget, repeats=chosen.repeats,
                 out=chosen.runs, workers=chosen.workers, progress=progress,
             )  # fmt: skip
-        for table in tables(finished):
+        finished.append(part)
+    together = FamilyComparison.joined(finished)
+    named = [(part.kind, part) for part in (finished if len(finished) == 1 else [*finished, together])]
+    for told, problems in (("right", ~together.misinformed), ("wrong", together.misinformed)):
+        part = together.part(problems)
+        if part.seeds:
+            named.append((f"{together.kind}, cheap models told {told}", part))
+    for name, part in named:
+        print(f"## {name}: {len(part.seeds)} problems\n")
+        for table in tables(part):
             print(f"{table.title}\n\n{markdown.render(table)}\n", flush=True)
+    print(f"{markdown.render(shown(together))}\n")
+    for part in finished:
+        for seed, reason in part.unmade:
+            print(f"- {part.kind} {seed} could not be made: {reason}")
+        for name, seed, failure in part.failures():
+            print(f"- {part.kind} {seed}, {name}: a run failed: {failure}")
+
+
+def shown(comparison: FamilyComparison) -> Table:
+    """What issue 11 asks to be shown, of the methods that were run."""
+    by_method = {each.method: each for each in comparison.contenders}
+    rows: list[tuple[str, str, str, str]] = []
+
+    def measured(method: str, calls: int, share: float = 0.5) -> float:
+        return quantile(comparison.excess(by_method[method].name, calls).ravel(), share)
+
+    def row(what: str, wanted: str, value: float, met: bool) -> None:
+        rows.append((what, wanted, f"{value:.4f}", "yes" if met else "no"))
+
+    if {"space-mapping", "sgwo-im"} <= by_method.keys():
+        paper, ours = measured("sgwo-im", 225), measured("space-mapping", 8)
+        row("space mapping, median at 8 [dB]", f"SGWO-IM's at 225: {paper:.4f}", ours, ours <= paper)
+    if "space-mapping" in by_method:
+        tail = measured("space-mapping", 8, 0.9)
+        row("space mapping, 90th percentile at 8 [dB]", "below 0.05", tail, tail < 0.05)
+        for told, chosen, calls in (
+            ("right", ~comparison.misinformed, 15),
+            ("wrong", comparison.misinformed, 30),
+        ):
+            if chosen.any():
+                share = comparison.part(chosen).solved(by_method["space-mapping"].name, calls, 0.02)
+                what = f"space mapping, cheap model told {told}, share within 0.02 dB at {calls}"
+                row(what, "at least 0.8", share, share >= 0.8)
+    without = [name for name in by_method if name not in HELPED]
+    for calls in (30, 60, 120, 225):
+        median = {name: measured(name, calls) for name in without if calls <= by_method[name].budget}
+        if AUTO in median and len(median) > 1:
+            others = {name: value for name, value in median.items() if name != AUTO}
+            rival = min(others, key=lambda name: others[name])
+            wanted = f"{label(rival)}'s: {others[rival]:.4f}"
+            row(f"{label(AUTO)}, median at {calls} [dB]", wanted, median[AUTO], median[AUTO] <= others[rival])
+    columns = (Column("what"), Column("wanted"), numbers("measured"), Column("met"))
+    return Table("", columns, tuple(rows))
 
 
 if __name__ == "__main__":

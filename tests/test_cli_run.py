@@ -23,6 +23,7 @@ from calibray.files import SIGNATURES
 from calibray.paths import Paths
 from calibray.result import FILES, Result
 from calibray.result import tables as report
+from calibray.scenarios import optima
 from calibray.tables.text import render
 from calibray.tracing.enclosed import Enclosed
 
@@ -319,9 +320,12 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path))
     (tmp_path / f"{'a' * 64}.h5").write_bytes(b"0" * 2_000_000)
     (tmp_path / "mine.h5").write_bytes(b"0")
+    (tmp_path / f"optimum-{'b' * 40}-64.json").write_text('{"rmse_db": 1.5}')
+    assert optima.find("b" * 64, 64) == 1.5
     listed = calibray("cache")
     assert re.search(rf"folder +{tmp_path}\ntraces +1, 2.0 MB", listed.stdout)
-    assert "Removed 1 traces" in calibray("cache", "--clear").stderr
+    assert re.search(r"optima +1, 0.0 MB", listed.stdout)
+    assert "Removed 1 traces, 0 compiled programs, 1 optima" in calibray("cache", "--clear").stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     assert "CALIBRAY_CACHE is empty" in calibray("cache").stdout

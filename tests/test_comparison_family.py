@@ -13,7 +13,7 @@ from calibray.comparison.comparison import Contender, code
 from calibray.comparison.family import FamilyComparison, compare_family, seed_range
 from calibray.comparison.family_tables import tables
 from calibray.comparison.runs import MethodRun
-from calibray.errors import InputError
+from calibray.errors import EngineError, InputError
 
 
 @pytest.fixture
@@ -38,7 +38,9 @@ def finished(*curves: tuple[float, ...]) -> FamilyComparison:
         (MethodRun("random", 10, 0, len(best), tuple(range(1, len(best) + 1)), best, 0.1),) for best in curves
     )
     contender = Contender("random", "random", 10)
-    return FamilyComparison("district", (0, 1, 2), (contender,), {"random": runs}, np.ones(len(curves)))
+    return FamilyComparison(
+        "district", (0, 1, 2), (contender,), {"random": runs}, np.ones(3), np.arange(3) == 1
+    )
 
 
 def test_a_data_profile_is_the_share_of_problems_within_the_tolerance():
@@ -52,6 +54,35 @@ def test_a_data_profile_is_the_share_of_problems_within_the_tolerance():
     assert row["median_excess_db"] == pytest.approx(0.01)
     assert row["p90_excess_db"] == pytest.approx(0.01 + 0.8 * 0.03)
     assert row["worst_excess_db"] == pytest.approx(0.04)
+
+
+def test_problems_are_taken_apart_and_joined():
+    comparison = finished((2.0, 1.04), (1.5, 1.3, 1.005), (1.01,))
+    wrong, right = (comparison.part(chosen) for chosen in (comparison.misinformed, ~comparison.misinformed))
+    assert (wrong.seeds, right.seeds) == ((1,), (0, 2))
+    assert [wrong.solved("random", 3, 0.02), right.solved("random", 3, 0.02)] == [1.0, 0.5]
+    both = FamilyComparison.joined([right, wrong])
+    assert both.seeds == (0, 2, 1)
+    assert both.excess("random", 3).ravel() == pytest.approx(
+        comparison.excess("random", 3)[[0, 2, 1]].ravel()
+    )
+    assert both.misinformed.tolist() == [False, False, True]
+
+
+def test_a_problem_that_cannot_be_made_is_named_and_the_others_are_run(streets, tmp_path, monkeypatch):
+    made = module.family_arena
+
+    def arena(kind, seed):
+        if seed == 3:
+            raise EngineError("the tracer fell over")
+        return made(kind, seed)
+
+    monkeypatch.setattr(module, "family_arena", arena)
+    finished = compare_family("district", (2, 3, 4), ["random"], budget=8, out=tmp_path)
+    assert finished.seeds == (2, 4)
+    assert finished.unmade == ((3, "the tracer fell over"),)
+    with pytest.raises(InputError, match="fell over"):
+        compare_family("district", (3,), ["random"], budget=8, out=tmp_path)
 
 
 def test_finished_runs_are_not_run_again(streets, tmp_path):

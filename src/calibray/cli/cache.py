@@ -1,4 +1,4 @@
-"""`calibray cache`: traces and compiled programs kept between runs."""
+"""`calibray cache`: what is kept between runs."""
 
 from __future__ import annotations
 
@@ -10,23 +10,28 @@ import typer
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all that is kept.")] = False,
 ) -> None:
-    """Tell where traces and compiled programs are kept between runs and how large they are, or remove them.
+    """Tell where traces, compiled programs and optima of planted problems are kept between runs, or remove them.
 
     The folder is named by CALIBRAY_CACHE; where that is empty, none are kept.
     """
     from calibray import caching
     from calibray.caching import compiled
+    from calibray.scenarios import optima
     from calibray.tables import Column, Table, numbers
     from calibray.tables.text import render
     from calibray.tracing import cache as traces
 
     folder, programs = caching.folder(), compiled()
-    kept = {"traces": traces.kept(), "compiled programs": [] if programs is None else programs.kept()}
+    kept = {
+        "traces": traces.kept(),
+        "compiled programs": [] if programs is None else programs.kept(),
+        "optima": optima.kept(),
+    }
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:
         for path in (path for paths in kept.values() for path in paths):
             path.unlink(missing_ok=True)
-        told = " and ".join(f"{len(paths)} {name}" for name, paths in kept.items())
+        told = ", ".join(f"{len(paths)} {name}" for name, paths in kept.items())
         typer.echo(f"Removed {told}, {sum(size.values()):.1f} MB", err=True)
         return
     rows = [

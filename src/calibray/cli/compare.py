@@ -133,4 +133,6 @@ def _on_family(
         typer.echo(render(table))
     for name, seed, failure in finished.failures():
         typer.echo(f"Warning: {name}, problem {seed}: {failure}", err=True)
+    for seed, reason in finished.unmade:
+        typer.echo(f"Warning: problem {seed} could not be made: {reason}", err=True)
     typer.echo(f"Written to {out}: {', '.join(FAMILY_FILES)}", err=True)

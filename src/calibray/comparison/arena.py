@@ -43,6 +43,7 @@ class Arena:
         evaluate: What is searched.
         screen: The objective of a cheap model of it; None where there is none.
         model: Makes that cheap model anew, for methods that correct it; None where there is none.
+        misinformed: Whether that cheap model is told wrong constants.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Arena:
     evaluate: Evaluate
     screen: Screen | None = None
     model: Callable[[], CheapModel] | None = None
+    misinformed: bool = False
 
 
 def study_arena(path: str | Path) -> Arena:
@@ -158,6 +160,7 @@ def family_arena(kind: str, seed: int) -> Arena:
         evaluate,
         planted.cheap_rmse_db,
         lambda: planted_model(planted),
+        planted.differences.misinformed,
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
@@ -26,6 +26,7 @@ from calibray.errors import InputError
 from calibray.files import check_folder
 from calibray.optimizers import METHODS
 from calibray.progress import Progress
+from calibray.scenarios.family import FamilyKind
 from calibray.spelling import did_you_mean
 
 CALLS: Final = (8, 15, 30, 60, 120, 225)  # where excesses are tabulated
@@ -42,6 +43,8 @@ class FamilyComparison:
         contenders: The methods, in the order asked for.
         runs: By contender name, the runs on every problem [p][repeats].
         optimum: Lowest objective known of every problem [p], [dB].
+        misinformed: Problems whose cheap model is told wrong constants [p].
+        unmade: Problems that could not be made, which nothing else here counts: seed and reason of each.
     """
 
     kind: str
@@ -49,6 +52,48 @@ class FamilyComparison:
     contenders: tuple[Contender, ...]
     runs: dict[str, tuple[tuple[MethodRun, ...], ...]]
     optimum: NDArray[np.float64]
+    misinformed: NDArray[np.bool_]
+    unmade: tuple[tuple[int, str], ...] = ()
+
+    def part(self, chosen: NDArray[np.bool_]) -> FamilyComparison:
+        """Some of the problems alone.
+
+        Args:
+            chosen: Which [p].
+
+        Returns:
+            The comparison on these.
+        """
+        places = np.flatnonzero(chosen)
+        return FamilyComparison(
+            self.kind,
+            tuple(self.seeds[place] for place in places),
+            self.contenders,
+            {name: tuple(each[place] for place in places) for name, each in self.runs.items()},
+            self.optimum[places],
+            self.misinformed[places],
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[FamilyComparison]) -> FamilyComparison:
+        """The problems of several families together.
+
+        Args:
+            parts: Comparisons of the same contenders.
+
+        Returns:
+            One comparison.
+        """
+        first = parts[0]
+        return FamilyComparison(
+            " and ".join(part.kind for part in parts),
+            tuple(seed for part in parts for seed in part.seeds),
+            first.contenders,
+            {name: tuple(each for part in parts for each in part.runs[name]) for name in first.runs},
+            np.concatenate([part.optimum for part in parts]),
+            np.concatenate([part.misinformed for part in parts]),
+            tuple(each for part in parts for each in part.unmade),
+        )
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
         """Excess of a contender's runs after some RT calls.
@@ -183,7 +228,7 @@ def compare_family(
     """Run methods on every problem of a family at equal budgets of RT calls.
 
     Every finished run is appended to `runs.jsonl` in `out` at once; what is found there of the same problem, code of
-    the method, budget and seed is not run again.
+    the method, budget and seed is not run again. A problem that cannot be made is left out, and named in `unmade`.
 
     Args:
         kind: "district" or "office".
@@ -199,8 +244,12 @@ def compare_family(
         The comparison.
 
     Raises:
-        InputError: A method, a number, the family or the folder cannot be used.
+        InputError: A method, a number, the family or the folder cannot be used, or no problem can be made.
     """
+    if kind not in get_args(FamilyKind):
+        raise InputError(
+            f"family {kind!r}: there is no such family; {did_you_mean(kind, get_args(FamilyKind))}"
+        )
     for name, value, most in (("repeats", repeats, MOST["seeds"]), ("workers", workers, MOST["workers"])):
         if not 1 <= value <= most:
             raise InputError(f"{name} = {value}; it must be 1 to {most:,}")
@@ -214,11 +263,17 @@ def compare_family(
             )
     path = Path(check_folder(out)) / "runs.jsonl"
     with _Pool(workers) as pool:
-        made = dict(
-            _told(pool.run(_prepare, [(kind, seed) for seed in seeds]), "problems", len(seeds), progress)
+        prepared = _told(
+            pool.run(_prepare, [(kind, seed) for seed in seeds]), "problems", len(seeds), progress
         )
+        answers = {task[1]: answer for task, answer in prepared}
+        made = {seed: answer for seed, answer in answers.items() if isinstance(answer, _Made)}
+        unmade = tuple((seed, answers[seed]) for seed in seeds if seed not in made)
+        if not made:
+            raise InputError(f"no problem of the family can be made: {unmade[0][1]}")
+        seeds = [seed for seed in seeds if seed in made]
         stores = {
-            (seed, contender.method): Runs(path, f"{made[kind, seed][0]}-{code(contender.method)}")
+            (seed, contender.method): Runs(path, f"{made[seed].fingerprint}-{code(contender.method)}")
             for seed in seeds
             for contender in contenders
         }
@@ -247,12 +302,11 @@ def compare_family(
         for contender in contenders
     }
     lowest = [
-        min(
-            [made[kind, seed][1], *(run.at(run.evaluations) for each in runs.values() for run in each[place])]
-        )
+        min([made[seed].minimum, *(run.at(run.evaluations) for each in runs.values() for run in each[place])])
         for place, seed in enumerate(seeds)
     ]
-    return FamilyComparison(kind, tuple(seeds), contenders, runs, np.array(lowest))
+    misinformed = np.array([made[seed].misinformed for seed in seeds])
+    return FamilyComparison(kind, tuple(seeds), contenders, runs, np.array(lowest), misinformed, unmade)
 
 
 Task = tuple[Any, ...]
@@ -294,10 +348,21 @@ def _key(contender: Contender, seed: int) -> tuple[str, int, int]:
     return contender.method, contender.budget, seed
 
 
-def _prepare(kind: str, seed: int) -> tuple[str, float]:
-    """Fingerprint of a problem, and its lowest objective."""
-    arena = _opened(kind, seed)
-    return arena.fingerprint, arena.minimum
+class _Made(NamedTuple):
+    """What is known of a problem before it is searched."""
+
+    fingerprint: str
+    minimum: float
+    misinformed: bool
+
+
+def _prepare(kind: str, seed: int) -> _Made | str:
+    """A problem, or why it cannot be made."""
+    try:
+        arena = _opened(kind, seed)
+    except (InputError, RuntimeError, OSError) as error:
+        return str(error)
+    return _Made(arena.fingerprint, arena.minimum, arena.misinformed)
 
 
 def _work(kind: str, seed: int, contender: Contender, repeat: int) -> MethodRun:

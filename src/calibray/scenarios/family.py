@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import replacing
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.optimizers.sampling import design
@@ -31,6 +29,7 @@ from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind as InteractionKind
 from calibray.paths import Paths
 from calibray.paths.program import concatenate, take, take_links
+from calibray.scenarios import optima
 from calibray.scenarios.direct import Direct
 from calibray.scenarios.office import office_site
 from calibray.scenarios.sites import Site, Stuff, district_site
@@ -212,20 +211,15 @@ class PlantedProblem:
     @property
     def minimum_rmse_db(self) -> float:
         """The lowest RMSE over the bounds [dB], found by least squares from `STARTS` points and then kept on disk."""
-        folder, name = cache.folder(), f"optimum-{self.fingerprint[:40]}-{STARTS}.json"
-        if folder is not None and (folder / name).is_file():
-            with suppress(ValueError, KeyError):
-                return float(json.loads((folder / name).read_text(encoding="utf-8"))["rmse_db"])
+        known = optima.find(self.fingerprint, STARTS)
+        if known is not None:
+            return known
         search = LeastSquares(self.lower, self.upper, starts=STARTS, x0=self.parameters.to_search(self.truth))
         while not search.done:
             points = search.ask()
             told = self.told(points, derivatives=True)
             search.tell(points, told.value, residuals=told.residuals, jacobian=told.jacobian)
-        if folder is not None:
-            with suppress(OSError):
-                folder.mkdir(parents=True, exist_ok=True)
-                with replacing(folder / name) as partial:
-                    partial.write_text(json.dumps({"rmse_db": search.best.y}), encoding="utf-8")
+        optima.keep(self.fingerprint, STARTS, search.best.y)
         return search.best.y
 
     def _without_offsets(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,212 @@
+"""What a cheap model that is pure noise costs space mapping, on planted problems.
+
+    python benchmarks/misleading.py --seeds 0:5
+
+runs space mapping on each problem of the families with its own cheap model, with none (the vector surrogate), and with
+two that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored, and
+*tones*, smooth random functions of the same size for every link. It prints the calls that each takes to come within a
+tolerance, and how many more than without. Finished runs are kept under out/misleading; a killed benchmark goes on.
+"""
+
+# ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+for library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.cli.console import log
+from calibray.cli.progress import progress_bars
+from calibray.comparison.arena import Arena, family_arena
+from calibray.comparison.comparison import Contender, code, quantile, run_contender
+from calibray.comparison.family import seed_range
+from calibray.comparison.runs import MethodRun, Runs
+from calibray.optimizers.cheap_model import CheapAnswer, CheapModel, Constants
+from calibray.tables import Column, Table, markdown, numbers
+
+ROOT = Path(__file__).resolve().parents[1]
+TOLERANCES_DB = (0.05, 0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class Scrambled:
+    """A cheap model with the answers of other links at the mirrored point.
+
+    Attributes:
+        model: The model.
+        ends: Sum of the lower and upper bounds [d].
+        order: The link that answers for each one [m].
+    """
+
+    model: CheapModel
+    ends: NDArray[np.float64]
+    order: NDArray[np.int64]
+
+    @property
+    def constants(self) -> Constants:
+        """Those of the model."""
+        return self.model.constants
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Rows that it says something about [m]."""
+        return self.model.known[self.order]
+
+    def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `CheapModel.residuals`."""
+        return self.model.residuals(self.ends - points, constants)[:, self.order]
+
+    def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
+        """See `CheapModel.answer`."""
+        told = self.model.answer(self.ends - points, constants)
+        return CheapAnswer(
+            told.residuals[:, self.order], -told.by_point[:, self.order], told.by_constant[:, self.order]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tones:
+    """Smooth random functions: for every link a sum of sines over the box.
+
+    Attributes:
+        size: Root mean square of each link's residuals [dB].
+        wave: Wave numbers of the tones by the parameters [t, d].
+        phase: Their phases [t].
+        weight: Weight of every tone in every link [t, m].
+    """
+
+    size: float
+    wave: NDArray[np.float64]
+    phase: NDArray[np.float64]
+    weight: NDArray[np.float64]
+
+    @property
+    def constants(self) -> Constants:
+        """None."""
+        return Constants.none()
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """It claims to know every row [m]."""
+        return np.ones(self.weight.shape[1], dtype=bool)
+
+    def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `CheapModel.residuals`."""
+        return self.size * np.sin(points @ self.wave.T + self.phase) @ self.weight
+
+    def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
+        """See `CheapModel.answer`."""
+        steep = self.size * np.cos(points @ self.wave.T + self.phase)
+        slope = np.einsum("nt,td,tm->nmd", steep, self.wave, self.weight)
+        return CheapAnswer(
+            self.residuals(points, constants), slope, np.zeros((len(points), self.weight.shape[1], 0))
+        )
+
+
+def scrambled(arena: Arena) -> CheapModel:
+    """The arena's cheap model, scrambled."""
+    model = own(arena)
+    order = np.random.default_rng(0).permutation(len(model.known))
+    return Scrambled(model, arena.lower + arena.upper, order)
+
+
+def tones(arena: Arena, count: int = 20) -> CheapModel:
+    """Tones of about one period over the box, as large as the residuals in its middle."""
+    rng, middle = np.random.default_rng(0), 0.5 * (arena.lower + arena.upper)
+    told = arena.evaluate(middle[None], False)
+    wave = rng.normal(0.0, np.pi, (count, len(middle))) / (arena.upper - arena.lower)
+    weight = rng.standard_normal((count, told.residuals.shape[1])) * np.sqrt(2.0 / count)
+    return Tones(float(told.value[0]), wave, rng.uniform(0.0, 2.0 * np.pi, count), weight)
+
+
+def own(arena: Arena) -> CheapModel:
+    """The arena's cheap model."""
+    if arena.model is None:
+        raise RuntimeError(f"{arena.name} has no cheap model")
+    return arena.model()
+
+
+MODELS: dict[str, Callable[[Arena], CheapModel] | None] = {
+    "none": None, "own": own, "scrambled": scrambled, "tones": tones,
+}  # fmt: skip
+
+
+def with_model(arena: Arena, name: str) -> Arena:
+    """The arena with another cheap model."""
+    make = MODELS[name]
+    return replace(arena, model=None if make is None else lambda: make(arena))
+
+
+def main() -> None:
+    """Run what is missing and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--families", nargs="+", default=["district", "office"])
+    parser.add_argument("--seeds", default="0:5")
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--budget", type=int, default=60)
+    parser.add_argument(
+        "--runs", type=Path, default=ROOT / "out/misleading", help="folder that keeps the runs"
+    )
+    chosen = parser.parse_args()
+    contender = Contender.parse("space-mapping", chosen.budget)
+    places = [(kind, seed) for kind in chosen.families for seed in seed_range(chosen.seeds)]
+    runs: dict[str, list[MethodRun]] = {name: [] for name in MODELS}
+    lowest: list[float] = []
+    with progress_bars(log) as progress:
+        for done, (kind, seed) in enumerate(places):
+            progress("problems", done, len(places))
+            arena = family_arena(kind, seed)
+            found = []
+            for name in MODELS:
+                store = Runs(
+                    chosen.runs / "runs.jsonl", f"{arena.fingerprint}-{code('space-mapping')}-{name}"
+                )
+                for repeat in range(chosen.repeats):
+                    kept = store.find(contender.method, contender.budget, repeat)
+                    run = kept or store.add(run_contender(with_model(arena, name), contender, repeat))
+                    runs[name].append(run)
+                    found.append(run.at(run.evaluations))
+            lowest += [min(arena.minimum, *found)] * chosen.repeats
+    print(markdown.render(compared(runs, np.array(lowest))))
+    for name, each in runs.items():
+        for run in each:
+            if run.failure:
+                print(f"- {name}, seed {run.seed}: a run failed: {run.failure}")
+
+
+def compared(runs: dict[str, list[MethodRun]], lowest: NDArray[np.float64]) -> Table:
+    """Calls to a tolerance with every cheap model, and beyond those without one."""
+    rows = []
+    for name, each in runs.items():
+        cells = [name]
+        for tolerance in TOLERANCES_DB:
+            calls, without = (
+                np.array([run.first(low + tolerance) for run, low in zip(some, lowest, strict=True)])
+                for some in (each, runs["none"])
+            )
+            median, base = (quantile(values, 0.5) for values in (calls, without))
+            more = "" if name == "none" else f"{median - base:+.1f}"
+            solved = [np.mean(calls <= limit) for limit in (15, 30, 60)]
+            cells += [f"{median:.1f}", more, " / ".join(f"{share:.2f}" for share in solved)]
+        rows.append(tuple(cells))
+    columns = [Column("cheap model")]
+    for tolerance in TOLERANCES_DB:
+        columns += [
+            numbers(f"median calls to {tolerance:g} dB"), numbers("more than without"),
+            numbers("solved at 15 / 30 / 60"),
+        ]  # fmt: skip
+    return Table("", tuple(columns), tuple(rows))
+
+
+if __name__ == "__main__":
+    main()
