@@ -17,15 +17,21 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 import programs
 from calibray import interruption
+from calibray.cli.app import app
 from calibray.cli.progress import progress_bars
 from calibray.engines import open_ledger
+from calibray.errors import EngineError
 from test_cli_run import write_study
 
-# Its standard input becomes the terminal that Ctrl-C is typed in.
-TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+# Its standard input becomes the terminal that Ctrl-C is typed in, which jobs in the background ignore by inheritance.
+TERMINAL = (
+    "import fcntl, signal, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+    "signal.signal(signal.SIGINT, signal.default_int_handler); "
+)
 MAIN = "from calibray.cli import main; main()"
 COMMAND, IN_TERMINAL = ([sys.executable, "-c", code] for code in (MAIN, TERMINAL + MAIN))
 PATIENCE = 120.0  # [s]
@@ -96,6 +102,31 @@ def test_an_interruption_that_a_library_took_for_its_own_failure_is_one(failure)
 
     with pytest.raises(KeyboardInterrupt):
         work()
+
+
+@pytest.mark.parametrize("pressed", [True, False])
+def test_what_fails_after_ctrl_c_is_an_interruption_and_nothing_else_is(pressed):
+    def work():
+        with interruption.noticed():
+            with contextlib.suppress(KeyboardInterrupt):
+                if pressed:
+                    signal.raise_signal(signal.SIGINT)
+            raise ValueError("of a library that was cut short")
+
+    with pytest.raises(KeyboardInterrupt if pressed else ValueError):
+        work()
+
+
+def test_what_went_wrong_when_ctrl_c_was_pressed_is_told(monkeypatch, tmp_path):
+    def fails(_):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise EngineError("the answer lies in rescue.json")
+
+    monkeypatch.setattr("calibray.study.Study.load", fails)
+    ended = CliRunner().invoke(app, ["run", "study.toml", "--out", str(tmp_path / "out")])
+    assert ended.exit_code == 130
+    assert "Error: the answer lies in rescue.json\nInterrupted" in ended.stderr
 
 
 def test_an_interruption_waits_for_what_must_not_be_left_half_made():

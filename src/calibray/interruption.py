@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Final
@@ -40,32 +40,54 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def noticed() -> Iterator[Callable[[], None]]:
-    """See to it that Ctrl-C is not lost where it falls into a callback of a library, which drops exceptions.
+def noticed() -> Iterator[None]:
+    """See to it that Ctrl-C ends what runs meanwhile, whatever a library makes of it.
+
+    Compiled code drops interruptions that fall into its callbacks, and raises errors of its own in their place: `check`
+    raises again those that were dropped, and whatever fails after Ctrl-C was pressed is an interruption.
 
     Yields:
-        What to call now and then; it raises KeyboardInterrupt where one was dropped before. Outside the main thread, or
-        where interruptions are ignored or seen to otherwise, it does nothing.
-    """
-    pressed: list[float] = []
+        Nothing. Outside the main thread, or where interruptions are ignored or seen to otherwise, they are left alone.
 
-    def press(_: int, __: FrameType | None) -> None:
-        pressed.append(time.monotonic())
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that came of it, if one did.
+        Exception: What was raised without it.
+    """
+    mine = threading.current_thread() is threading.main_thread()
+    mine = mine and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if mine:
+        _pressed.clear()
+        signal.signal(signal.SIGINT, _press)
+    try:
+        yield
+    except Exception as error:
+        if _pressed:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        if mine:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            _pressed.clear()
+
+
+def check() -> None:
+    """Go on, unless Ctrl-C was pressed a while ago and nobody has heeded it.
+
+    Raises:
+        KeyboardInterrupt: It was, within `noticed`.
+    """
+    if _pressed and time.monotonic() - _pressed[-1] > GRACE:
         raise KeyboardInterrupt
 
-    def check() -> None:
-        if pressed and time.monotonic() - pressed[-1] > GRACE:
-            raise KeyboardInterrupt
 
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
-        yield lambda: None
-        return
-    signal.signal(signal.SIGINT, press)
-    try:
-        yield check
-    finally:
-        signal.signal(signal.SIGINT, before)
+_pressed: list[
+    float
+] = []  # when, within `noticed`; there is one keyboard, and one handler of its signal, a process
+
+
+def _press(_: int, __: FrameType | None) -> None:
+    _pressed.append(time.monotonic())
+    raise KeyboardInterrupt
 
 
 @contextmanager

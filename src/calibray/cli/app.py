@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
+from calibray.cli import INTERRUPTED
 from calibray.cli.cache import cache
 from calibray.cli.compare import compare
 from calibray.cli.demo import demo
@@ -29,12 +30,10 @@ from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
+from calibray.interruption import noticed
 
 LONGEST: Final = 4096
 """The number of characters beyond which an argument is refused; Linux takes no longer path."""
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it: 128 and the number of the signal."""
 
 
 class Commands(TyperGroup):
@@ -70,7 +69,8 @@ class Commands(TyperGroup):
             BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
-            return super().invoke(ctx)
+            with noticed():
+                return super().invoke(ctx)
         except InputError as error:
             typer.echo(f"Error: {error}", err=True)
             raise typer.Exit(2) from error
@@ -86,7 +86,9 @@ class Commands(TyperGroup):
             )
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            # What the command has to say of what was kept it said itself.
+            # What the command has to say of what was kept it said itself; what went wrong on the way is not to be lost.
+            if isinstance(error.__cause__, (InputError, EngineError)):
+                typer.echo(f"Error: {error.__cause__}", err=True)
             typer.echo("Interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from error
 

@@ -12,7 +12,7 @@ from typing import Final
 from rich import progress as rich_progress
 from rich.console import Console
 
-from calibray.interruption import noticed
+from calibray import interruption
 from calibray.progress import Progress
 
 EVERY: Final = 5.0
@@ -35,10 +35,10 @@ def progress_bars(console: Console, every: float | None = None) -> Iterator[Prog
         What to call with the stage's name, how much is done, and out of how much.
     """
     told = _bars(console) if console.is_terminal else _lines(console, every or EVERY)
-    with told as report, noticed() as check:
+    with told as report, interruption.noticed():
 
         def progress(stage: str, done: int, total: int | None) -> None:
-            check()
+            interruption.check()
             report(stage, done, total)
 
         yield progress
