@@ -95,6 +95,26 @@ class District:
         return found
 
 
+@dataclass(frozen=True)
+class Streets:
+    """A grid of streets around blocks, centred on the origin.
+
+    Attributes:
+        blocks: Number of blocks along x and y [2].
+        pitch: Distance from street to street along x and y [2], [m].
+        width: Width of a street [m].
+    """
+
+    blocks: np.ndarray
+    pitch: np.ndarray
+    width: float
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Size of it all along x and y [2], [m]."""
+        return self.blocks * self.pitch + self.width
+
+
 def make(name: str, folder: Path) -> District:
     """Make a district and trace it; the package's cache keeps its paths.
 
@@ -113,18 +133,17 @@ def make(name: str, folder: Path) -> District:
 
 def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
     random = np.random.default_rng([seed, 77])
-    size, street = random.integers(2, 5, 2), random.uniform(14, 30)
+    blocks, width = random.integers(2, 5, 2), random.uniform(14, 30)
     block = random.uniform(50, 130, 2)
-    pitch = block + street
-    extent = size * pitch + street
+    streets = Streets(blocks, block + width, width)
     buildings = []
-    for column in range(size[0]):
-        for row in range(size[1]):
-            south_west = np.array([column, row]) * pitch + street - extent / 2
+    for column in range(blocks[0]):
+        for row in range(blocks[1]):
+            south_west = np.array([column, row]) * streets.pitch + width - streets.extent / 2
             buildings += _block(south_west, block, random, len(buildings))
     frequency = float(random.choice([0.9e9, 2.1e9, 3.5e9, 6e9, 10e9, 28e9]))
     structures, windows = zip(*(building_meshes(each) for each in buildings), strict=True)
-    corner = extent / 2 + 20
+    corner = streets.extent / 2 + 20
     ground = Mesh(
         np.array(
             [
@@ -160,7 +179,7 @@ def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
     if random.random() < 0.5:
         bounds["walls.conductivity"] = {"bounds": [1e-3, 3.0], "scale": "log"}
     count = round(float(np.exp(random.uniform(np.log(20), np.log(200)))))
-    table = _links(4 * count, size, pitch, street, extent, random)
+    table = _links(4 * count, streets, random)
     table.to_csv(folder / "links.csv", index=False)
     content = {
         "version": 1,
@@ -197,37 +216,22 @@ def _block(corner: np.ndarray, size: np.ndarray, random: np.random.Generator, fi
     return found
 
 
-def _links(
-    count: int,
-    size: np.ndarray,
-    pitch: np.ndarray,
-    street: float,
-    extent: np.ndarray,
-    random: np.random.Generator,
-) -> pd.DataFrame:
-    stations = np.column_stack(
-        [_in_streets(3, size, pitch, street, extent, random), random.uniform(3, 20, 3)]
-    )
+def _links(count: int, streets: Streets, random: np.random.Generator) -> pd.DataFrame:
+    stations = np.column_stack([_in_streets(3, streets, random), random.uniform(3, 20, 3)])
     stations = stations[: random.integers(1, 4)]
-    place = _in_streets(count, size, pitch, street, extent, random)
+    place = _in_streets(count, streets, random)
     near = np.linalg.norm(place[:, None] - stations[None, :, :2], axis=2)
     tx = stations[near.argmin(axis=1)]
     table = np.column_stack([tx, place, np.full(count, 1.5)]).round(2)
     return pd.DataFrame(table, columns=["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]).assign(loss_db=100.0)
 
 
-def _in_streets(
-    count: int,
-    size: np.ndarray,
-    pitch: np.ndarray,
-    street: float,
-    extent: np.ndarray,
-    random: np.random.Generator,
-) -> np.ndarray:
+def _in_streets(count: int, streets: Streets, random: np.random.Generator) -> np.ndarray:
     """Places in the streets [count, 2], [m]."""
+    blocks, pitch, extent = streets.blocks, streets.pitch, streets.extent
     along = random.random(count) < 0.5
-    line = np.where(along, random.integers(0, size[0] + 1, count), random.integers(0, size[1] + 1, count))
-    across = line * np.where(along, pitch[0], pitch[1]) + street * random.uniform(0.15, 0.85, count)
+    line = np.where(along, random.integers(0, blocks[0] + 1, count), random.integers(0, blocks[1] + 1, count))
+    across = line * np.where(along, pitch[0], pitch[1]) + streets.width * random.uniform(0.15, 0.85, count)
     other = random.uniform(0, 1, count) * np.where(along, extent[1], extent[0])
     found = np.where(along[:, None], np.stack([across, other], 1), np.stack([other, across], 1))
     return found - extent / 2

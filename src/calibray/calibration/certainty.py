@@ -186,7 +186,7 @@ def _from_draws(
 
 def _freedom(problem: Problem, rows: int) -> int:
     """Rows of the residuals less what is fitted to them."""
-    return rows - len(problem.parameters) - int(problem.objective.determined.sum())
+    return rows - problem.unknowns
 
 
 def _curvature(

@@ -56,14 +56,13 @@ def heard(problem: Problem, progress: Progress | None = None) -> Problem:
             pass
         start = search.minima[:SEARCHES]
         found = problem.evaluate(search.best.x[None])
-        freedom = objective.num_counted - len(problem.parameters) - int(objective.determined.sum())
-        error = float(found.rmse_db[0]) * np.sqrt(objective.num_counted / max(freedom, 1))
+        error = float(found.rmse_db[0]) * np.sqrt(objective.num_counted / max(problem.freedom, 1))
         expected = objective.model(found.modelled)[0]
         before, faint = faint, (everyone > 0) & ~(expected <= limit - MARGIN * error)
         if progress is not None:
             progress("choosing links", turn + 1, ROUNDS)
         fewer = replace(objective, weight=np.where(faint, 0.0, everyone))
-        if np.array_equal(faint, before) or freedom < 1 or not _determines(problem, fewer):
+        if np.array_equal(faint, before) or problem.freedom < 1 or not _determines(problem, fewer):
             faint = before
             break
         objective = fewer
@@ -75,5 +74,5 @@ def _determines(problem: Problem, objective: Objective) -> bool:
     """Whether the links that are left tell all that those before them told."""
     if not (objective.weight > 0).any():
         return False
-    enough = objective.num_counted > len(problem.parameters) + int(objective.determined.sum())
+    enough = replace(problem, objective=objective).freedom >= 1
     return enough and np.array_equal(objective.determined, problem.objective.determined)

@@ -186,12 +186,11 @@ def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
         }
         others = {name: (model - objective.measured)[judged] for name, model in rivals.items()}
         judgement = (compare(errors, others, links.rx[judged]).sentence,)
-    freedom = objective.num_counted - len(problem.parameters) - int(objective.determined.sum())
     size, basis = None, "too few links"
     if len(errors) >= FEWEST:
         size, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
-    elif freedom >= 1:
-        size = float(trail.best_rmse_db * np.sqrt(objective.num_counted / freedom))
+    elif problem.freedom >= 1:
+        size = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
         basis = f"{objective.num_counted} links calibrated on"
 
     def rmse(model: NDArray[np.float64]) -> float | None:

@@ -109,6 +109,16 @@ class Problem:
         return self.engine.parameters
 
     @property
+    def unknowns(self) -> int:
+        """Number of values that the links have to determine: parameters, and coefficients of the nuisance."""
+        return len(self.parameters) + int(self.objective.determined.sum())
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom: links calibrated on, less the unknowns; below 1 they tell nothing of the errors' size."""
+        return self.objective.num_counted - self.unknowns
+
+    @property
     def differentiable(self) -> bool:
         """Whether derivatives can be had."""
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None

@@ -140,12 +140,11 @@ class _Model:
         self.engine = self._engine(setup)
         problem = Problem.of(setup, self.engine)
         parameters, objective = problem.parameters, problem.objective
-        freedom = objective.num_counted - len(parameters) - int(objective.determined.sum())
-        if freedom < 1:
+        if problem.freedom < 1:
             raise InputError(
                 f"{result.study.path}: {objective.num_counted} links are too few to tell the size of errors"
             )
-        self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / freedom)), 1e-3)
+        self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / problem.freedom)), 1e-3)
         self.problem = replace(problem, objective=replace(objective, noise_db=self.noise_db))
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower

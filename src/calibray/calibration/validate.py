@@ -167,11 +167,10 @@ def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
         names, place = np.unique(given[counted], return_inverse=True)
         block[counted], labels = place, tuple(map(str, names))
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
-    unknowns = len(problem.parameters) + int(problem.objective.determined.sum())
-    if len(labels) < 2 or counted.sum() < len(labels) or fewest <= unknowns:
+    if len(labels) < 2 or counted.sum() < len(labels) or fewest <= problem.unknowns:
         raise InputError(
             f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} to calibrate "
-            f"{unknowns} unknowns on; name two blocks or more, of fewer links each"
+            f"{problem.unknowns} unknowns on; name two blocks or more, of fewer links each"
         )
     return block, labels
 
@@ -215,8 +214,7 @@ def fitted_twins(part: Problem, known: NDArray[np.float64]) -> dict[str, tuple[P
     shifted = replace(part, objective=_with_term(objective, CONSTANT, setup))
     found = {BEFORE: (shifted, parameters.to_search(parameters.start)), CALIBRATED: (part, calibrated[0])}
     rows = objective.num_counted
-    freedom = max(rows - len(parameters) - int(objective.determined.sum()), 1)
-    noise = float(part.evaluate(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / freedom)
+    noise = float(part.evaluate(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
     prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
     variants = {PRIOR: prior, SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))}
     if (per_tx := _per_transmitter(objective, setup)) is not None:

@@ -39,10 +39,7 @@ def weighed(problem: Problem, progress: Progress | None = None) -> Problem:
     study = problem.setup.study
     if not problem.weighs_priors or study.noise.std_db is not None or study.links.std is not None:
         return problem
-    freedom = (
-        problem.objective.num_counted - len(problem.parameters) - int(problem.objective.determined.sum())
-    )
-    if not problem.differentiable or freedom < 1:
+    if not problem.differentiable or problem.freedom < 1:
         cause = (
             "there are too few links" if problem.differentiable else f"the engine is {study.engine.name!r}"
         )
@@ -62,7 +59,7 @@ def weighed(problem: Problem, progress: Progress | None = None) -> Problem:
         if progress is not None:
             progress("weighing", turn + 1, ROUNDS)
         before, links = noise, problem.objective.num_counted
-        noise = float(problem.evaluate(search.best.x[None]).rmse_db[0] * np.sqrt(links / freedom))
+        noise = float(problem.evaluate(search.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
         if abs(noise - before) <= SETTLED * before:
             break
     return replace(problem, objective=replace(problem.objective, noise_db=max(noise, 1e-3)))

@@ -20,6 +20,7 @@ from calibray.reporting.style import (
     PALETTE,
     dress,
     plain_figure,
+    residual_figure,
     styled,
 )
 from calibray.spelling import shortened
@@ -221,8 +222,7 @@ def leverage(table: pd.DataFrame) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Leverage", "Calibrated - measured [dB]")
-    axes.axhline(0, color=INK, lw=0.8)
+    figure, axes = residual_figure("Leverage")
     size = 40 if len(table) <= 100 else 16 if len(table) <= 1000 else 5
     axes.scatter(table["leverage"], table["residual_db"], s=size, c=BLUE, alpha=0.7, lw=0,
                  rasterized=len(table) > 2000)  # fmt: skip
@@ -240,8 +240,7 @@ def by_depth(table: pd.DataFrame) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Interactions of the strongest path", "Calibrated - measured [dB]")
-    axes.axhline(0, color=INK, lw=0.8)
+    figure, axes = residual_figure("Interactions of the strongest path")
     error = table["standard_deviation_db"] / np.sqrt(table["links"])
     axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=BLUE, capsize=3)
     labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]

@@ -23,6 +23,7 @@ from calibray.reporting.style import (
     dress,
     logarithmic,
     plain_figure,
+    residual_figure,
     styled,
 )
 from calibray.spelling import shortened
@@ -162,9 +163,8 @@ def residual_over_distance(survey: Survey) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Distance [m]", "Calibrated - measured [dB]")
+    figure, axes = residual_figure("Distance [m]")
     left, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
-    axes.axhline(0, color=INK, lw=0.8)
     for mask, color, marker, name in (
         (~held_out, BLUE, "o", "calibrated on"),
         (held_out, ORANGE, "^", "held out"),

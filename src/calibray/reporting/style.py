@@ -94,6 +94,20 @@ def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tup
     return figure, axes
 
 
+def residual_figure(x: str) -> tuple[Figure, Axes]:
+    """An empty figure for what is left of links' path loss, with a line where nothing is left.
+
+    Args:
+        x: What the horizontal axis shows, with its unit.
+
+    Returns:
+        The figure and its axes.
+    """
+    figure, axes = plain_figure(x, "Calibrated - measured [dB]")
+    axes.axhline(0, color=INK, lw=0.8)
+    return figure, axes
+
+
 def dress(axes: Axes, x: str, y: str) -> None:
     """Label axes, and take away what says nothing.
 
