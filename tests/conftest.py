@@ -1,7 +1,4 @@
-"""What all tests share: reproducible property tests, and the folder with measured data."""
-
-import os
-from pathlib import Path
+"""What all tests share: reproducible property tests, one cache of compiled code, no lines of progress."""
 
 import pytest
 from hypothesis import settings
@@ -21,15 +18,6 @@ def pytest_configure(config: pytest.Config) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv(caching.VARIABLE, str(kept.mkdir("calibray")))
             import calibray.fields  # noqa: F401
-
-
-@pytest.fixture(scope="session")
-def data_folder() -> Path:
-    """The folder with measured data, which is no part of the repository."""
-    folder = Path(os.environ.get("CALIBRAY_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    if not (folder / "nist_boulder").is_dir():
-        pytest.skip(f"no measured data in {folder}; name their folder in CALIBRAY_DATA")
-    return folder
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -115,6 +115,15 @@ SCENES: dict[str, Case] = {
         str(demo_study_path().with_name("scene") / "scene.xml"), 4e9, (-381.5, 140, 4), (-384, 180, 4), (-376, 420, 4),
         {"max_depth": 3, "diffuse_reflection": True}, _BOUNCES,
     ),
+    "box_one_screen, through it at 28.5 GHz": Case(
+        "sionna:box_one_screen", 28.5e9, (-3, -2, 2), (1, -4, 1), (4, 4, 3),
+        {"max_depth": 2, "refraction": True}, frozenset({Kind.SPECULAR, Kind.REFRACTION}),
+        exception="low-loss slabs many wavelengths thick",
+    ),
+}  # fmt: skip
+"""The scenes; a further one is one entry."""
+
+MEASURED: dict[str, Case] = {
     "auckland_tower": Case(
         DATA + "auckland_tower/scene/scene.xml", 1.88e9, (5, 13.5, 11), (1, 1, 10.5), (17, 17, 11.5),
         {"max_depth": 2, **MIXED},
@@ -127,7 +136,7 @@ SCENES: dict[str, Case] = {
         exception="low-loss slabs many wavelengths thick",
     ),
 }  # fmt: skip
-"""The campaigns; a further scene is one entry."""
+"""Scenes of measured campaigns, which are no part of the repository: for `benchmarks/fidelity.py`."""
 
 
 @dataclass(frozen=True)

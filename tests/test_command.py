@@ -300,7 +300,6 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
     ],
 )
 def test_executors_that_are_refused(workers, scheduler, message, monkeypatch):
-    pytest.importorskip("distributed")
     monkeypatch.setattr("calibray.engines.pool.PATIENCE", 0.1)
     with pytest.raises(InputError, match=message), engines.open_executor(workers, scheduler):
         pass

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import rasterio
 from typer.testing import CliRunner
 
 import calibray as cb
@@ -79,7 +80,6 @@ def test_a_cell_is_what_is_predicted_there(result, found):
 
 
 def test_the_geotiff_lies_where_the_scene_does(result, found, tmp_path):
-    rasterio = pytest.importorskip("rasterio")
     names = cb.save_map(found, tmp_path)
     assert names == ("map.tif", "map.png", "map.csv")
     table = pd.read_csv(tmp_path / "map.csv")

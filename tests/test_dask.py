@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 
+import distributed
 import numpy as np
 import pytest
 
@@ -15,7 +16,6 @@ import programs
 from calibray import engines
 from calibray.errors import InputError
 
-distributed = pytest.importorskip("distributed", reason="the extra calibray[dask] is not installed")
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late
 
 

@@ -1,6 +1,4 @@
-import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,11 +8,6 @@ from hypothesis import strategies as st
 
 from calibray.errors import InputError
 from calibray.measurements import Measurements, links_from_frame, read_links, read_measurements
-
-DATA = Path(os.environ.get("CALIBRAY_DATA") or Path(__file__).parents[2] / "shared" / "data")
-needs_data = pytest.mark.skipif(
-    not DATA.is_dir(), reason="measured data absent: set CALIBRAY_DATA to the folder with nist_boulder"
-)
 
 TABLE = """\
 x,y,z,loss,set,spread
@@ -311,41 +304,3 @@ def test_links_to_predict_at_have_no_values(tmp_path):
         links_from_frame(frame.drop(columns="rx_z"))
     with pytest.raises(InputError, match="holds no rows"):
         links_from_frame(frame.iloc[:0])
-
-
-@needs_data
-def test_the_boulder_campaign_reads_as_its_description_says():
-    arguments = {
-        "tx": [0.0, 0.0, 2.5],
-        "rx": ["rx_x_m", "rx_y_m", 1.6],
-        "value": "pl_total_db",
-        "group": "set",
-    }
-    links = read_measurements(DATA / "nist_boulder" / "links.csv", **arguments)
-    assert len(links) == 133
-    assert dict(zip(*np.unique(links.group, return_counts=True), strict=True)) == {"LOS": 50, "NLOS": 83}
-    # The campaign's own distances, from raw GPS, differ from those in the scene's frame by up to 3 %.
-    np.testing.assert_allclose(links.distance, links.frame["dist3d_m"], rtol=0.03)
-    # In line of sight the path loss is free space less the 2 dBi of the transmitter's antenna.
-    free_space = 20 * np.log10(4 * np.pi * links.distance * 28.5e9 / 299792458)
-    excess = (links.path_loss_db - free_space)[links.where("set == 'LOS'")]
-    assert abs(np.median(excess) + 2) < 1
-    fixed = read_measurements(DATA / "nist_boulder" / "links.csv", where="gpsmode == 4", **arguments)
-    assert len(fixed) == (links.frame["gpsmode"] == 4).sum() == 117
-
-
-@needs_data
-def test_the_auckland_campaign_reads_as_its_description_says():
-    links = read_measurements(
-        DATA / "auckland_tower" / "links.csv",
-        tx=["tx_x_m", "tx_y_m", "tx_z_m"],
-        rx=["rx_x_m", "rx_y_m", "rx_z_m"],
-        value="path_gain_db",
-        quantity="path_gain",
-        std="sample_std_db",
-        group="tx_id",
-    )
-    assert len(links) == 104
-    assert links.group_names == ("5", "6")
-    np.testing.assert_allclose(links.distance, links.frame["dist3d_m"], atol=2e-3)
-    np.testing.assert_array_equal(links.path_loss_db, -links.frame["path_gain_db"])
