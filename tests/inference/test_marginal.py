@@ -9,14 +9,15 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from calibray.inference.marginal import OFFSET_DB, Marginal, NoiseModel, noise_models
+from calibray.inference.marginal import OFFSET_DB, Differing, Marginal, NoiseModel, corners, noise_models
 from calibray.inference.neighbours import whitener
 
 RANDOM = np.random.default_rng(1)
 COUNT = 6
 POSITION = RANDOM.uniform(0, 100, (COUNT, 3))
 GAP = RANDOM.normal(0, 2, COUNT)
-SENSITIVITY = RANDOM.uniform(0, 200, COUNT)
+VARIANCE = RANDOM.uniform(0, 8, COUNT)
+SHIFT = RANDOM.normal(0, 1, COUNT)
 
 
 def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0) -> Marginal:
@@ -40,19 +41,21 @@ def integral(log_density) -> float:
             NoiseModel("correlated", 1.0, range_m=50.0, share=0.7),
             0.7 * np.exp(-cdist(POSITION, POSITION) / 50) + 0.3 * np.eye(COUNT),
         ),
-        (NoiseModel("heterogeneous", 1.0, spread=0.2), np.diag(1 + 0.01 * SENSITIVITY)),
+        (NoiseModel("heterogeneous", 1.0, spread=0.2), np.diag(1 + VARIANCE / 4)),
     ],
 )
 def test_gaussian_densities_are_the_integrals(model, covariance):
     precision, determinant = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
 
     def log_density(offset, size):
-        left = GAP - offset
+        left = GAP - SHIFT * (model.kind == "heterogeneous") - offset
         square = np.einsum("...i,ij,...j->...", left, precision, left)
         normal = COUNT * (np.log(size[..., 0]) + 0.5 * np.log(2 * np.pi)) + 0.5 * determinant
         return -0.5 * square / size[..., 0] ** 2 - normal
 
-    found = marginal((model,), np.ones((COUNT, 1))).densities(GAP[None], SENSITIVITY[None])
+    found = marginal((model,), np.ones((COUNT, 1))).densities(
+        GAP[None], Differing(SHIFT[None], VARIANCE[None])
+    )
     assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
 
 
@@ -89,21 +92,23 @@ def test_planted_errors_speak_for_their_kind(kind):
     """Of 150 links; the kind planted gets the largest weight, and an offset is found where one was planted alone."""
     random = np.random.default_rng(7)
     position = random.uniform(0, 600, (150, 2))
-    sensitivity = random.choice([0.0, 400.0], 150)
+    variance = 0.15**2 * random.choice([0.0, 400.0], 150)
     errors = {
         "gaussian": 3 * random.standard_normal(150),
         "correlated": 3
         * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
         @ random.standard_normal(150),
         "student-t": 3 * random.standard_t(2.5, 150),
-        "heterogeneous": np.sqrt(1 + 0.15**2 * sensitivity) * random.standard_normal(150),
+        "heterogeneous": np.sqrt(1 + variance) * random.standard_normal(150),
     }[kind]
     models = noise_models(position)
     assert sum(model.weight for model in models) == pytest.approx(1.0)
     density = marginal(models, position=position, noise_db=2.0)
+    differing = Differing(np.zeros((1, 150)), variance[None])
+    assert density.spread == 0.15
 
     def weights(gap):
-        found = density.densities(gap[None], sensitivity[None])[0]
+        found = density.densities(gap[None], differing)[0]
         share = np.exp(found - logsumexp(found))
         kinds = {model.kind: 0.0 for model in models}
         for model, each in zip(models, share, strict=True):
@@ -125,3 +130,20 @@ def test_what_a_study_states_is_not_tried():
     assert {model.range_m for model in noise_models(POSITION, range_m=60.0)} == {60.0}
     assert {model.spread for model in noise_models(POSITION, spread=0.2)} == {0.2}
     assert not any(model.offset for model in noise_models(POSITION, offset=False))
+
+
+def test_corners_tell_the_mean_and_the_variance_of_materials_that_differ():
+    """Of a curved function of three constants, against draws of it: to the second order both are right."""
+    slope, bend, spread = np.array([3.0, -2.0, 1.0]), np.array([4.0, 0.0, -7.0]), 0.15
+
+    def loss(factor):
+        return factor @ slope + 0.5 * factor**2 @ bend
+
+    there = loss(spread * corners(3))
+    drawn = loss(spread * np.random.default_rng(2).standard_normal((200_000, 3)))
+    assert there.mean() == pytest.approx(drawn.mean(), abs=0.003)
+    assert there.std() == pytest.approx(drawn.std(), rel=0.05)
+    for count in range(1, 9):
+        signs = corners(count)
+        assert np.array_equal(signs.T @ signs, len(signs) * np.eye(count))
+        assert np.array_equal(signs.sum(axis=0), np.zeros(count))

@@ -21,8 +21,8 @@ from calibray.inference.verdicts import verdicts
 from calibray.optimizers import LeastSquares
 from calibray.progress import Progress
 
-COST: Final = 5
-"""Replays of the draws by those of the calibration, at most."""
+COST: Final = 10
+"""Replays of the draws by those of the calibration, at most; these take derivatives, which doubles their cost."""
 
 INTERACTIONS: Final = 50_000_000
 """Interactions times replays that draws may take in any case: some seconds."""
@@ -132,11 +132,11 @@ def _from_draws(
     minima, square = _minima(problem, trail)
     likely = _likely(minima, square, freedom)
     offset, shifted = _free_offset(problem, likely, float(square.min()), freedom)
-    size = _size(problem, trail)
+    explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
+    size = _size(problem, trail, explaining.replays)
     if size is None:
         reason = "by the curvature at the optimum alone: draws would cost more than five calibrations"
         return replace(offset, intervals={name: replace(each, reason=reason) for name, each in local.items()})
-    explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
     # What fits worse by least squares may fit best where errors are alike or have heavy tails.
     known = np.concatenate([minima[np.argsort(square)[:KNOWN]], shifted[:BASINS]])
     explained = explaining(known)
@@ -238,11 +238,11 @@ def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: i
     return minima[order]
 
 
-def _size(problem: Problem, trail: Trail) -> tuple[int, int] | None:
-    """Points of a round and rounds, as the cost allows; None where not even the fewest do."""
+def _size(problem: Problem, trail: Trail, replays: int) -> tuple[int, int] | None:
+    """Points of a round and rounds, as the cost of so many replays each allows; None where not even the fewest do."""
     interactions = getattr(problem.engine, "interactions", 1)
     allowed = max(COST * trail.rt_calls, INTERACTIONS // max(interactions, 1))
-    return next(((batch, turns) for batch, turns in SIZES if batch * (turns + 2) <= allowed), None)
+    return next(((batch, turns) for batch, turns in SIZES if batch * (turns + 2) * replays <= allowed), None)
 
 
 def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:

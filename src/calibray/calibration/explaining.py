@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.calibration.problem import Problem
-from calibray.engines.protocol import Differentiable
-from calibray.inference.marginal import Marginal, noise_models
+from calibray.inference.marginal import Differing, Marginal, corners, noise_models
 from calibray.inference.nuisance import CONSTANT
 
 CHUNK: Final = 256
@@ -87,8 +86,13 @@ class Explaining:
         return np.concatenate(parts) if parts else np.zeros((0, len(self.marginal.models)))
 
     def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of the links that count [n, m], [dB]."""
-        return self.problem.objective.capped(self.problem.evaluate(points).modelled)[:, self.counted]
+        """Path loss of the links that count at points of the search space [n, m], [dB]."""
+        return self._loss(self.problem.parameters.from_search(points))
+
+    @property
+    def replays(self) -> int:
+        """Replays that one point takes."""
+        return 1 + (len(corners(len(self.problem.parameters))) if self.marginal.spread else 0)
 
     def weights(self, points: NDArray[np.float64]) -> dict[str, float]:
         """What speaks for each kind of noise, and for a forgotten offset.
@@ -109,26 +113,28 @@ class Explaining:
         return found
 
     def _part(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        problem, sensitivity = self.problem, None
-        candidates = problem.parameters.from_search(points)
-        objective, with_slopes = problem.objective, problem.observable.derivatives
-        if (
-            self.marginal.needs_slopes
-            and with_slopes is not None
-            and isinstance(problem.engine, Differentiable)
-        ):
-            modelled, slope = with_slopes(problem.engine, candidates)
-            flat = modelled >= (np.inf if objective.ceiling_db is None else objective.ceiling_db)
-            relative = np.where(flat[..., None], 0.0, slope) * candidates[:, None, :]
-            sensitivity = np.sum(relative**2, axis=2)[:, self.counted] * self.scale**2
-        else:
-            modelled = problem.observable.modelled(problem.engine, candidates)
-        loss = objective.capped(modelled)[:, self.counted]
-        gap = (objective.measured[self.counted] - self.fixed - loss) * self.scale
-        found = self.marginal.densities(gap, sensitivity)
-        if len(problem.priors):
-            found -= 0.5 * np.sum(problem.priors.rows(candidates) ** 2, axis=1)[:, None]
+        candidates = self.problem.parameters.from_search(points)
+        loss = self._loss(candidates)
+        differing = self._differing(candidates, loss) if self.marginal.spread else None
+        gap = (self.problem.objective.measured[self.counted] - self.fixed - loss) * self.scale
+        found = self.marginal.densities(gap, differing)
+        if len(self.problem.priors):
+            found -= 0.5 * np.sum(self.problem.priors.rows(candidates) ** 2, axis=1)[:, None]
         return found
+
+    def _differing(self, candidates: NDArray[np.float64], loss: NDArray[np.float64]) -> Differing:
+        """What materials that differ from building to building do to path loss."""
+        parameters, spread = self.problem.parameters, self.marginal.spread
+        there = np.stack([
+            self._loss(np.clip(candidates * np.exp(spread * corner), parameters.lower, parameters.upper))
+            for corner in corners(len(parameters))
+        ])  # fmt: skip
+        return Differing((there.mean(axis=0) - loss) * self.scale, there.var(axis=0) * self.scale**2)
+
+    def _loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss of the links that count [n, m], [dB]."""
+        modelled = self.problem.observable.modelled(self.problem.engine, candidates)
+        return self.problem.objective.capped(modelled)[:, self.counted]
 
 
 def has_offset(problem: Problem) -> bool:

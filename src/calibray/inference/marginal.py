@@ -14,18 +14,22 @@ errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 f being the number of links less that of columns with a flat prior. With Student's t both are taken by Laplace's
 approximation at the mode, with Fisher's information.
 
-Heterogeneity: where a material's constant differs from building to building by a factor with spread tau, link i gets
-the further variance tau^2 sum_k (theta_k dm_i/dtheta_k)^2.
+Heterogeneity: where a material's constant differs from building to building by a factor exp(tau z), a link's path loss
+is another one on average, and varies about it. Both are taken from the corners of a two-level factorial design,
+theta_k exp(+-tau) (R. L. Plackett and J. P. Burman, Biometrika 33, 1946): the mean is right to the second order in tau,
+and so is the variance, which is added to the noise; and where reflections inside walls make path loss wave with the
+constant, they stay within the wave, as no derivative does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import hadamard
 from scipy.special import gammaln
 
 from calibray.inference.neighbours import Whitener, pairwise, whitener
@@ -55,6 +59,35 @@ NEGLIGIBLE: Final = 1e-3
 """Weight of a model below which it is left out."""
 
 GAUSSIAN, CORRELATED, HEAVY, DIFFERING = "gaussian", "correlated", "student-t", "heterogeneous"
+
+
+def corners(parameters: int) -> NDArray[np.float64]:
+    """Corners whose averages tell each parameter's effect by itself.
+
+    Args:
+        parameters: Number of parameters d.
+
+    Returns:
+        Signs [k, d], the columns orthogonal to each other and to a constant.
+
+    Example:
+        >>> corners(2).tolist()
+        [[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]
+    """
+    count = 1 << parameters.bit_length()
+    return np.asarray(hadamard(count)[:, 1 : parameters + 1], dtype=np.float64)
+
+
+class Differing(NamedTuple):
+    """What buildings that differ do to path loss, at one spread.
+
+    Attributes:
+        shift: Change of the mean [n, m], [dB], times the roots of the weights.
+        variance: Variance about it [n, m], [dB^2], times the weights.
+    """
+
+    shift: NDArray[np.float64]
+    variance: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -182,25 +215,23 @@ class Marginal:
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), made)
 
     @property
-    def needs_slopes(self) -> bool:
-        """Whether some model asks how the links depend on the parameters."""
-        return any(model.kind == DIFFERING for model in self.models)
+    def spread(self) -> float:
+        """Spread of materials that a model asks for, the middle one of several; 0 where none does."""
+        spreads = sorted({model.spread for model in self.models if model.kind == DIFFERING})
+        return spreads[len(spreads) // 2] if spreads else 0.0
 
-    def densities(
-        self, gap: NDArray[np.float64], sensitivity: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+    def densities(self, gap: NDArray[np.float64], differing: Differing | None = None) -> NDArray[np.float64]:
         """Logarithm of each model's weight times the density of the measurements.
 
         Args:
             gap: Measured minus modelled path loss, without the nuisance, times the roots of the weights [n, m], [dB].
-            sensitivity: Squares of the changes of path loss by relative changes of the constants, summed, times the
-                weights [n, m], [dB^2]; needed where a model `needs_slopes`.
+            differing: What materials that differ by `spread` do to path loss; needed where that is not 0.
 
         Returns:
             The logarithms [n, models]; -inf where a gap is not finite.
 
         Raises:
-            ValueError: A model asks for the sensitivity, and it is not given.
+            ValueError: A model asks what differing materials do, and it is not given.
         """
         found = np.full((len(gap), len(self.models)), -np.inf)
         good = np.isfinite(gap).all(axis=1)
@@ -212,10 +243,12 @@ class Marginal:
             if model.kind == HEAVY:
                 value = _student(gap, design, ridge / self.noise_db, model.freedom)
             elif model.kind == DIFFERING:
-                if sensitivity is None:
-                    raise ValueError("a heterogeneous model needs the sensitivity")
-                weight = 1.0 / (1.0 + (model.spread / self.noise_db) ** 2 * sensitivity[good])
-                value = _weighted(gap, design, ridge, weight)
+                if differing is None:
+                    raise ValueError("a heterogeneous model needs what differing materials do")
+                # Both grow with the square of the spread, to the second order.
+                part = (model.spread / self.spread) ** 2
+                weight = 1.0 / (1.0 + part / self.noise_db**2 * differing.variance[good])
+                value = _weighted(gap - part * differing.shift[good], design, ridge, weight)
             elif model.kind == CORRELATED:
                 place = (model.range_m, model.share)
                 filter_ = self.whiteners[place]
