@@ -92,7 +92,7 @@ def calibrate(
     trail = search(problem, choose(problem, helper.model), progress)
     problem, trail, gap = settle(problem, trail, progress)
     seconds = time.perf_counter() - traced
-    told = certainty(problem, trail, progress)
+    told = certainty(problem, trail, progress, helper.model)
     judged = validated(problem, progress=progress) if in_turn else None
     result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started, helper)
     if out is not None:

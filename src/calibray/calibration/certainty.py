@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -10,15 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from calibray.calibration.cheap import ReplayedModel
 from calibray.calibration.explaining import Explaining, has_offset
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail, rounds
+from calibray.calibration.stand_in import ensemble
+from calibray.engines.observable import PATH_LOSS
 from calibray.inference.intervals import CONFIDENCE, Interval, intervals
 from calibray.inference.marginal import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 from calibray.inference.nuisance import Nuisance, make_term
-from calibray.inference.posterior import Draws, sample
+from calibray.inference.posterior import ENOUGH, Draws, pooled, sample
 from calibray.inference.verdicts import verdicts
 from calibray.optimizers import LeastSquares
+from calibray.parameters import Parameters
 from calibray.progress import Progress
 
 COST: Final = 10
@@ -29,6 +34,12 @@ INTERACTIONS: Final = 50_000_000
 
 SIZES: Final = ((512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
 """Points of a round and rounds, the first that the cost allows."""
+
+SHARED: Final = ((128, 4), (64, 3))
+"""The same where several engines share them."""
+
+ALIKE: Final = 0.1
+"""Differences of functions that stand in for an engine, by the links' errors, below which their mean does as well."""
 
 SEARCHES: Final = 64
 """Local searches for the minima, where the method kept none."""
@@ -69,7 +80,7 @@ class Certainty:
     """How far a calibration can be trusted.
 
     Attributes:
-        intervals: Interval and verdict by parameter; empty where the engine gives no derivatives.
+        intervals: Interval and verdict by parameter.
         draws: Values of the parameters, by name, that explain the data about as well as those found.
         posterior: All draws, in the search space; None where none were made.
         noise: Weights of the kinds of noise, and of a forgotten offset.
@@ -91,41 +102,96 @@ class Certainty:
     seconds: float = 0.0
 
 
-def certainty(problem: Problem, trail: Trail, progress: Progress | None = None) -> Certainty:
+def certainty(
+    problem: Problem, trail: Trail, progress: Progress | None = None, model: ReplayedModel | None = None
+) -> Certainty:
     """Work out how far a calibration can be trusted.
 
     Args:
         problem: The problem.
         trail: Its finished search.
         progress: Called with the stage "drawing" after every round.
+        model: The replay of the study's own scene, where the search had one as a cheap model.
 
     Returns:
         What the data tell of the parameters.
     """
-    if not problem.differentiable:
-        name = problem.setup.study.engine.name
-        return Certainty(
-            remarks=(f"Intervals are not known: the engine {name!r} gives no derivatives, which they take.",)
+    started = time.perf_counter()
+    if problem.differentiable:
+        calls = problem.engine.calls
+        found = _certain(problem, [problem], trail, trail.rt_calls, progress)
+        calls = problem.engine.calls - calls
+    else:
+        found, calls = _approximate(problem, trail, progress, model)
+    return replace(found, calls=calls, seconds=time.perf_counter() - started)
+
+
+def _approximate(
+    problem: Problem, trail: Trail, progress: Progress | None, model: ReplayedModel | None
+) -> tuple[Certainty, int]:
+    """The same by what stands in for an engine without derivatives, and the replays that it took."""
+    stands, name = ensemble(problem, trail, model), problem.setup.study.engine.name
+    if stands is None:
+        reason = f"{len(trail.candidates)} calls of the engine are too few to tell how path loss depends on anything"
+        return Certainty(_whole(problem.parameters, reason)), 0
+    mean, *drawn = (
+        replace(problem, engine=engine, observable=PATH_LOSS) for engine in (stands.mean, *stands.drawn)
+    )
+    alike = stands.apart_db < ALIKE * trail.best_value
+    spent = trail.rt_calls if model is None else model.calls
+    found = _certain(mean, [mean] if alike else drawn, trail, spent, progress)
+    way = "" if stands.replayed is None else ", by way of the corrected replay of its scene"
+    remark = (
+        f"Intervals are approximate: the engine {name!r} gives no derivatives, so {stands.calls} of its calls stand in "
+        f"for it{way}; of these the better half are foretold to {stands.error_db:.2g} dB, each from all others."
+    )
+    intervals = {name: replace(each, approximate=True) for name, each in found.intervals.items()}
+    calls = 0 if stands.replayed is None else stands.replayed.calls
+    return replace(found, intervals=intervals, remarks=(remark, *found.remarks)), calls
+
+
+def _whole(parameters: Parameters, reason: str) -> dict[str, Interval]:
+    """Intervals that tell nothing."""
+    return {
+        each.name: Interval(
+            (each.upper - each.lower) / np.sqrt(12.0),
+            each.lower,
+            each.upper,
+            "not identifiable",
+            (),
+            reason,
+            True,
         )
-    started, calls = time.perf_counter(), problem.engine.calls
+        for each in parameters
+    }
+
+
+def _certain(
+    problem: Problem, engines: Sequence[Problem], trail: Trail, spent: int, progress: Progress | None
+) -> Certainty:
+    """What the data tell, by a problem and by those that differ in their engine alone, each as likely as the others."""
     told = problem.evaluate(problem.parameters.to_search(trail.best)[None], derivatives=True)
     local = _curvature(problem, trail, told.residuals[0], told.slopes[0])
     freedom = _freedom(problem, told.residuals.shape[1])
     if freedom < 1:
         reason = f"{told.residuals.shape[1]} links are too few for so many unknowns"
-        found = Certainty(
+        return Certainty(
             {name: replace(each, verdict="not identifiable", reason=reason) for name, each in local.items()}
         )
-    elif told.value[0] < EXACT_DB:
+    if told.value[0] < EXACT_DB:
         reason = "the data hold no noise"
-        found = Certainty({name: replace(each, reason=reason) for name, each in local.items()})
-    else:
-        found = _from_draws(problem, trail, local, freedom, progress)
-    return replace(found, calls=problem.engine.calls - calls, seconds=time.perf_counter() - started)
+        return Certainty({name: replace(each, reason=reason) for name, each in local.items()})
+    return _from_draws(problem, engines, trail, local, freedom, spent, progress)
 
 
 def _from_draws(
-    problem: Problem, trail: Trail, local: dict[str, Interval], freedom: int, progress: Progress | None
+    problem: Problem,
+    engines: Sequence[Problem],
+    trail: Trail,
+    local: dict[str, Interval],
+    freedom: int,
+    spent: int,
+    progress: Progress | None,
 ) -> Certainty:
     parameters = problem.parameters
     lower, upper = parameters.search_bounds
@@ -133,7 +199,7 @@ def _from_draws(
     likely = _likely(minima, square, freedom)
     offset, shifted = _free_offset(problem, likely, float(square.min()), freedom)
     explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
-    size = _size(problem, trail, explaining.replays)
+    size = _size(problem, spent, len(engines), explaining.replays)
     if size is None:
         reason = "by the curvature at the optimum alone: draws would cost more than five calibrations"
         return replace(offset, intervals={name: replace(each, reason=reason) for name, each in local.items()})
@@ -143,20 +209,25 @@ def _from_draws(
     order = np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")
     starts = known[order[:BASINS]]
     explaining = explaining.without_negligible(explained)
-    batch, turns = size
-    done = 0
+    wide = _covariances(problem, starts, freedom)
+    (batch, turns), done = size, 0
 
-    def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress("drawing", done, turns + 1)
-        return np.logaddexp.reduce(explaining(points), axis=1)
+    def drawn(engine: Problem) -> Draws:
+        own = replace(explaining, problem=engine)
 
-    posterior = sample(
-        density, lower, upper, starts, _covariances(problem, starts, freedom), batch=batch, rounds=turns,
-        seed=problem.setup.study.method.seed,
-    )  # fmt: skip
+        def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress("drawing", done, (turns + 1) * len(engines))
+            return np.logaddexp.reduce(own(points), axis=1)
+
+        return sample(
+            density, lower, upper, starts, wide, batch=batch, rounds=turns, enough=ENOUGH / len(engines),
+            seed=problem.setup.study.method.seed,
+        )  # fmt: skip
+
+    posterior = pooled([drawn(engine) for engine in engines])
 
     def shown(index: int, value: float) -> float:
         point = lower.copy()
@@ -174,13 +245,14 @@ def _from_draws(
             local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
         )
     noise = explaining.weights(posterior.resampled(200))
+    missed = _missed(problem, posterior, trail) if problem in engines else ()
     return replace(
         offset,
         intervals=found,
         draws=_draws(problem, posterior),
         posterior=posterior,
         noise=noise,
-        remarks=(*offset.remarks, *_departures(noise), *_missed(problem, posterior, trail)),
+        remarks=(*offset.remarks, *_departures(noise), *missed),
     )
 
 
@@ -238,11 +310,15 @@ def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: i
     return minima[order]
 
 
-def _size(problem: Problem, trail: Trail, replays: int) -> tuple[int, int] | None:
-    """Points of a round and rounds, as the cost of so many replays each allows; None where not even the fewest do."""
+def _size(problem: Problem, spent: int, engines: int, replays: int) -> tuple[int, int] | None:
+    """Points of a round and rounds, as the cost of so many replays each allows; None where not even the fewest do.
+
+    Where several engines share the draws, each needs the fewest that do.
+    """
     interactions = getattr(problem.engine, "interactions", 1)
-    allowed = max(COST * trail.rt_calls, INTERACTIONS // max(interactions, 1))
-    return next(((batch, turns) for batch, turns in SIZES if batch * (turns + 2) * replays <= allowed), None)
+    allowed = max(COST * spent, INTERACTIONS // max(interactions, 1)) // engines
+    sizes = SIZES if engines == 1 else SHARED
+    return next(((batch, turns) for batch, turns in sizes if batch * (turns + 2) * replays <= allowed), None)
 
 
 def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:

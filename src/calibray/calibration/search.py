@@ -59,6 +59,7 @@ class Trail:
         minima: Where the optimizer's searches ended, the best first, as points of the search space [k, d].
         rt_calls: RT calls that the search spent, now or in an earlier run that left them in the ledger.
         ledger_hits: How many of them the ledger answered.
+        modelled: What the engine answered to each [L], where it gives no derivatives: nothing else tells of it then.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)
@@ -73,6 +74,7 @@ class Trail:
     minima: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     rt_calls: int = 0
     ledger_hits: int = 0
+    modelled: list[NDArray[np.float64]] = field(default_factory=list)
 
     def add(self, candidates: NDArray[np.float64], told: Evaluation, iteration: int, now: float) -> None:
         """Record one round.
@@ -124,6 +126,8 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     started, calls, hits = time.perf_counter(), engine.calls, _hits(engine)
     for iteration, (points, told) in enumerate(rounds(optimizer, problem.evaluate), start=1):
         trail.add(problem.parameters.from_search(points), told, iteration, time.perf_counter() - started)
+        if not problem.differentiable:
+            trail.modelled += list(told.modelled)
         if progress is not None:
             progress("calibrating", len(trail.rmse_db), optimizer.budget)
     trail.ledger_hits = _hits(engine) - hits

@@ -22,6 +22,7 @@ class Interval:
         verdict: "identified", "weakly identified", "ambiguous", "at bound" or "not identifiable".
         pieces: Lower and upper end of every piece, ascending, where the interval was taken from draws.
         reason: Why the verdict is what it is, in words.
+        approximate: Whether something stands in for the engine, which gives no derivatives.
     """
 
     standard_error: float
@@ -30,6 +31,12 @@ class Interval:
     verdict: str
     pieces: tuple[tuple[float, float], ...] = ()
     reason: str = ""
+    approximate: bool = False
+
+    @property
+    def told(self) -> str:
+        """The verdict as it is shown."""
+        return f"{self.verdict}, approximate" if self.approximate else self.verdict
 
 
 def intervals(

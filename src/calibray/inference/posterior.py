@@ -9,7 +9,7 @@ mixture of all proposals, so that none is lost and no basin has to be crossed fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,7 +26,7 @@ KERNELS: Final = 120
 """Kernels of a round."""
 
 ENOUGH: Final = 500.0
-"""Effective draws after which no further round is made."""
+"""Effective draws that intervals are taken from."""
 
 LEAST: Final = 60.0
 """Effective points that kernels are taken from; where there are fewer, the density is flattened."""
@@ -76,6 +76,7 @@ def sample(
     *,
     batch: int = 512,
     rounds: int = 8,
+    enough: float = ENOUGH,
     seed: int = 0,
 ) -> Draws:
     """Draw from a posterior within bounds.
@@ -88,6 +89,7 @@ def sample(
         covariance: Covariance of the parameters there by curvature [k, d, d].
         batch: Points of a round.
         rounds: Rounds at most, the first not counted.
+        enough: Effective draws after which no further round is made.
         seed: Seed of the random numbers.
 
     Returns:
@@ -114,7 +116,7 @@ def sample(
         weight = np.exp(raw - raw.max())
         weight /= weight.sum()
         draws, turn = Draws(lower + unit * width, found, weight), len(share) - 2
-        if turn == rounds or (turn and draws.effective >= ENOUGH):
+        if turn == rounds or (turn and draws.effective >= enough):
             return draws
         kernels = _learned(unit, raw, random)
         new = inside(kernels.draw(batch, random))
@@ -127,6 +129,22 @@ def sample(
         proposals.append(kernels)
         log_parts.append(kernels.log_density(unit))
         share.append(float(batch))
+
+
+def pooled(parts: Sequence[Draws]) -> Draws:
+    """Draws from several posteriors, each as likely as the others.
+
+    Args:
+        parts: Draws from each.
+
+    Returns:
+        All of them.
+    """
+    return Draws(
+        np.concatenate([part.point for part in parts]),
+        np.concatenate([part.density for part in parts]),
+        np.concatenate([part.weight for part in parts]) / len(parts),
+    )
 
 
 def inside(unit: NDArray[np.float64]) -> NDArray[np.float64]:

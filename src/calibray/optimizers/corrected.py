@@ -91,8 +91,8 @@ class Corrected:
         Returns:
             Mean [k, m], and the variance by that of each residual [k].
         """
-        cheap = _cheap(self.model, self.box, unit, self.constants)
-        mean, share = self.rest.predict(_seen(self.model, self.response, unit, cheap))
+        cheap, seen = self.seen(unit)
+        mean, share = self.rest.predict(seen)
         return cheap + mean, share
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -104,10 +104,37 @@ class Corrected:
         Returns:
             Mean [k, m] and Jacobian by the coordinates of the unit cube [k, m, d].
         """
+        cheap, slope, seen, change = self.sloped(unit)
+        mean, _ = self.rest.predict(seen)
+        return cheap + mean, slope + self.rest.slope(seen, change)
+
+    def seen(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Seen]:
+        """What the cheap model says, its constants adjusted.
+
+        Args:
+            unit: Points of the unit cube [k, d].
+
+        Returns:
+            Residuals [k, m], and the points as the rest sees them.
+        """
+        cheap = _cheap(self.model, self.box, unit, self.constants)
+        return cheap, _seen(self.model, self.response, unit, cheap)
+
+    def sloped(
+        self, unit: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Seen, NDArray[np.float64]]:
+        """The same with derivatives by the coordinates of the unit cube.
+
+        Args:
+            unit: Points of the unit cube [k, d].
+
+        Returns:
+            Residuals [k, m], their derivatives [k, m, d], the points as the rest sees them, and the derivatives of
+            what it sees [k, r, d].
+        """
         cheap, slope = cheap_and_slope(self.model, self.box, unit, self.constants)
         seen = _seen(self.model, self.response, unit, cheap)
-        mean, _ = self.rest.predict(seen)
-        return cheap + mean, slope + self.rest.slope(seen, _known(self.model, self.response, slope))
+        return cheap, slope, seen, _known(self.model, self.response, slope)
 
     def with_point(self, point: NDArray[np.float64]) -> Corrected:
         """Pretend that a point had been evaluated and had come out as predicted.
@@ -120,8 +147,7 @@ class Corrected:
         """
         unit = np.vstack([self.rest.seen.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
-        cheap = _cheap(self.model, self.box, unit, self.constants)
-        seen = _seen(self.model, self.response, unit, cheap)
+        cheap, seen = self.seen(unit)
         rest = discrepancy.solve(seen, residuals - cheap, self.rest.hyper, self.rest.scale)
         return replace(self, residuals=residuals, rest=rest)
 

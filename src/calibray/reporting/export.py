@@ -131,7 +131,7 @@ def _rows(result: Result) -> Iterator[dict[str, Any]]:
             row.setdefault(f"{constant}_upper", math.nan)
             row.setdefault(f"{constant}_verdict", "")
             if owner == name:
-                row[f"{constant}_verdict"] = "not known" if interval is None else interval.verdict
+                row[f"{constant}_verdict"] = "not known" if interval is None else interval.told
             if interval is not None:
                 row |= {f"{constant}_lower": interval.lower, f"{constant}_upper": interval.upper}
         if result.laws:

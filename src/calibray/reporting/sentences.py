@@ -177,6 +177,13 @@ def _sure(result: Result) -> Iterator[Sentence]:
         if names := _by_verdict(result, verdict):
             begin = "None is certain. " if not told and verdict == "not identifiable" else ""
             yield Sentence(heading if begin else "", f"{begin}{_list(names)}: {meaning}.", "caution")
+    if any(interval.approximate for interval in result.intervals.values()):
+        yield Sentence(
+            "",
+            f"These intervals are approximate: the engine {result.study.engine.name} gives no derivatives, and what it "
+            "answered to its calls stands in for it.",
+            "caution",
+        )
 
 
 def _next(result: Result, meets: Mapping[str, int] | None) -> Iterator[Sentence]:

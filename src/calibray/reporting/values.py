@@ -38,6 +38,7 @@ class Value:
         places: Where on the bar the values before and after stand, each 0 to 1.
         pieces: Where every piece of the interval begins and ends, each 0 to 1.
         reason: Why the verdict is what it is; empty where that is not known.
+        approximate: Whether something stands in for an engine without derivatives.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Value:
     places: dict[str, float]
     pieces: tuple[tuple[float, float], ...] = ()
     reason: str = ""
+    approximate: bool = False
 
     @property
     def mark(self) -> str:
@@ -87,6 +89,7 @@ def values(result: Result) -> list[Value]:
                 places,
                 tuple((place(low), place(high)) for low, high in pieces),
                 "" if interval is None else interval.reason,
+                interval is not None and interval.approximate,
             )
         )
     return found

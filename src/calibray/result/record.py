@@ -46,8 +46,8 @@ class Result:
         study: The study, with the method, seed and engine that ran.
         parameters: Calibrated values by name, in the fields' units.
         initial_parameters: Values before calibration.
-        intervals: 95 % intervals and verdicts with their reasons, by parameter; empty where the engine gives no
-            derivatives.
+        intervals: 95 % intervals and verdicts with their reasons, by parameter; approximate ones where the engine
+            gives no derivatives.
         materials: All materials of the scene at its carrier, the calibrated values in place.
         offsets_db: Offsets by group, [dB]; the nameless group stands for all links; empty without `[offset]`.
         rmse_db: RMSE over the links calibrated on (paper eq. 1), [dB].

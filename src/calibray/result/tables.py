@@ -125,7 +125,7 @@ def parameters(result: Result) -> Table:
         unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
         label = Column(name, "" if unit == "1" else unit).heading
         before, interval = result.initial_parameters[name], result.intervals.get(name)
-        ends = (ends_text(interval), interval.verdict) if interval else ("-", "not known")
+        ends = (ends_text(interval), interval.told) if interval else ("-", "not known")
         rows.append((label, f"{before:.4g}", f"{after:.4g}", *ends))
     columns = (Column(), numbers("before"), numbers("after"), numbers("95 % interval"), Column("verdict"))
     return Table("Parameters", columns, tuple(rows))

@@ -1,0 +1,233 @@
+"""Intervals on engines that can only be called, beside those that their derivatives would give.
+
+    python benchmarks/called.py --repetitions 30 --districts demo,development --out called.jsonl
+
+The engine is the replay of a district whose fixed constants (thickness, conductivity) are off by random factors and
+whose every link is off by 0.5 dB, so that the study's own replay is a cheap model that is told wrongly. Truths are
+drawn evenly from their ranges, errors have 1 and 3 dB. Twice the engine is only called: by space mapping with the
+study's replay, 10 calls a parameter, and by the vector surrogate without, 20 calls a parameter; the third time its
+derivatives are used. A row tells how often 90 % and 95 % intervals hold the truth, and how wide they are beside the
+third's on the same data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import districts
+from calibray.calibration.certainty import certainty
+from calibray.calibration.cheap import ProblemRows, ReplayedModel, with_constants
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import search
+from calibray.engines import Replay
+from calibray.inference.credible import credible
+from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render
+
+LEVELS = (0.9, 0.95)
+NOISES_DB = (1.0, 3.0)
+OWN_DB = 0.5
+"""What every link of the engine is off by against the study's replay, standard deviation [dB]."""
+OFF = 0.5
+"""How far its constants are off, of the spread that space mapping allows for."""
+
+
+@dataclass
+class Engine:
+    """A district with constants of its own.
+
+    Attributes:
+        stored: Its paths, over the parameters and then the constants.
+        constants: The constants, in the fields' units.
+        own: What every link is off by [L], [dB].
+        parameters: What a candidate's components stand for.
+        calls: Candidates evaluated so far.
+    """
+
+    stored: Replay
+    constants: np.ndarray
+    own: np.ndarray
+    parameters: Any
+    calls: int = 0
+
+    @property
+    def materials(self) -> dict[str, Any]:
+        """The scene's materials."""
+        return self.stored.materials
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        """Path loss [n, L], [dB]."""
+        self.calls += len(candidates)
+        return self.stored.path_loss(self._whole(candidates)) + self.own
+
+    def _whole(self, candidates: np.ndarray) -> np.ndarray:
+        return np.hstack([candidates, np.tile(self.constants, (len(candidates), 1))])
+
+
+@dataclass
+class WithDerivatives(Engine):
+    """The same with derivatives."""
+
+    large: bool = False
+
+    @property
+    def interactions(self) -> int:
+        """Interactions that a candidate is evaluated at."""
+        return self.stored.interactions
+
+    def path_loss_and_jacobian(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Path loss [n, L], [dB], and derivatives [n, L, d]."""
+        self.calls += len(candidates)
+        loss, slope = self.stored.path_loss_and_jacobian(self._whole(candidates))
+        return loss + self.own, slope[:, :, : candidates.shape[1]]
+
+
+@cache
+def _opened(name: str, folder: Path) -> tuple[Problem, Replay]:
+    """A district's problem, and its paths over the parameters and the constants."""
+    problem = districts.make(name, folder).problem
+    paths = problem.engine.paths
+    setup = problem.setup
+    stored = Replay(
+        paths, with_constants(problem.parameters, paths.materials), setup.study.objective.combining,
+        setup.study.scene.bandwidth,
+    )  # fmt: skip
+    return problem, stored
+
+
+def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str, Any]:
+    """One planted truth, by three ways to it."""
+    problem, stored = _opened(name, folder)
+    parameters, started = problem.parameters, time.process_time()
+    random = np.random.default_rng([zlib.crc32(name.encode()), turn, 12])
+    bounds, count = parameters.search_bounds, len(parameters)
+    point = random.uniform(*bounds)
+    low, high = (each[count:] for each in stored.parameters.search_bounds)
+    # Bounds lie three spreads out.
+    moved = (low + high) / 2 + OFF * (high - low) / 6 * random.standard_normal(len(low))
+    constants = stored.parameters.from_search(np.append(point, np.clip(moved, low, high)))[count:]
+    own = OWN_DB * random.standard_normal(len(problem.before))
+    called = Engine(stored, constants, own, parameters)
+    exact = WithDerivatives(stored, constants, own, parameters)
+    loss = exact.path_loss(parameters.from_search(point)[None])[0]
+    known = np.isfinite(loss)
+    measured = np.where(known, loss + noise_db * random.standard_normal(len(loss)), 0.0)
+    objective = replace(
+        problem.objective, measured=measured, weight=np.where(known, problem.objective.weight, 0.0)
+    )
+    found = {}
+    for way in ("derivatives", "mapped", "planes"):
+        asked = replace(problem, engine=exact if way == "derivatives" else called, objective=objective)
+        asked = replace(asked, before=asked.engine.path_loss(parameters.start[None])[0])
+        model = ReplayedModel(stored, count, ProblemRows(asked)) if way == "mapped" else None
+        optimizer = {
+            "derivatives": lambda: LeastSquares(*bounds, starts=64, seed=turn),
+            "mapped": lambda model=model: SpaceMapping(*bounds, model=model, budget=10 * count, seed=turn),
+            "planes": lambda: VectorSurrogate(*bounds, budget=20 * count, seed=turn),
+        }[way]()
+        trail = search(asked, optimizer)
+        before = time.process_time()
+        told = certainty(asked, trail, model=model)
+        draws = told.posterior
+        sets = [
+            {
+                str(level): credible(draws.point[:, k], draws.weight, bounds[0][k], bounds[1][k], level)
+                for level in LEVELS
+            }
+            for k in range(count)
+        ]
+        found[way] = {
+            "verdicts": [each.verdict for each in told.intervals.values()],
+            "held": [
+                {level: _holds(pieces, value) for level, pieces in each.items()}
+                for value, each in zip(point, sets, strict=True)
+            ],
+            "width": [sum(b - a for a, b in each["0.9"]) for each in sets],
+            "rmse_db": trail.best_rmse_db,
+            "calls": trail.rt_calls,
+            "seconds": time.process_time() - before,
+        }  # fmt: skip
+    return {
+        "district": name, "noise_db": noise_db, "turn": turn, "ways": found, "seconds": time.process_time() - started
+    }  # fmt: skip
+
+
+def _holds(pieces: tuple[tuple[float, float], ...], value: float) -> bool:
+    return any(low <= value <= high for low, high in pieces)
+
+
+def _table(lines: list[dict[str, Any]]) -> Table:
+    columns = (
+        Column("noise"), Column("way"), numbers("intervals"), *(numbers(f"{level:.0%} held") for level in LEVELS),
+        numbers("identified or weakly"), numbers("90% held there"), numbers("width by derivatives', median"),
+        numbers("a tenth below"), numbers("a tenth above"), numbers("seconds"),
+    )  # fmt: skip
+    return Table("Intervals on engines that can only be called", columns, tuple(_rows(lines)))
+
+
+def _rows(lines: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    for noise in sorted({line["noise_db"] for line in lines}):
+        here = [line["ways"] for line in lines if line["noise_db"] == noise]
+        for way in here[0]:
+            held = [each for ways in here for each in ways[way]["held"]]
+            verdict = [each for ways in here for each in ways[way]["verdicts"]]
+            told = [
+                each["0.9"]
+                for each, said in zip(held, verdict, strict=True)
+                if said in ("identified", "weakly identified")
+            ]
+            ratio = np.concatenate(
+                [np.array(ways[way]["width"]) / ways["derivatives"]["width"] for ways in here]
+            )
+            low, middle, high = np.quantile(ratio, (0.1, 0.5, 0.9))
+            yield (
+                f"{noise:g} dB", way, str(len(held)),
+                *(f"{np.mean([each[str(level)] for each in held]):.2f}" for level in LEVELS),
+                str(len(told)), f"{np.mean(told):.2f}" if told else "-", f"{middle:.2f}", f"{low:.2f}", f"{high:.2f}",
+                f"{np.mean([ways[way]['seconds'] for ways in here]):.1f}",
+            )  # fmt: skip
+
+
+def main() -> None:
+    """Run what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repetitions", type=int, default=30)
+    parser.add_argument("--districts", default="demo,development")
+    parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
+    parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
+    given = parser.parse_args()
+    groups = {"development": districts.DEVELOPMENT, "judging": districts.JUDGING}
+    names = [name for word in given.districts.split(",") for name in groups.get(word, (word,))]
+    lines = []
+    if given.out is not None and given.out.exists():
+        lines = [json.loads(line) for line in given.out.read_text().splitlines()]
+    done = {(line["district"], line["noise_db"], line["turn"]) for line in lines}
+    for turn in range(given.repetitions):
+        for name in names:
+            for noise in NOISES_DB:
+                if (name, noise, turn) in done:
+                    continue
+                lines.append(repetition(name, noise, turn, given.folder))
+                took = f"{lines[-1]['seconds']:.0f} s"
+                print(f"{name}, {noise:g} dB, repetition {turn + 1}: {took}", file=sys.stderr)
+                if given.out is not None:
+                    with given.out.open("a") as file:
+                        file.write(json.dumps(lines[-1]) + "\n")
+    print(render(_table([line for line in lines if line["district"] in names])))
+
+
+if __name__ == "__main__":
+    main()
