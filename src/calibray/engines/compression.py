@@ -60,7 +60,7 @@ POOL: Final = 2000
 BLOCK: Final = 400_000_000
 """Powers, paths times candidates, held at once."""
 
-FIRST_INTERVALS: Final = 4096
+FIRST_INTERVALS: Final = 512
 LAST_INTERVALS: Final = 65536
 """Intervals of a table of coefficients, at first and at most."""
 

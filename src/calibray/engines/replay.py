@@ -9,28 +9,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
-from calibray.fields.tabulation import Lookup
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
 BLOCK_INTERACTIONS: Final = 50_000
 """Interactions times candidates evaluated at once, whose numbers fit into a core's cache."""
 
-TABULATED: Final = 50_000
-"""Interactions beyond which coefficients come from tables."""
+LARGE: Final = 50_000
+"""Interactions beyond which a program is large."""
 
-FIRST_INTERVALS: Final = 2048
-LAST_INTERVALS: Final = 65536
-"""Intervals of a table of coefficients, at first and at most."""
+TABULATED: Final = 1_000
+"""Interactions beyond which coefficients may come from tables."""
 
-NODE_COST: Final = 4
-"""Interactions looked up in the time of evaluating a node, with its share of the check."""
+NODES: Final = 0.5
+"""Nodes of tables for each interaction, beyond which filling them would cost more than they spare."""
 
 TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
+
+FORETOLD: Final = 32
+"""Candidates spread over the bounds that tell how fine tables must be, beside the first one."""
 
 LARGEST_BLOCK: Final = 16
 """Candidates a call, at most; fewer are filled up, so that a program is compiled for one number of candidates."""
@@ -46,7 +48,7 @@ class Replay:
         bandwidth: Bandwidth [Hz], for "band".
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             combine by power.
-        tabulate: Whether coefficients come from tables; if None, for large programs.
+        tabulate: Whether coefficients come from tables; if None, where that is quicker.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -72,8 +74,7 @@ class Replay:
         self._columns = columns
         self._base = jnp.asarray(fields.material_table(paths).astype(dtype))
         self._fields = tuple(int(column) for column in used)
-        self._intervals = FIRST_INTERVALS if (self.large if tabulate is None else tabulate) else None
-        self._forced = tabulate is True
+        self._intervals = None if tabulate is False else self._needed(force=tabulate is True)
         self._program = self._laid_out()
 
     @property
@@ -84,7 +85,7 @@ class Replay:
     @property
     def large(self) -> bool:
         """Whether there are so many interactions that a candidate costs milliseconds."""
-        return self.interactions > TABULATED
+        return self.interactions > LARGE
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates.
@@ -144,22 +145,25 @@ class Replay:
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
+    def _needed(self, force: bool) -> NDArray[np.int64] | None:
+        """Intervals of the tables by material and mode; None where evaluating every coefficient is quicker."""
+        if not force and self.interactions <= TABULATED:
+            return None
+        unit = qmc.Sobol(len(self.parameters), rng=0).random(FORETOLD)
+        few = np.concatenate([self.parameters.start[None], self.parameters.from_unit(unit)])
+        tables = self.parameters.constants_of(few, self.paths.materials, self.paths.frequency)
+        found = fields.table_intervals(self.paths, tables, TABLE_TOLERANCE)
+        return found if force or found.sum() <= NODES * self.interactions else None
+
     def _refine(self) -> None:
         """Make the tables of coefficients finer, for these candidates and all that follow."""
-        finer = 2 * (self._intervals or LAST_INTERVALS)
-        self._intervals = finer if finer <= LAST_INTERVALS else None
+        if self._intervals is not None:
+            finer = 2 * self._intervals
+            self._intervals = finer if finer.max() <= fields.FINEST else None
         self._program = self._laid_out()
 
     def _laid_out(self) -> fields.GroupedProgram:
-        phases = self._combining != "power"
-        program = fields.layout(self.paths, self._dtype, self._intervals, phases).program
-        if self._forced or not isinstance(places := program.coefficients, Lookup):
-            return program
-        # Filling tables would cost more than evaluating every coefficient by itself.
-        if NODE_COST * places.num_nodes > self.paths.num_interactions:
-            self._intervals = None
-            return fields.layout(self.paths, self._dtype, None, phases).program
-        return program
+        return fields.layout(self.paths, self._dtype, self._intervals, self._combining != "power").program
 
     def _size(self) -> int:
         """Candidates that a call takes: one where tables are filled for each."""

@@ -28,9 +28,11 @@ from calibray.fields.evaluation import (  # noqa: E402
     program_path_loss,
 )
 from calibray.fields.program import GroupedProgram, Layout, layout, material_table  # noqa: E402
+from calibray.fields.resolution import FINEST, table_intervals  # noqa: E402
 
 __all__ = [
     "COMBINING",
+    "FINEST",
     "GroupedProgram",
     "Layout",
     "band_quadrature",
@@ -45,4 +47,5 @@ __all__ = [
     "path_losses_and_slopes",
     "path_powers",
     "program_path_loss",
+    "table_intervals",
 ]

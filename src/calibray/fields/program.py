@@ -32,6 +32,10 @@ from calibray.paths import Kind, Paths
 _MODE: Final = {Kind.REFRACTION: tabulation.TRANSMITTED, Kind.DIFFUSE: tabulation.RAW}
 
 
+PADDED: Final = 50_000
+"""Interactions up to which a program with tables is filled up."""
+
+
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["tx", "rx", "rotation", "turn", "wedge"],
@@ -166,21 +170,25 @@ class Layout:
 
 
 def layout(
-    paths: Paths, dtype: type = np.float64, intervals: int | None = None, phases: bool = True
+    paths: Paths,
+    dtype: type = np.float64,
+    intervals: tabulation.Intervals | None = None,
+    phases: bool = True,
 ) -> Layout:
     """Lay a path program out for evaluation.
 
     Args:
         paths: The path program.
         dtype: Precision of the constants, `numpy.float64` or `numpy.float32`.
-        intervals: Tabulate the coefficients over the angle of incidence with so many intervals; None evaluates
-            every coefficient by itself.
+        intervals: Tabulate the coefficients over the angle of incidence with so many intervals, in all or by material
+            and mode [M, 3]; None evaluates every coefficient by itself.
         phases: Keep the delays, which nothing but the sum of powers can do without.
 
     Returns:
         The grouped program, on JAX's default device.
     """
-    steps = Steps.padded(paths) if intervals is None else Steps.exact(paths)
+    small = intervals is None or paths.num_interactions <= PADDED
+    steps = Steps.padded(paths) if small else Steps.exact(paths)
     index = steps.index
     order = np.concatenate(index) if index else np.zeros(0, dtype=np.int64)
     flat = _Flat(paths)
@@ -269,22 +277,37 @@ def _row_of(kind: NDArray[np.integer], which: Kind) -> NDArray[np.int64]:
     return np.where(chosen, np.cumsum(chosen) - 1, -1)
 
 
+def coefficients_of(
+    paths: Paths,
+) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]:
+    """Material, mode and cosine of incidence of every coefficient.
+
+    Args:
+        paths: The path program.
+
+    Returns:
+        The three, of all interactions, then of the other faces of diffracting wedges (each [J]).
+    """
+    faces = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
+    kind, material = (np.concatenate([column, column[faces]]) for column in (paths.kind, paths.material))
+    mode = np.select([kind == one for one in _MODE], list(_MODE.values()), 0)
+    return material, mode, np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
+
+
 def _coefficients(
-    paths: Paths, flat: _Flat, dtype: type, intervals: int | None
+    paths: Paths, flat: _Flat, dtype: type, intervals: tabulation.Intervals | None
 ) -> Formula | tabulation.Lookup:
-    kind, material = (np.concatenate([column, column[flat.faces]]) for column in (paths.kind, paths.material))
-    cosine = np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
+    material, mode, cosine = coefficients_of(paths)
     if intervals is not None:
-        mode = np.select([kind == one for one in _MODE], list(_MODE.values()), 0)
-        at, sizes = _joined(flat.places, np.int64), [len(place) for place in flat.places]
-        return tabulation.make_lookup(material[at], mode[at], cosine[at], sizes, intervals, dtype)
+        root = tabulation.roots(material_table(paths), speed_of_light / paths.frequency)
+        return tabulation.make_lookup(material, mode, cosine, root, flat.places, intervals, dtype)
     return Formula(
         material=jnp.asarray(material),
         cosine=jnp.asarray(cosine.astype(dtype)),
-        transmitted=jnp.asarray(kind == Kind.REFRACTION),
-        raw=jnp.asarray(kind == Kind.DIFFUSE),
+        transmitted=jnp.asarray(mode == tabulation.TRANSMITTED),
+        raw=jnp.asarray(mode == tabulation.RAW),
         place=tuple(jnp.asarray(place.astype(np.int32)) for place in flat.places),
-        any_transmitted=bool((kind == Kind.REFRACTION).any()),
+        any_transmitted=bool((mode == tabulation.TRANSMITTED).any()),
     )
 
 
