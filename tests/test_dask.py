@@ -13,18 +13,22 @@ import pytest
 
 import planted
 import programs
-from calibray import engines
+import two_ray
+from calibray import calibrate, engines
 from calibray.errors import InputError
+from calibray.study import Setup
 
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late
 
 
 @pytest.fixture(scope="module")
-def cluster():
-    """Three worker processes and their scheduler; a worker that dies is replaced."""
+def cluster(tmp_path_factory):
+    """Three worker processes and their scheduler, with a cache of their own; a worker that dies is replaced."""
     options = {"n_workers": 3, "threads_per_worker": 1, "dashboard_address": None, "processes": True}
-    with distributed.LocalCluster(**options) as cluster:
-        yield cluster
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", str(tmp_path_factory.mktemp("cache")))
+        with distributed.LocalCluster(**options) as cluster:
+            yield cluster
 
 
 def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
@@ -50,6 +54,30 @@ def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
     asked = programs.calls(tmp_path)
     # What the dead worker was on, and had finished without it being fetched yet, is run by another.
     assert len(set(asked)) == len(candidates) <= len(asked)
+
+
+def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_path, cluster):
+    few = {"method": {"name": "least-squares", "options": {"starts": 4}}, "offset": {"bounds": [-5.0, 5.0]}}
+    parted = {**few, "engine": {"name": "replay", "block_links": 10}}
+    killed: list[int] = []
+
+    def kill_one(stage: str, done: int, total: int | None) -> None:
+        if stage == "calibrating" and not killed:
+            with distributed.Client(cluster.scheduler_address) as client:
+                killed.append(next(iter(client.run(os.getpid).values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    setup = Setup.open(two_ray.study(tmp_path, noise_db=1.0, **parted), two_ray.TwoRay)
+    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
+        found = calibrate(setup, executor=crew, progress=kill_one)
+    assert killed
+    # No block twice: those of the dead worker came from the cache.
+    assert sorted((tmp_path / two_ray.TRACED).read_text().split()) == ["10", "10", "10"]
+    whole = calibrate(Setup.open(two_ray.study(tmp_path, noise_db=1.0, **few), two_ray.TwoRay))
+    assert found.parameters == pytest.approx(whole.parameters, rel=1e-9)
+    assert found.rmse_db == pytest.approx(whole.rmse_db, rel=1e-9)
+    assert found.offsets_db == pytest.approx(whole.offsets_db, rel=1e-9)
+    assert found.links["after_db"].to_numpy() == pytest.approx(whole.links["after_db"].to_numpy(), rel=1e-9)
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):

@@ -4,26 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
 import pytest
 
 import calibray as cb
-from calibray.fields import path_loss
-from calibray.measurements import links_from_frame
-from calibray.scenes import read_scene
+import two_ray
 from calibray.study import Study
-from calibray.tracing.settings import Antenna, TraceSettings
-from small_scenes import write_scene
-from two_ray import TwoRay
-
-FREQUENCY = 3.5e9
-TRUTH = 6.3
-COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
-GROUND = (
-    '<bsdf type="radio-material" id="mat-ground"><float name="relative_permittivity" value="3.0"/>'
-    '<float name="conductivity" value="0.5"/><float name="thickness" value="1.0"/></bsdf>'
-)
+from two_ray import TRUTH, TwoRay
 
 
 @pytest.fixture
@@ -31,25 +17,7 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
     """Links over a flat ground, their path loss computed by the tracer with the planted permittivity."""
     monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("calibray.tracing.factory.Sionna.__call__", refuse)
-    corners = [(-300.0, -300.0, 0.0), (300.0, -300.0, 0.0), (300.0, 300.0, 0.0), (-300.0, 300.0, 0.0)]
-    file = write_scene(tmp_path, {"floor": [corners]}, GROUND, "mat-ground")
-    rx = np.stack([np.geomspace(3, 150, 30), np.zeros(30), np.full(30, 1.5)], axis=1)
-    table = pd.DataFrame(np.hstack([np.tile([0.0, 0.0, 10.0], (30, 1)), rx]), columns=COLUMNS)
-    antenna = Antenna("dipole")
-    truth = {"ground": {"relative_permittivity": TRUTH, "conductivity": 0.5, "thickness": 1.0}}
-    tracer = TwoRay(read_scene(file, FREQUENCY, truth), FREQUENCY, TraceSettings(), antenna, antenna)
-    loss = path_loss(tracer.trace(links_from_frame(table)), combining="coherent")
-    table.assign(path_loss_db=loss).to_csv(tmp_path / "links.csv", index=False, float_format="%.17g")
-    dipole = {"pattern": "dipole", "polarization": "V"}
-    content = {
-        "version": 1,
-        "scene": {"file": "scene.xml", "frequency": FREQUENCY},
-        "links": {"file": "links.csv", "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db"},
-        "antennas": {"tx": dipole, "rx": dipole},
-        "objective": {"combining": "coherent"},
-        "parameters": {"ground.relative_permittivity": {"bounds": [1.5, 15.0]}},
-    }
-    return Study.from_content(content, tmp_path / "study.toml")
+    return two_ray.study(tmp_path)
 
 
 def refuse(*_: object) -> None:

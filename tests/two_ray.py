@@ -4,24 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.fields import path_gains
+from calibray.fields import path_gains, path_loss
 from calibray.materials import Material
+from calibray.measurements import links_from_frame
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import Chains
 from calibray.progress import Progress
-from calibray.scenes import Scene
+from calibray.scenes import Scene, read_scene
+from calibray.study import Study
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
 from calibray.tracing.launches import Plan, plan
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
+from small_scenes import write_scene
 
 MIRROR = np.array([1.0, 1.0, -1.0])
+FREQUENCY = 3.5e9
+TRUTH = 6.3
+BOUNDS = {"ground.relative_permittivity": [1.5, 15.0], "ground.conductivity": [0.01, 2.0]}
+COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
+GROUND = (
+    '<bsdf type="radio-material" id="mat-ground"><float name="relative_permittivity" value="3.0"/>'
+    '<float name="conductivity" value="0.5"/><float name="thickness" value="1.0"/></bsdf>'
+)
+TRACED = "traced.txt"
+"""File beside the scene with a line for every trace."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +61,8 @@ class TwoRay:
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
         tx, rx = positions(links)
+        with (self.scene.path.parent / TRACED).open("a") as file:
+            file.write(f"{len(rx)}\n")
         image, count = rx * MIRROR, len(rx)
         ground = tx + (image - tx) * (tx[:, 2:] / (tx - image)[:, 2:])
         chains = Chains(
@@ -72,3 +89,30 @@ class TwoRay:
 
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.asarray(points)[:, 2] < 0
+
+
+def study(folder: Path, links: int = 30, noise_db: float = 0.0, free: int = 1, **sections: Any) -> Study:
+    """A study of links over a flat ground, their path loss computed by the tracer with the planted permittivity."""
+    corners = [(-300.0, -300.0, 0.0), (300.0, -300.0, 0.0), (300.0, 300.0, 0.0), (-300.0, 300.0, 0.0)]
+    file = write_scene(folder, {"floor": [corners]}, GROUND, "mat-ground")
+    rx = np.stack([np.geomspace(3, 150, links), np.zeros(links), np.full(links, 1.5)], axis=1)
+    table = pd.DataFrame(np.hstack([np.tile([0.0, 0.0, 10.0], (links, 1)), rx]), columns=COLUMNS)
+    antenna = Antenna("dipole")
+    truth = {"ground": {"relative_permittivity": TRUTH, "conductivity": 0.5, "thickness": 1.0}}
+    tracer = TwoRay(read_scene(file, FREQUENCY, truth), FREQUENCY, TraceSettings(), antenna, antenna)
+    loss = path_loss(tracer.trace(links_from_frame(table)), combining="coherent")
+    loss = loss + noise_db * np.random.default_rng(5).standard_normal(links)
+    half = np.where(np.arange(links) % 2, "odd", "even")
+    table.assign(path_loss_db=loss, half=half).to_csv(folder / "links.csv", index=False, float_format="%.17g")
+    (folder / TRACED).unlink()
+    dipole = {"pattern": "dipole", "polarization": "V"}
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": FREQUENCY},
+        "links": {"file": "links.csv", "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db"},
+        "antennas": {"tx": dipole, "rx": dipole},
+        "objective": {"combining": "coherent"},
+        "parameters": {name: {"bounds": bounds} for name, bounds in list(BOUNDS.items())[:free]},
+        **sections,
+    }
+    return Study.from_content(content, folder / "study.toml")

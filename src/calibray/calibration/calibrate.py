@@ -17,6 +17,7 @@ from calibray.calibration.search import search
 from calibray.calibration.settle import settle
 from calibray.calibration.validate import check_engine, validated
 from calibray.calibration.weighing import weighed
+from calibray.engines.crew import Crew
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.files import check_outputs
@@ -36,7 +37,7 @@ def calibrate(
     out: str | Path | None = None,
     *,
     engine: Engine | None = None,
-    executor: Executor | None = None,
+    executor: Executor | Crew | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
     overwrite: bool = False,
@@ -51,7 +52,8 @@ def calibrate(
         out: Folder to save the result in; checked before anything is computed. The ledger of RT calls lies there,
             and a run that was killed repeats none of them when it is started again.
         engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
-        executor: What runs the calls of a batch on the engine "command".
+        executor: What runs the calls of a batch on the engine "command" (`engines.open_executor`); where blocks of
+            links live on the engine "replay" (`engines.open_crew`).
         progress: Called as the work goes on.
         overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.

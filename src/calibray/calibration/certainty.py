@@ -13,7 +13,7 @@ from scipy.special import fdtri
 
 from calibray.calibration.cheap import ReplayedModel
 from calibray.calibration.explaining import Explaining, has_offset
-from calibray.calibration.problem import Problem
+from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Trail, rounds
 from calibray.calibration.stand_in import ensemble
 from calibray.engines.observable import PATH_LOSS
@@ -55,6 +55,9 @@ LIKELY: Final = 20.0
 
 KEPT: Final = 128
 """Draws that are kept with the result."""
+
+LINKS: Final = 10_000
+"""Links beyond which errors that neighbours share are not looked at: all pairs of them would have to be."""
 
 COLUMNS: Final = 100
 """Columns of the nuisance beyond which draws leave them as they are at the optimum."""
@@ -170,11 +173,11 @@ def _certain(
     problem: Problem, engines: Sequence[Problem], trail: Trail, spent: int, progress: Progress | None
 ) -> Certainty:
     """What the data tell, by a problem and by those that differ in their engine alone, each as likely as the others."""
-    told = problem.evaluate(problem.parameters.to_search(trail.best)[None], derivatives=True)
-    local = _curvature(problem, trail, told.residuals[0], told.slopes[0])
-    freedom = _freedom(problem, told.residuals.shape[1])
+    told = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
+    local = _curvature(problem, trail, told)
+    freedom = _freedom(problem, told.num_rows)
     if freedom < 1:
-        reason = f"{told.residuals.shape[1]} links are too few for so many unknowns"
+        reason = f"{told.num_rows} links are too few for so many unknowns"
         return Certainty(
             {name: replace(each, verdict="not identifiable", reason=reason) for name, each in local.items()}
         )
@@ -198,11 +201,14 @@ def _from_draws(
     minima, square = _minima(problem, trail)
     likely = _likely(minima, square, freedom)
     offset, shifted = _free_offset(problem, likely, float(square.min()), freedom)
+    if problem.objective.num_counted > LINKS:
+        crowd = f"for more than {LINKS:,} links, errors that neighbours share are not looked at"
+        return replace(offset, intervals=_by_curvature(local, crowd))
     explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
     size = _size(problem, spent, len(engines), explaining.replays)
     if size is None:
-        reason = "by the curvature at the optimum alone: draws would cost more than five calibrations"
-        return replace(offset, intervals={name: replace(each, reason=reason) for name, each in local.items()})
+        dear = "draws would cost more than five calibrations"
+        return replace(offset, intervals=_by_curvature(local, dear))
     # What fits worse by least squares may fit best where errors are alike or have heavy tails.
     known = np.concatenate([minima[np.argsort(square)[:KNOWN]], shifted[:BASINS]])
     explained = explaining(known)
@@ -256,19 +262,26 @@ def _from_draws(
     )
 
 
+def _by_curvature(local: dict[str, Interval], why: str) -> dict[str, Interval]:
+    reason = f"by the curvature at the optimum alone: {why}"
+    return {name: replace(each, reason=reason) for name, each in local.items()}
+
+
 def _freedom(problem: Problem, rows: int) -> int:
     """Rows of the residuals less what is fitted to them."""
     return rows - problem.unknowns
 
 
-def _curvature(
-    problem: Problem, trail: Trail, residuals: NDArray[np.float64], jacobian: NDArray[np.float64]
-) -> dict[str, Interval]:
+def _curvature(problem: Problem, trail: Trail, told: Evaluation) -> dict[str, Interval]:
     """Intervals by linear theory, taken in the search space: of what spans decades, the logarithm is uncertain."""
     parameters = problem.parameters
     nuisances = int(problem.objective.determined.sum())
     point = parameters.to_search(trail.best)
-    found = intervals(point, residuals, jacobian, *parameters.search_bounds, nuisances)
+    scale = np.sqrt(told.num_rows / told.residuals.shape[1])
+    found = intervals(
+        point, told.residuals[0] * scale, told.slopes[0] * scale, *parameters.search_bounds, nuisances,
+        told.num_rows,
+    )  # fmt: skip
     lower, upper = (
         parameters.from_search(np.array(ends))
         for ends in zip(*((each.lower, each.upper) for each in found), strict=True)
@@ -282,11 +295,10 @@ def _curvature(
 
 def _covariances(problem: Problem, points: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
     """Covariance of the parameters at minima by linear theory, nowhere wider than a third of the range [k, d, d]."""
-    told = problem.evaluate(points, derivatives=True)
+    told = problem.squares(points, derivatives=True)
     lower, upper = problem.parameters.search_bounds
-    slopes = told.slopes * (upper - lower)
-    curvature = np.einsum("kmi,kmj->kij", slopes, slopes)
-    variance = told.value**2 * told.residuals.shape[1] / freedom
+    curvature = told.curvature * np.outer(upper - lower, upper - lower)
+    variance = told.value**2 * told.num_rows / freedom
     # A prior as wide as a third of the range keeps what the data cannot tell within it.
     precision = curvature / variance[:, None, None] + 9.0 * np.eye(len(lower))
     return np.linalg.inv(precision) * np.outer(upper - lower, upper - lower)
@@ -297,10 +309,10 @@ def _minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArra
     minima = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
     if len(minima) <= 2:  # the method kept its best alone
         search = LeastSquares(*problem.parameters.search_bounds, starts=SEARCHES, x0=minima)
-        for _ in rounds(search, problem.evaluate):
+        for _ in rounds(search, problem.squares):
             pass
         minima = np.concatenate([minima, search.minima])
-    return minima, problem.evaluate(minima).value ** 2
+    return minima, problem.squares(minima).value ** 2
 
 
 def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
@@ -329,7 +341,7 @@ def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
     columns = problem.objective.nuisance.columns
     if len(columns) > COLUMNS:
         return named
-    coefficients = problem.objective.coefficients(problem.evaluate(found).modelled)
+    coefficients = problem.objective.coefficients(problem.modelled(found))
     return named | dict(zip(columns, coefficients.T.tolist(), strict=True))
 
 
@@ -346,7 +358,7 @@ def _departures(noise: dict[str, float]) -> tuple[str, ...]:
 def _missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[str, ...]:
     """Said where draws lie below what the method found."""
     top = posterior.point[np.argsort(-posterior.density)[:16]]
-    lowest = float(problem.evaluate(top).value.min())
+    lowest = float(problem.squares(top).value.min())
     if lowest > trail.best_value - 0.01:
         return ()
     return (
@@ -366,12 +378,12 @@ def _free_offset(
     terms = (*objective.nuisance.terms, term)
     trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
     search = LeastSquares(*problem.parameters.search_bounds, starts=16, x0=minima[:BASINS])
-    for _ in rounds(search, trial.evaluate):
+    for _ in rounds(search, trial.squares):
         pass
-    told = trial.evaluate(search.minima)
+    told = trial.squares(search.minima)
     shifted = _likely(search.minima, told.value**2, freedom - 1)
     best = int(np.argmin(told.value))
-    offset = float(trial.objective.coefficients(told.modelled[best : best + 1])[0, -1])
+    offset = float(trial.objective.coefficients(trial.modelled(search.minima[best : best + 1]))[0, -1])
     left = float(told.value[best] ** 2)
     # F of one further column: the offset over its standard error, squared.
     ratio = (square - left) / left * (freedom - 1) if left > 0 else np.inf

@@ -53,7 +53,7 @@ class Explaining:
         scale = np.sqrt(weight * len(weight) / weight.sum())
         noise_db = float(np.sqrt(square * (freedom + len(problem.parameters)) / freedom))
         nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
-        coefficients = objective.coefficients(problem.evaluate(best[None]).modelled)[0]
+        coefficients = objective.coefficients(problem.modelled(best[None]))[0]
         held = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
         design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
         used = objective.determined & ~held

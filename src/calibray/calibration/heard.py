@@ -52,12 +52,12 @@ def heard(problem: Problem, progress: Progress | None = None) -> Problem:
     faint = np.zeros(len(limit), dtype=bool)
     for turn in range(ROUNDS):
         search = LeastSquares(*bounds, starts=SEARCHES if turn == 0 else 1, x0=start)
-        for _ in rounds(search, problem.evaluate):
+        for _ in rounds(search, problem.squares):
             pass
         start = search.minima[:SEARCHES]
-        found = problem.evaluate(search.best.x[None])
+        found = problem.squares(search.best.x[None])
         error = float(found.rmse_db[0]) * np.sqrt(objective.num_counted / max(problem.freedom, 1))
-        expected = objective.model(found.modelled)[0]
+        expected = objective.model(problem.modelled(search.best.x[None]))[0]
         before, faint = faint, (everyone > 0) & ~(expected <= limit - MARGIN * error)
         if progress is not None:
             progress("choosing links", turn + 1, ROUNDS)

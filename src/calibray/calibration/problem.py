@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.observable import PATH_LOSS, Observable
-from calibray.engines.protocol import Differentiable, Engine
+from calibray.engines.protocol import Differentiable, Engine, Parted, Reduced
 from calibray.errors import InputError
 from calibray.inference.nuisance import OFFSET, Nuisance, make_term
 from calibray.inference.objective import Objective, make_objective
+from calibray.inference.squares import Share, rows, total
 from calibray.measurements import Measurements
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
 from calibray.study import Setup, Study
@@ -25,8 +27,10 @@ class Evaluation(NamedTuple):
         value: What is minimized [n].
         residuals: Weighted residuals, and a row for every prior [n, m].
         jacobian: Their derivatives by the search coordinates [n, m, d], where asked for.
-        modelled: What the engine answered [n, L].
+        modelled: What the engine answered [n, L]; [n, 0] where it gave sums alone.
         rmse_db: The RMSE of the links alone (paper eq. 1) [n].
+        stands_for: Number of residuals that those given stand for, with the same mean squares and products; None
+            where they are all.
     """
 
     value: NDArray[np.float64]
@@ -34,6 +38,18 @@ class Evaluation(NamedTuple):
     jacobian: NDArray[np.float64] | None
     modelled: NDArray[np.float64]
     rmse_db: NDArray[np.float64]
+    stands_for: int | None = None
+
+    @property
+    def num_rows(self) -> int:
+        """Number of residuals, or of those that the ones given stand for."""
+        return self.residuals.shape[1] if self.stands_for is None else self.stands_for
+
+    @property
+    def curvature(self) -> NDArray[np.float64]:
+        """Products of the derivatives, summed over all residuals [n, d, d]."""
+        slopes = self.slopes
+        return np.einsum("nmi,nmj->nij", slopes, slopes) * (self.num_rows / slopes.shape[1])
 
     @property
     def slopes(self) -> NDArray[np.float64]:
@@ -146,6 +162,59 @@ class Problem:
         rmse_db = np.sqrt(np.mean(residuals[:, : objective.num_counted] ** 2, axis=1))
         value = np.sqrt(np.mean(residuals**2, axis=1))
         return Evaluation(value, residuals, jacobian, modelled, rmse_db)
+
+    def squares(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
+        """The same for who asks nothing of residuals but their squares and products.
+
+        Where links are parted into blocks, sums come from these, and as many residuals as there are parameters, and one
+        more, stand for those of all links.
+
+        Args:
+            points: The points [n, d].
+            derivatives: Whether the Jacobian is wanted.
+
+        Returns:
+            What an optimizer is told, if it is told no link's own residual.
+        """
+        if self._blocks is None:
+            return self.evaluate(points, derivatives)
+        reduced, shares = self._blocks
+        parameters, objective = self.parameters, self.objective
+        candidates = parameters.from_search(points)
+        found = total(reduced(candidates, derivatives), shares, len(objective.nuisance.columns))
+        products, links = objective.products(found)
+        count, width = objective.num_rows, products.shape[1]
+        unit = np.ones((len(points), width))
+        if derivatives:
+            unit[:, :-1] = parameters.search_slope(candidates)
+        products = products * unit[:, :, None] * unit[:, None, :]
+        if len(self.priors):
+            known = -objective.noise_db * self.priors.rows(candidates)[..., None]
+            if derivatives:
+                slopes = objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :-1]
+                known = np.concatenate([slopes, known], axis=2)
+            products = products + known.transpose(0, 2, 1) @ known
+            count += known.shape[1]
+        lost = ~np.isfinite(products[:, -1, -1])
+        made = rows(np.where(lost[:, None, None], 0.0, products)) * np.sqrt(width / count)
+        value, rmse_db = (
+            np.where(lost, np.inf, np.sqrt(np.maximum(square, 0.0) / number))
+            for square, number in ((products[:, -1, -1], count), (links, objective.num_counted))
+        )
+        jacobian = made[:, :, :-1] if derivatives else None
+        return Evaluation(value, -made[:, :, -1], jacobian, np.empty((len(points), 0)), rmse_db, count)
+
+    def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the engine answers to points of the search space [n, d]: that of every link [n, L]."""
+        return self.observable.modelled(self.engine, self.parameters.from_search(points))
+
+    @cached_property
+    def _blocks(self) -> tuple[Reduced, list[Share]] | None:
+        """What reduces path loss to sums where it arises, where links are parted into blocks."""
+        if not isinstance(self.engine, Parted) or self.observable is not PATH_LOSS:
+            return None
+        shares = self.objective.shares(self.engine.blocks)
+        return self.engine.reducing(shares), shares
 
     def residuals(
         self, candidates: NDArray[np.float64], modelled: NDArray[np.float64]

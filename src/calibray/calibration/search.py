@@ -124,7 +124,10 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
     """
     engine, trail = problem.engine, Trail()
     started, calls, hits = time.perf_counter(), engine.calls, _hits(engine)
-    for iteration, (points, told) in enumerate(rounds(optimizer, problem.evaluate), start=1):
+    # A method that takes residuals without derivatives makes a model of each.
+    each = "residuals" in optimizer.uses and not optimizer.needs_derivatives()
+    evaluate = problem.evaluate if each else problem.squares
+    for iteration, (points, told) in enumerate(rounds(optimizer, evaluate), start=1):
         trail.add(problem.parameters.from_search(points), told, iteration, time.perf_counter() - started)
         if not problem.differentiable:
             trail.modelled += list(told.modelled)
@@ -138,6 +141,8 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
             "every candidate lost the path of some link; exclude those links or use no_path = 'censor'"
         )
     trail.minima = optimizer.minima
+    if not len(trail.best_modelled):
+        trail.best_modelled = problem.modelled(optimizer.best.x[None])[0]
     return trail
 
 

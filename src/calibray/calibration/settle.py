@@ -11,6 +11,7 @@ from calibray.calibration.methods import AUTO, choose
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import Trail, search
 from calibray.engines.kinds.replay import ReplaySection, replay
+from calibray.engines.protocol import Parted
 from calibray.progress import Progress, staged
 
 
@@ -40,8 +41,11 @@ def settle(
     gap = None
     for turn in range(study.fidelity.rounds):
         materials = parameters.materials(trail.best, problem.engine.materials)
-        paths = setup.trace(materials, staged(progress, "checking"))
-        again = replay(setup, paths, section.compress_db)
+        told = staged(progress, "checking")
+        if isinstance(problem.engine, Parted):
+            again = problem.engine.traced_with(materials, told)
+        else:
+            again = replay(setup, setup.trace(materials, told), section.compress_db)
         gap = difference(again.path_loss(trail.best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db

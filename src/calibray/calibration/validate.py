@@ -214,7 +214,7 @@ def fitted_twins(part: Problem, known: NDArray[np.float64]) -> dict[str, tuple[P
     shifted = replace(part, objective=_with_term(objective, CONSTANT, setup))
     found = {BEFORE: (shifted, parameters.to_search(parameters.start)), CALIBRATED: (part, calibrated[0])}
     rows = objective.num_counted
-    noise = float(part.evaluate(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
+    noise = float(part.squares(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
     prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
     variants = {PRIOR: prior, SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))}
     if (per_tx := _per_transmitter(objective, setup)) is not None:
@@ -238,13 +238,13 @@ def _per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
 def _minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHES) -> NDArray[np.float64]:
     """Minima of a problem by local searches, the best first [k, d]."""
     search = LeastSquares(*problem.parameters.search_bounds, starts=searches, x0=known[:MINIMA])
-    for _ in rounds(search, problem.evaluate):
+    for _ in rounds(search, problem.squares):
         pass
     return search.minima
 
 
 def _at(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _predicted(problem.objective, problem.evaluate(point[None]).modelled[0])
+    return _predicted(problem.objective, problem.modelled(point[None])[0])
 
 
 def _predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:

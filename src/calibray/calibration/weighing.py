@@ -49,17 +49,17 @@ def weighed(problem: Problem, progress: Progress | None = None) -> Problem:
         )
     bounds = problem.parameters.search_bounds
     start = problem.parameters.to_search(problem.parameters.start)[None]
-    noise = float(problem.evaluate(start).rmse_db[0])
+    noise = float(problem.squares(start).rmse_db[0])
     for turn in range(ROUNDS):
         problem = replace(problem, objective=replace(problem.objective, noise_db=max(noise, 1e-3)))
         search = LeastSquares(*bounds, starts=SEARCHES if turn == 0 else 1, x0=start)
-        for _ in rounds(search, problem.evaluate):
+        for _ in rounds(search, problem.squares):
             pass
         start = search.minima[:SEARCHES]
         if progress is not None:
             progress("weighing", turn + 1, ROUNDS)
         before, links = noise, problem.objective.num_counted
-        noise = float(problem.evaluate(search.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
+        noise = float(problem.squares(search.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
         if abs(noise - before) <= SETTLED * before:
             break
     return replace(problem, objective=replace(problem.objective, noise_db=max(noise, 1e-3)))

@@ -27,11 +27,18 @@ def run(
         typer.Option(metavar="NAME", help="Engine in place of the study's: replay, retrace or command."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Programs of the engine 'command' that run at once here.")
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Processes here that blocks of links are shared out to, or programs of the engine 'command' at once.",
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run the engine 'command'."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler whose workers take blocks of links, or run the engine 'command'.",
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON instead of tables.")
@@ -46,7 +53,7 @@ def run(
     from calibray.calibration.methods import check_method
     from calibray.cli.progress import progress_bars
     from calibray.cli.sanity import warn
-    from calibray.engines import open_executor
+    from calibray.engines import open_crew, open_executor
     from calibray.files import check_outputs
     from calibray.result import FILES, tables
     from calibray.study import Study
@@ -58,7 +65,8 @@ def run(
     setup = study.opened()
     warn(study, setup.links)
     try:
-        with open_executor(workers, scheduler) as executor, progress_bars(log) as progress:
+        opened = open_crew if study.engine.parted else open_executor
+        with opened(workers, scheduler) as executor, progress_bars(log) as progress:
             result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
         typer.echo(_kept(out), err=True)

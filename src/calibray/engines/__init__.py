@@ -1,6 +1,7 @@
 """Engines: what turns candidates into path loss.
 
 - `Replay` evaluates stored paths: microseconds a candidate, with derivatives; `ReplayCarriers` at several carriers.
+- `Blocks` replays links in blocks, which live here or on the workers of a cluster; only sums come back.
 - `Retrace` runs the ray tracer anew for every candidate: the cost model of the paper, and replay's rival.
 - `Command` asks any external program.
 - `Recorded` puts a `Ledger` before one of the latter two, so that no RT call is paid for twice.
@@ -15,8 +16,10 @@ from typing import TYPE_CHECKING
 from calibray.lazy import lazily
 
 if TYPE_CHECKING:
+    from calibray.engines.blocks import Blocks as Blocks
     from calibray.engines.carriers import ReplayCarriers as ReplayCarriers
     from calibray.engines.command import Command as Command
+    from calibray.engines.crew import open_crew as open_crew
     from calibray.engines.ledger import LEDGER_FILE as LEDGER_FILE
     from calibray.engines.ledger import Ledger as Ledger
     from calibray.engines.ledger import open_ledger as open_ledger
@@ -41,10 +44,12 @@ _HOMES = {
     "Ledger": "calibray.engines.ledger",
     "Recorded": "calibray.engines.recorded",
     "Replay": "calibray.engines.replay",
+    "Blocks": "calibray.engines.blocks",
     "ReplayCarriers": "calibray.engines.carriers",
     "Retrace": "calibray.engines.retrace",
     "check_candidates": "calibray.engines.protocol",
     "make": "calibray.engines.making",
+    "open_crew": "calibray.engines.crew",
     "open_executor": "calibray.engines.pool",
     "open_ledger": "calibray.engines.ledger",
 }

@@ -11,11 +11,13 @@ from calibray.engines.kinds import KINDS
 from calibray.engines.ledger import Ledger
 from calibray.engines.protocol import Answering, Engine
 from calibray.engines.recorded import Recorded
+from calibray.engines.section import EngineSection
 from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
+    from calibray.engines.crew import Crew
     from calibray.study.model import Study
     from calibray.study.setup import Setup
 
@@ -25,7 +27,7 @@ def make(
     name: str | None = None,
     progress: Progress | None = None,
     ledger: str | Path | None = None,
-    executor: Executor | None = None,
+    executor: Executor | Crew | None = None,
     *,
     paths: Paths | None = None,
 ) -> Engine:
@@ -37,7 +39,8 @@ def make(
         progress: Called after every launch of a trace ("tracing"), or every RT call of a batch ("running").
         ledger: SQLite file to keep RT calls in. Replay has no use for it: finding an answer there takes longer
             than computing it.
-        executor: What runs the calls of a batch, for "command" only.
+        executor: What runs the calls of a batch, for "command" (`open_executor`); where blocks of links live, for
+            "replay" (`open_crew`).
         paths: Paths of the study's links for "replay"; traced, or taken from the cache, if None.
 
     Returns:
@@ -51,9 +54,9 @@ def make(
     name = setup.study.engine.name if name is None else name
     if name not in KINDS:
         raise InputError(f"engine {name!r}: must be one of {', '.join(KINDS)}")
-    if executor is not None and not KINDS[name].external:
+    if executor is not None and not _fits(KINDS[name], executor):
         raise InputError(
-            f"engine {name!r} runs in this process; --workers and --scheduler need engine 'command'"
+            f"engine {name!r} runs in this process; --workers and --scheduler need engine 'command' or 'replay'"
         )
     if name != setup.study.engine.name:
         setup = setup.replace(engine=name)
@@ -63,3 +66,7 @@ def make(
         return engine
     # Kinds whose calls are dear answer one by one.
     return Recorded(cast(Answering, engine), Ledger(ledger), fingerprint(setup), name, progress)
+
+
+def _fits(kind: type[EngineSection], executor: Executor | Crew) -> bool:
+    return kind.external if isinstance(executor, Executor) else kind.parted

@@ -6,12 +6,16 @@ import re
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib.util import find_spec
 from socket import create_connection, gaierror
 from time import monotonic, sleep
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 from calibray.errors import InputError
 from calibray.spelling import shortened
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 PATIENCE = 30
 """How long to wait for a scheduler [s]."""
@@ -53,10 +57,27 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[Executor]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("--scheduler needs Dask; install it with: pip install 'calibray[dask]'") from None
+    with open_client(scheduler) as client:
+        # A worker that dies gives its calls back to the scheduler, which gives them to others.
+        yield client.get_executor(pure=False)
+
+
+@contextmanager
+def open_client(scheduler: str) -> Iterator[Client]:
+    """Dask's client of a scheduler, closed at the end.
+
+    Args:
+        scheduler: Its address, for instance "tcp://10.0.0.1:8786".
+
+    Yields:
+        The client.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers.
+    """
+    _need_dask("--scheduler")
+    from distributed import Client
+
     _await_scheduler(scheduler)
     try:
         client = Client(scheduler, timeout=PATIENCE)
@@ -64,8 +85,39 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
     except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
         _refuse(scheduler, str(error))
     with client:
-        # A worker that dies gives its calls back to the scheduler, which gives them to others.
-        yield client.get_executor(pure=False)
+        yield client
+
+
+@contextmanager
+def open_local_client(workers: int) -> Iterator[Client]:
+    """Dask's client of worker processes on this machine, which end with it; each has its share of the cores.
+
+    Args:
+        workers: Their number.
+
+    Yields:
+        The client.
+
+    Raises:
+        InputError: The number is not positive, or Dask is not installed.
+    """
+    if workers < 1:
+        raise InputError(f"--workers {workers}: must be at least 1")
+    _need_dask("--workers")
+    from distributed import Client, LocalCluster
+
+    from calibray.engines.cores import Cores
+
+    # Blocks are as large as the study says, and a worker beyond some share of the memory would be ended by Dask.
+    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "memory_limit": 0}
+    with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster) as client:
+        client.register_plugin(Cores(workers))
+        yield client
+
+
+def _need_dask(option: str) -> None:
+    if find_spec("distributed") is None:
+        raise InputError(f"{option} needs Dask; install it with: pip install 'calibray[dask]'")
 
 
 def _await_scheduler(scheduler: str) -> None:

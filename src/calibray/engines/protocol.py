@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from threading import Event
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.parameters import Parameters
+from calibray.progress import Progress
 
 
 @runtime_checkable
@@ -57,6 +58,46 @@ class Differentiable(Engine, Protocol):
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
+        ...
+
+
+Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
+"""Path loss [n, l] of a block's links and its derivatives [n, l, d], if asked for, to what is wanted of them."""
+
+Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
+"""Candidates [n, d], and whether derivatives are taken, to what the reduction of every block gave."""
+
+
+@runtime_checkable
+class Parted(Differentiable, Protocol):
+    """An engine whose links are parted into blocks, which may live on other machines."""
+
+    @property
+    def blocks(self) -> Sequence[NDArray[np.int64]]:
+        """Links of every block; together they hold every link once."""
+        ...
+
+    def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
+        """What reduces the path loss of every block where that lives, so that only what is wanted of it comes back.
+
+        Args:
+            reductions: One for every block, sent there once.
+
+        Returns:
+            The function of candidates in the fields' units.
+        """
+        ...
+
+    def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Parted:
+        """The same engine on paths traced with other materials.
+
+        Args:
+            materials: Constants in place of the scene's, by material name.
+            progress: Called with the stage "tracing" whenever a block is traced.
+
+        Returns:
+            Another engine.
+        """
         ...
 
 

@@ -11,6 +11,7 @@ from calibray.engines.protocol import Engine
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
+    from calibray.engines.crew import Crew
     from calibray.paths import Paths
     from calibray.study.setup import Setup
 
@@ -25,11 +26,13 @@ class EngineSection(Section, ABC):
         name: The kind's name in study files.
         dear: Whether a call costs more than looking it up, so that calls are kept in a ledger.
         external: Whether a program outside answers, which needs no ray tracer here.
+        parted: Whether its links can be parted into blocks that live elsewhere.
     """
 
     name: str
     dear: ClassVar[bool]
     external: ClassVar[bool]
+    parted: ClassVar[bool] = False
 
     @abstractmethod
     def answers_by(self, setup: Setup) -> list[str] | None:
@@ -41,7 +44,11 @@ class EngineSection(Section, ABC):
 
     @abstractmethod
     def open(
-        self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
+        self,
+        setup: Setup,
+        paths: Paths | None,
+        progress: Progress | None,
+        executor: Executor | Crew | None,
     ) -> Engine:
         """The engine over all links of a study.
 
@@ -49,7 +56,8 @@ class EngineSection(Section, ABC):
             setup: The opened study.
             paths: Paths of its links that were traced already; traced, if the kind needs any, if None.
             progress: Called as the work goes on.
-            executor: What runs the calls of a batch; only for kinds that are `external`.
+            executor: What runs the calls of a batch, for kinds that are `external`; where blocks live, for kinds
+                that are `parted`.
 
         Returns:
             The engine.

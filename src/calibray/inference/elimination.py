@@ -29,6 +29,7 @@ class Elimination:
     Attributes:
         design: Its columns at the links that count [m, q].
         weighted: The same transposed, times the weights [q, m].
+        data: Their product, the normal equations of the data alone [q, q].
         normal: The normal equations, columns in the order of `order`.
         order: Place in the design of the columns of `normal` [q].
         lower: Lower bounds [q].
@@ -40,6 +41,7 @@ class Elimination:
 
     design: Matrix
     weighted: Matrix
+    data: sparse.csr_array
     normal: Arrowhead
     order: NDArray[np.int64]
     lower: NDArray[np.float64]
@@ -71,6 +73,7 @@ class Elimination:
         return cls(
             design=design.toarray() if small else design,
             weighted=weighted.toarray() if small else weighted,
+            data=data.tocsr(),
             normal=arrowhead,
             order=order,
             lower=nuisance.lower,
@@ -92,7 +95,21 @@ class Elimination:
         Raises:
             EngineError: No minimum within the bounds was found.
         """
-        side = (self.weighted @ gap.T).T[:, self.order]
+        return self.minimum((self.weighted @ gap.T).T)
+
+    def minimum(self, side: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The best coefficients from sums over the links.
+
+        Args:
+            side: Columns of the design times weights and gap [n, q].
+
+        Returns:
+            Coefficients [n, q]; see `coefficients`.
+
+        Raises:
+            EngineError: No minimum within the bounds was found.
+        """
+        side = side[:, self.order]
         found = np.empty_like(side)
         if self.separable:
             found[:, self.order] = side / np.where(self.normal.held, np.inf, self.normal.scale**2)
@@ -110,8 +127,19 @@ class Elimination:
         Returns:
             Derivatives of the coefficients with their sign changed [n, q, d].
         """
+        return self.followed(_products(self.weighted, slope), coefficients)
+
+    def followed(self, side: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same from sums over the links.
+
+        Args:
+            side: Columns of the design times weights and derivatives [n, q, d].
+            coefficients: The best coefficients [n, q].
+
+        Returns:
+            What `taken_up` gives [n, q, d].
+        """
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
-        side = _products(self.weighted, slope)
         taken = np.empty_like(side)
         taken[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
         return taken

@@ -46,6 +46,7 @@ def intervals(
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
     nuisances: int,
+    count: int | None = None,
 ) -> list[Interval]:
     """Confidence intervals of the parameters from the curvature of the sum of squares at the optimum.
 
@@ -59,6 +60,8 @@ def intervals(
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         nuisances: Number of offsets fitted beside the parameters.
+        count: Number of residuals that those given stand for, with the same sums of squares and products; their own
+            if None.
 
     Returns:
         One interval per parameter.
@@ -66,7 +69,7 @@ def intervals(
     # SciPy is for who computes intervals; a result that holds some is read without it.
     from scipy.special import stdtrit
 
-    freedom = max(len(residuals) - len(best) - nuisances, 1)
+    freedom = max((len(residuals) if count is None else count) - len(best) - nuisances, 1)
     reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # Student's t: standard errors either side
     variance = float(residuals @ residuals) / freedom
     values, vectors = np.linalg.eigh((scaled := jacobian * (upper - lower)).T @ scaled)

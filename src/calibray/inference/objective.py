@@ -11,6 +11,7 @@ of all rows; `rmse` remains the paper's, of the links alone. Without priors the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.inference.elimination import Elimination
 from calibray.inference.nuisance import Nuisance
+from calibray.inference.squares import Share, Sums
 from calibray.measurements import Measurements
 
 
@@ -168,6 +170,57 @@ class Objective:
         """
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
+
+    def shares(self, blocks: Sequence[NDArray[np.int64]]) -> list[Share]:
+        """What blocks of links need for their sums.
+
+        Args:
+            blocks: Links of every block.
+
+        Returns:
+            The share of every block.
+        """
+        weight, found = np.zeros(len(self.weight)), []
+        weight[self._counted] = self._scale**2
+        for block in blocks:
+            here = np.flatnonzero(weight[block] > 0)
+            links = block[here]
+            design = self.nuisance.design[links]
+            columns = np.unique(design.indices).astype(np.int64)
+            found.append(
+                Share(here, self.measured[links], weight[links], design[:, columns], columns, self.ceiling_db)
+            )
+        return found
+
+    def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Squares and products of residuals and their derivatives, from sums over the links that count.
+
+        Args:
+            sums: Sums over all links, by their `shares`.
+
+        Returns:
+            What the columns [derivatives, -residuals], rows of priors included, have as squares and products
+            [n, k, k], and the sum of squares of the links alone [n], [dB^2].
+
+        Raises:
+            EngineError: No minimum of the nuisance within its bounds was found.
+        """
+        if not self.nuisance.terms:
+            return sums.square, sums.square[:, -1, -1]
+        side = sums.side
+        best = self._elimination.minimum(side[..., -1])
+        taken = self._elimination.followed(side[..., :-1], best)
+        best = np.concatenate([taken, best[..., None]], axis=2)
+        crossed = best.transpose(0, 2, 1) @ side
+        inner = np.stack([each.T @ (self._elimination.data @ each) for each in best])
+        links = sums.square - crossed - crossed.transpose(0, 2, 1) + inner
+        held = best * self._ridge[:, None]
+        return links + held.transpose(0, 2, 1) @ held, links[:, -1, -1]
+
+    @property
+    def num_rows(self) -> int:
+        """Number of residuals: of the links that count, and of coefficients with a prior."""
+        return self.num_counted + int(np.count_nonzero(self._ridge > 0))
 
     @property
     def num_counted(self) -> int:

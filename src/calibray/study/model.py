@@ -188,6 +188,9 @@ class Study(Section):
         study._path, study._other_engines = Path(path), others
         return study
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_content, (self.content(), self._path.absolute())
+
     def __repr__(self) -> str:
         return glance.text(*summary(self))
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,10 +110,22 @@ class Setup:
         """
         return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
 
-    @cached_property
+    @property
     def tracer(self) -> Tracer:
         """The ray tracer with the scene at the study's carrier, loaded when first used."""
-        return self._tracer(self.scene, self.study.scene.frequency)
+        if "tracer" not in self._loaded:
+            self._loaded["tracer"] = self._tracer(self.scene, self.study.scene.frequency)
+        return self._loaded["tracer"]
+
+    @cached_property
+    def _loaded(self) -> dict[str, Tracer]:
+        """The tracer, once it is loaded, for all setups of one scene."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is sent to another process: all but what is loaded; files are found from another folder, too."""
+        here = {each.name: getattr(self, each.name) for each in fields(self)}
+        return here | {"scene": replace(self.scene, path=self.scene.path.absolute())}
 
     @cached_property
     def carriers(self) -> dict[float, dict[str, Material]]:
@@ -198,9 +210,8 @@ class Setup:
         return paths
 
     def _with_tracer(self, changed: Setup) -> Setup:
-        """A tracer that is loaded serves on: neither links nor methods have a say in it."""
-        if "tracer" in self.__dict__:
-            changed.__dict__["tracer"] = self.tracer
+        """A tracer serves on, whoever loads it: neither links nor methods have a say in it."""
+        changed.__dict__["_loaded"] = self._loaded
         return changed
 
     def _scene_at(self, frequency: float) -> Scene:

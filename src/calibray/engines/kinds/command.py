@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, cast, final
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -14,6 +14,7 @@ from calibray.progress import Progress
 
 if TYPE_CHECKING:
     from calibray.engines.command import Command
+    from calibray.engines.crew import Crew
     from calibray.paths import Paths
     from calibray.study.setup import Setup
 
@@ -64,7 +65,11 @@ class CommandSection(EngineSection):
         return list(self.command)
 
     def open(
-        self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
+        self,
+        setup: Setup,
+        paths: Paths | None,
+        progress: Progress | None,
+        executor: Executor | Crew | None,
     ) -> Command:
         """The program over a study's links; see `EngineSection.open`."""
         from calibray.engines.command import Command
@@ -88,7 +93,7 @@ class CommandSection(EngineSection):
             surroundings,
             setup.scene.materials,
             setup.parameters,
-            executor,
+            cast("Executor | None", executor),
             progress,
             source=str(study.path),
             carriers=setup.carriers,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, final
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, cast, final
 
 import numpy as np
 from pydantic import Field
@@ -13,10 +15,16 @@ from calibray.errors import InputError
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
+    from calibray.engines.blocks import Blocks
     from calibray.engines.carriers import ReplayCarriers
+    from calibray.engines.crew import Crew
     from calibray.engines.replay import Replay
+    from calibray.materials import Material
     from calibray.paths import Paths
     from calibray.study.setup import Setup
+
+BLOCK_LINKS: Final = 1000
+"""Links of a block where workers are given and the study does not say."""
 
 
 @final
@@ -26,22 +34,30 @@ class ReplaySection(EngineSection):
     Attributes:
         name: "replay".
         compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
+        block_links: Trace and replay the links in blocks of so many at most; all at once if None, or in blocks of
+            `BLOCK_LINKS` where workers are given.
     """
 
     dear: ClassVar[bool] = False
     external: ClassVar[bool] = False
+    parted: ClassVar[bool] = True
 
     # Sections are frozen, so that a narrower type is safe.
     name: Literal["replay"] = "replay"  # pyright: ignore[reportIncompatibleVariableOverride]
     compress_db: Annotated[float, Field(gt=0)] | None = None
+    block_links: Annotated[int, Field(ge=1)] | None = None
 
     def answers_by(self, setup: Setup) -> None:
         """Nothing: what is replayed is kept with the paths."""
         return
 
     def open(
-        self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
-    ) -> Replay | ReplayCarriers:
+        self,
+        setup: Setup,
+        paths: Paths | None,
+        progress: Progress | None,
+        executor: Executor | Crew | None,
+    ) -> Replay | ReplayCarriers | Blocks:
         """The replay of a study's links; see `EngineSection.open`.
 
         Raises:
@@ -49,6 +65,13 @@ class ReplaySection(EngineSection):
         """
         # Before anything is traced.
         self._check_compressible(setup)
+        if paths is None and (executor is not None or self.block_links is not None):
+            from calibray.engines.blocks import Blocks, cut
+            from calibray.engines.crew import Here
+
+            crew = Here() if executor is None else cast("Crew", executor)
+            blocks = cut(setup.links, self.block_links or BLOCK_LINKS)
+            return Blocks(crew, setup, blocks, partial(_traced, self.compress_db), progress=progress)
         return replay(setup, setup.trace(progress=progress) if paths is None else paths, self.compress_db)
 
     def _check_compressible(self, setup: Setup) -> None:
@@ -62,6 +85,12 @@ class ReplaySection(EngineSection):
                 f"{study.path}: engine.compress_db = {self.compress_db:g} needs objective.combining = 'power' and "
                 "a single carrier without coefficients of laws; remove it"
             )
+
+
+def _traced(
+    compress_db: float | None, setup: Setup, materials: Mapping[str, Material]
+) -> Replay | ReplayCarriers:
+    return replay(setup, setup.trace(materials), compress_db)
 
 
 def replay(setup: Setup, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:

@@ -11,6 +11,7 @@ from calibray.engines.section import EngineSection
 from calibray.progress import Progress
 
 if TYPE_CHECKING:
+    from calibray.engines.crew import Crew
     from calibray.engines.retrace import Retrace
     from calibray.paths import Paths
     from calibray.study.setup import Setup
@@ -35,7 +36,11 @@ class RetraceSection(EngineSection):
         return list(setup.factory.versions.values())
 
     def open(
-        self, setup: Setup, paths: Paths | None, progress: Progress | None, executor: Executor | None
+        self,
+        setup: Setup,
+        paths: Paths | None,
+        progress: Progress | None,
+        executor: Executor | Crew | None,
     ) -> Retrace:
         """The ray tracer over a study's links; see `EngineSection.open`."""
         from calibray.engines.retrace import CarrierTracer, Retrace
