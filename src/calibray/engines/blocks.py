@@ -201,7 +201,7 @@ class Blocks:
 
 
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Cut links into blocks of about equal numbers, with few transmitters each.
+    """Cut links into blocks of about equal numbers, with few positions to send rays from in each.
 
     Args:
         links: The links.
@@ -211,12 +211,13 @@ def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
         Links of every block, in ascending order.
 
     Example:
-        >>> links = Measurements(tx=[[0, 0, 9], [5, 0, 9]] * 2, rx=[[1, 1, 1]] * 4, path_loss_db=[80] * 4)
+        >>> links = Measurements(tx=[[0, 0, 9], [5, 0, 9]] * 2, rx=np.arange(12).reshape(4, 3), path_loss_db=[80] * 4)
         >>> [block.tolist() for block in cut(links, 2)]
         [[0, 2], [1, 3]]
     """
-    _, transmitter = np.unique(links.tx, axis=0, return_inverse=True)
-    order = np.argsort(transmitter.reshape(-1), kind="stable")
+    ends = (np.unique(end, axis=0, return_inverse=True) for end in (links.tx, links.rx))
+    _, place = min(ends, key=lambda found: len(found[0]))
+    order = np.argsort(place.reshape(-1), kind="stable")
     return [np.sort(part) for part in np.array_split(order, -(-len(order) // size))]
 
 
