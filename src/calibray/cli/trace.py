@@ -19,7 +19,9 @@ def trace(
     check: Annotated[
         bool,
         typer.Option(
-            "--check", help="Trace again with twice the samples and another seed, and tell what changes."
+            "--check",
+            help="Trace again with twice the samples and another seed, and tell what changes; where the samples are "
+            "'auto', tell what the last round of rays changed.",
         ),
     ] = False,
     overwrite: Overwrite = False,
@@ -49,8 +51,11 @@ def trace(
         if out is not None:
             paths.save(out)
         loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
-        found = convergence.check(tracer, links, paths, loss, staged(progress, "checking")) if check else None
+        again = check and not study.trace.adaptive
+        found = convergence.check(tracer, links, paths, loss, staged(progress, "checking")) if again else None
     typer.echo(render(report.found(paths, links.row, setup.enclosed)))
+    if check and study.trace.adaptive:
+        typer.echo("\n" + report.rounds(paths.settings, study.fidelity.tolerance_db))
     if found is not None:
         typer.echo("\n" + render(*report.convergence(found, links.row, study.fidelity.tolerance_db)))
     if out is not None:

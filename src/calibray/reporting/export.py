@@ -18,6 +18,7 @@ from calibray.materials import FIELDS
 from calibray.reporting.survey import survey
 from calibray.scenes import export_scene, read_scene
 from calibray.scenes.export import exported_id
+from calibray.tracing.settings import TraceSettings
 
 if TYPE_CHECKING:
     from calibray.result import Result
@@ -162,10 +163,16 @@ def _calibration(result: Result) -> dict[str, Any]:
         "bandwidth_hz": study.scene.bandwidth,
         "combining": study.objective.combining,
         "antennas": {"tx": asdict(tx), "rx": asdict(rx)},
-        "solver": {SOLVER.get(name, name): value for name, value in study.trace.record().items()},
+        "solver": {SOLVER.get(name, name): value for name, value in _numbered(study.trace).items()},
         "scattering_patterns": patterns,
         "offsets_db": result.offsets_db,
     }
+
+
+def _numbered(settings: TraceSettings) -> dict[str, object]:
+    """The switches with a number of rays: Sionna RT's own solver adds none in rounds."""
+    record: dict[str, object] = dict(settings.record())
+    return {**record, "samples": TraceSettings.samples} if settings.adaptive else record
 
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:

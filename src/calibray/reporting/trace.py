@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -55,6 +56,28 @@ def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float
     most = _most_changed(change, row)
     verdict = _verdict(change, len(row), tolerance_db)
     return (_overview(change, row), *([most] if most.rows else []), verdict)
+
+
+def rounds(settings: Mapping[str, object], tolerance_db: float) -> str:
+    """What the last round of a trace changed whose rays were added in rounds.
+
+    Args:
+        settings: How the paths were traced (`Paths.settings`).
+        tolerance_db: Change of a link's path loss that is let stand [dB].
+
+    Returns:
+        The verdict.
+    """
+    rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
+    if not rays:
+        return "Converged: only direct paths were looked for, and no ray is needed for them."
+    told = f"{rays:,} rays a position were sent out; the later half of them changed"
+    if change <= tolerance_db:
+        least = f"{max(change, 0.01):.2f}"
+        return (
+            f"Converged: {told} no link by more than {least} dB (fidelity.tolerance_db = {tolerance_db:g})."
+        )
+    return f"Not converged: {told} a link by {change:.2f} dB (fidelity.tolerance_db = {tolerance_db:g})."
 
 
 def _overview(change: Convergence, row: NDArray[np.int64]) -> Table:

@@ -117,9 +117,14 @@ def check(
         The change of every link.
 
     Raises:
-        InputError: `before` holds other links.
+        InputError: `before` holds other links, or its rays were added in rounds, of which the last one is the check.
         EngineError: There are more paths than the tracer can hold.
     """
     settings = tracer.settings
+    if settings.samples == "auto":
+        raise InputError(
+            "trace.samples = 'auto' has no trace with twice the rays: its last round is one; what it changed is "
+            "settings['last_round_db'] of the paths"
+        )
     finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=settings.seed + 1))
     return compare(before, finer.trace(links, progress), settings.samples, path_loss)

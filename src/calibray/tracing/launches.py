@@ -83,8 +83,8 @@ class Launches(Sequence[Launch]):
             return [self[place] for place in range(*index.indices(len(self)))]
         place, piece = divmod(range(len(self))[index], self._pieces)
         source, links = self._receivers[place]
-        first, end = (self._settings.samples * k // self._pieces for k in (piece, piece + 1))
-        seed, last = _seed(self._settings.seed, piece), piece == self._pieces - 1
+        first, end = (self._settings.rays * k // self._pieces for k in (piece, piece + 1))
+        seed, last = seed_of(self._settings.seed, piece), piece == self._pieces - 1
         return Launch(source, links, first, end - first, seed, last)
 
 
@@ -161,8 +161,10 @@ def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffe
         The launches.
     """
     depth = max(settings.max_depth, 1)
-    together = max(1, lanes // (settings.samples * depth))
-    pieces = min(settings.samples, -(-settings.samples * depth // lanes)) if settings.max_depth else 1
+    # Rays of several rounds look for no receiver: chains are found once for all of them.
+    samples, alone = settings.rays, settings.adaptive
+    together = len(source) if alone else max(1, lanes // (samples * depth))
+    pieces = min(samples, -(-samples * depth // lanes)) if settings.max_depth and not alone else 1
     positions, group = np.unique(source, axis=0, return_inverse=True)
     members = np.split(
         np.argsort(group.reshape(-1), kind="stable"), np.cumsum(np.bincount(group.reshape(-1)))[:-1]
@@ -172,14 +174,22 @@ def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffe
         for position, index in zip(positions, members, strict=True)
         for part in np.array_split(index, -(-len(index) // together))
     ]
-    rays = -(-settings.samples // pieces)
-    largest = rays * settings.max_depth * max(len(part) for _, part in receivers)
+    rays = -(-samples // pieces)
+    largest = rays * settings.max_depth * (1 if alone else max(len(part) for _, part in receivers))
     size = buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth)
     return Plan(Launches(receivers, settings, pieces), largest, size)
 
 
-def _seed(seed: int, piece: int) -> int:
-    """Seed of one of several launches to the same receivers; the first has the trace's own."""
+def seed_of(seed: int, piece: int) -> int:
+    """Seed of one of several launches to the same receivers; the first has the trace's own.
+
+    Args:
+        seed: Seed of the trace.
+        piece: Number of the launch.
+
+    Returns:
+        The seed.
+    """
     return seed if piece == 0 else int(np.random.SeedSequence([seed, piece]).generate_state(1)[0])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
-from typing import Final
+from typing import Final, Literal
 
 from calibray.errors import InputError
 from calibray.spelling import shortened
@@ -13,6 +13,11 @@ from calibray.tracing.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
+
+AUTO: Final = "auto"
+"""The number of rays is the tracer's to find."""
+ROUND: Final = 250_000
+"""Rays of one launch where rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
 """The numbers a trace may be given: no machine follows more, and Sionna RT's seeds have 32 bits."""
@@ -31,7 +36,8 @@ class TraceSettings:
         edge_diffraction: Let free edges diffract as well.
         diffraction_lit_region: Keep diffraction where the edge's source or image is in sight.
         diffuse_reflection: Follow diffuse reflections.
-        samples: Rays sent out per transmitter, 1 to 10^12.
+        samples: Rays sent out per transmitter, 1 to 10^12; or "auto": rays are added in rounds until path loss stands
+            still, without diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
@@ -46,7 +52,7 @@ class TraceSettings:
     edge_diffraction: bool = False
     diffraction_lit_region: bool = True
     diffuse_reflection: bool = False
-    samples: int = 1_000_000
+    samples: int | Literal["auto"] = 1_000_000
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -55,14 +61,32 @@ class TraceSettings:
                 if not isinstance(value, bool):
                     raise InputError(f"trace.{name} = {shortened(repr(value))}: must be true or false")
                 continue
+            if name == "samples" and value == AUTO:
+                continue
             least, most = RANGES[name]
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(
                     f"trace.{name} = {shortened(repr(value))}: must be a whole number of at least {least} and at most "
-                    f"{most:,}"
+                    f"{most:,}" + (", or 'auto'" if name == "samples" else "")
                 )
 
-    def record(self) -> dict[str, int | bool]:
+        if self.diffuse_reflection and self.adaptive:
+            raise InputError(
+                "trace.samples = 'auto' looks for paths until there are no more, but diffuse reflection is an average "
+                "over rays; give a number, or diffuse_reflection = false"
+            )
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether rays are added until path loss stands still."""
+        return self.samples == AUTO
+
+    @property
+    def rays(self) -> int:
+        """Rays per transmitter; those of one round where rays are added in rounds."""
+        return ROUND if self.samples == "auto" else self.samples
+
+    def record(self) -> dict[str, int | bool | str]:
         """The settings by name, for files and digests."""
         return asdict(self)
 

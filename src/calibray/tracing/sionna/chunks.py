@@ -14,7 +14,7 @@ from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.paths import Kind
-from calibray.tracing.launches import Launch, directions, repeated
+from calibray.tracing.launches import repeated
 from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
 
 
@@ -29,21 +29,19 @@ class Chunk:
 
 
 @contextmanager
-def share_of_rays(launch: Launch, samples: int) -> Iterator[None]:
-    """Let Sionna take a launch's share of the lattice of all rays in place of a lattice of its own.
+def rays_towards(square: NDArray[np.float64] | None) -> Iterator[None]:
+    """Let Sionna send its rays into directions of ours in place of a lattice of its own.
 
     Args:
-        launch: The launch.
-        samples: Number of all rays.
+        square: The directions, as points of the unit square [2, rays]; Sionna's own if None.
 
     Yields:
-        Nothing; the share is taken as long as the context is open.
+        Nothing; they are taken as long as the context is open.
     """
     whole = sb_deterministic.fibonacci_lattice
-    if launch.rays < samples:
-        share = directions(launch.first, launch.rays, samples)
+    if square is not None:
         sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(
-            *(aligned(axis, np.float32) for axis in share)
+            *(aligned(axis, np.float32) for axis in square)
         )
     try:
         yield

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ class Trace:
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
         chunks: The paths.
+        told: What the search tells, for the record.
     """
 
     tracer: Tracer
@@ -34,12 +35,14 @@ class Trace:
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     chunks: tuple[Chunk, ...]
+    told: Mapping[str, object] = field(default_factory=dict)
 
     def paths(self) -> Paths:
         """Compile the paths, ordered by link."""
-        return concatenate(
+        paths = concatenate(
             [self.tracer.compile(chunk, self.tx, self.rx, self.materials) for chunk in self.chunks]
         )
+        return replace(paths, settings={**paths.settings, **self.told})
 
     def link(self) -> NDArray[np.integer]:
         """Link of every path, non-decreasing [P]."""

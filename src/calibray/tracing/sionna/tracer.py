@@ -22,6 +22,7 @@ import sionna.rt as rt
 from numpy.typing import NDArray
 from sionna.rt.path_solvers.field_calculator import FieldCalculator
 from sionna.rt.path_solvers.image_method import ImageMethod
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
@@ -34,15 +35,16 @@ from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
-from calibray.tracing.launches import Launch, Plan, paths_that_fit, plan, starts_at_receivers
+from calibray.tracing.launches import Launch, Plan, directions, paths_that_fit, plan, starts_at_receivers
 from calibray.tracing.memory import available
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
-from calibray.tracing.sionna.chunks import Chunk, share_of_rays, without_repeats
+from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_repeats
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.reciprocity import turned_around
+from calibray.tracing.sionna.rounds import search
 from calibray.tracing.sionna.stored import Trace
 
 LANES: Final = 20_000_000
@@ -188,14 +190,17 @@ class Tracer:
         ends = tx if backwards else rx
         constants = self.give(materials or {})
         room = paths_that_fit(available(), self.settings.max_depth)
+        if self.settings.adaptive:
+            found, told = search(self, self.plan(links), (tx, rx), backwards, room, progress)
+            return Trace(self, constants, tx, rx, found, told)
         chunks: list[Chunk] = []
         pieces: list[Chunk] = []
-        found = done = 0
+        count = done = 0
         if progress is not None:
             progress("tracing", 0, len(rx))
         for launch in self.plan(links).launches:
-            pieces.append(self._trace_launch(launch, ends[launch.links], room - found, backwards))
-            found += len(pieces[-1].link)
+            pieces.append(self._trace_launch(launch, ends[launch.links], room - count, backwards))
+            count += len(pieces[-1].link)
             if launch.last:
                 chunks += without_repeats(pieces)
                 pieces = []
@@ -203,6 +208,11 @@ class Tracer:
             if progress is not None:
                 progress("tracing", done, len(rx))
         return Trace(self, constants, tx, rx, tuple(chunks))
+
+    @property
+    def mitsuba(self) -> Any:
+        """The scene that Mitsuba holds."""
+        return mitsuba_scene(self._scene)
 
     def give(self, materials: Mapping[str, Material]) -> dict[str, Material]:
         """Give Sionna's materials the scene's constants, some of them replaced.
@@ -261,57 +271,103 @@ class Tracer:
     def _trace_launch(
         self, launch: Launch, targets: NDArray[np.float64], room: int, backwards: bool
     ) -> Chunk:
-        settings, size = self.settings, BUFFER
-        # A path a lane, and the direct ones.
-        most = (launch.rays * settings.max_depth + 1) * len(targets) + 2
+        samples = self.settings.rays
+        share = directions(launch.first, launch.rays, samples) if launch.rays < samples else None
         src, tgt = points(launch.source[None]), points(targets)
+        direct = self.settings.line_of_sight and launch.first == 0
+        with rays_towards(share):
+            buffer = self.candidates(self.mitsuba, src, tgt, launch.rays, launch.seed, direct, BUFFER, room)
+        if backwards:
+            buffer, src, tgt = turned_around(buffer, tgt), tgt, src
+        self.settle(buffer, src, tgt)
+        end = buffer.source_indices if backwards else buffer.target_indices
+        return Chunk(buffer, src, tgt, launch.links[np.array(end, dtype=np.int64)])
+
+    def candidates(
+        self,
+        scene: Any,
+        source: mi.Point3f,
+        targets: mi.Point3f,
+        rays: int,
+        seed: int,
+        direct: bool,
+        size: int,
+        room: int,
+    ) -> PathsBuffer:
+        """Send out rays, and keep what may be a path.
+
+        Args:
+            scene: Mitsuba's scene, or what answers as it does.
+            source: Where the rays start.
+            targets: Where paths are to end.
+            rays: Number of rays.
+            seed: Seed of the random numbers.
+            direct: Whether direct paths are looked for.
+            size: Candidates that the buffer holds at first.
+            room: Candidates that fit into memory.
+
+        Returns:
+            The candidates.
+
+        Raises:
+            EngineError: There are more than fit into memory.
+        """
+        settings, count = self.settings, dr.width(targets)
+        # A path a lane, and the direct ones.
+        most = (rays * settings.max_depth + 1) * count + 2
         while True:
-            with share_of_rays(launch, settings.samples):
-                buffer = self._candidates(
-                    mi_scene=mitsuba_scene(self._scene),
-                    src_positions=src,
-                    tgt_positions=tgt,
-                    samples_per_src=launch.rays,
-                    max_num_paths_per_src=size,
-                    max_depth=settings.max_depth,
-                    los=settings.line_of_sight and launch.first == 0,
-                    specular_reflection=settings.specular_reflection,
-                    diffuse_reflection=settings.diffuse_reflection,
-                    refraction=settings.refraction,
-                    diffraction=settings.diffraction,
-                    edge_diffraction=settings.edge_diffraction,
-                    seed=launch.seed,
-                )
-                buffer.schedule()
-                dr.eval()
-            count = int(np.array(buffer.paths_counter).item())
-            if count > room:
+            buffer = self._candidates(
+                mi_scene=scene,
+                src_positions=source,
+                tgt_positions=targets,
+                samples_per_src=max(rays, 1),
+                max_num_paths_per_src=size,
+                max_depth=settings.max_depth if rays else 0,
+                los=direct,
+                specular_reflection=settings.specular_reflection,
+                diffuse_reflection=settings.diffuse_reflection,
+                refraction=settings.refraction,
+                diffraction=settings.diffraction,
+                edge_diffraction=settings.edge_diffraction,
+                seed=seed,
+            )
+            buffer.schedule()
+            dr.eval()
+            found = int(np.array(buffer.paths_counter).item())
+            if found > room:
                 raise EngineError(
-                    f"more paths than fit into memory, with {len(targets)} receivers at work; "
+                    f"more paths than fit into memory, with {count} receivers at work; "
                     "lower trace.samples or trace.max_depth, or trace fewer links at once"
                 )
-            if count < size - 1:
+            if found < size - 1:
                 break
             size = min(4 * size, most)
         buffer.shrink()
         buffer.detach_geometry()
-        if backwards:
-            buffer, src, tgt = turned_around(buffer, tgt), tgt, src
-        if buffer.buffer_size:
-            buffer = self._images(
-                scene=mitsuba_scene(self._scene),
-                paths=buffer,
-                src_positions=src,
-                tgt_positions=tgt,
-                diffraction=settings.diffraction,
-                diffraction_lit_region=settings.diffraction_lit_region,
-            )
-            buffer.discard_invalid()
-            buffer.schedule()
-            # At once: what is left to be computed would hold on to all candidates and the whole buffer.
-            dr.eval()
-        end = buffer.source_indices if backwards else buffer.target_indices
-        return Chunk(buffer, src, tgt, launch.links[np.array(end, dtype=np.int64)])
+        return buffer
+
+    def settle(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> None:
+        """Compute the geometry of candidates by the method of images, and leave those that are paths.
+
+        Args:
+            buffer: The candidates; changed.
+            source: Where their sources stand.
+            target: Where their targets stand.
+        """
+        if not buffer.buffer_size:
+            return
+        self._images(
+            scene=mitsuba_scene(self._scene),
+            paths=buffer,
+            src_positions=source,
+            tgt_positions=target,
+            diffraction=self.settings.diffraction,
+            diffraction_lit_region=self.settings.diffraction_lit_region,
+        )
+        buffer.discard_invalid()
+        buffer.schedule()
+        # At once: what is left to be computed would hold on to all candidates and the whole buffer.
+        dr.eval()
 
     def compile(
         self,
@@ -374,7 +430,7 @@ class Tracer:
             kind=kind,
             material=material[of_path].reshape(count, depth),
             probability=np.array(buffer.probs, dtype=float).reshape(count, depth),
-            samples=self.settings.samples,
+            samples=self.settings.rays,
             edge=wedge[0],
             normal_n=wedge[1],
             edge_lengths=wedge[2],
@@ -397,7 +453,7 @@ class Tracer:
         found: Any = self._fields(
             wavelength=self._scene.wavelength,
             paths=buffer,
-            samples_per_src=self.settings.samples,
+            samples_per_src=self.settings.rays,
             diffraction=self.settings.diffraction,
             src_positions=chunk.source,
             tgt_positions=chunk.target,
