@@ -27,6 +27,7 @@ bench: setup
 	$(BIN)/python benchmarks/interactions.py
 	$(BIN)/python benchmarks/nuisance.py
 	$(BIN)/python benchmarks/diffuse.py
+	$(BIN)/python benchmarks/launches.py
 
 docs: setup site
 	$(BIN)/python tools/check_docs.py

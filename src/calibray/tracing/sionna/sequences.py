@@ -169,7 +169,7 @@ def possible(
             goal = dr.gather(mi.Point3f, aim, at) + dr.gather(mi.Point3f, slide, at) * mi.Point3f(place)
             n, d = dr.gather(mi.Point3f, normal, at), dr.gather(mi.Float, offset, at)
             near, far = dr.dot(n, vertex) - d, dr.dot(n, goal) - d
-            point = vertex + (goal - vertex) * (near / (near - far))
+            point = vertex + (goal - vertex) * mi.Point3f(near / (near - far))
             inside = dr.all(point >= dr.gather(mi.Point3f, low, at)) & dr.all(
                 point <= dr.gather(mi.Point3f, high, at)
             )
