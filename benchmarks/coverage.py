@@ -7,7 +7,10 @@
 Every repetition draws a truth for each parameter evenly from its search range, makes path losses of it, adds the errors
 of its world, and calibrates as `calibray run` does, from fewer starting points. Nothing is told of the world: every
 study has the defaults. A row tells how often the interval held the truth, over all repetitions and where the verdict
-was "identified" or "weakly identified", and how often the verdict was "not identifiable".
+was "identified" or "weakly identified", and how often the verdict was "not identifiable". Beside stands what the same
+draws tell where the noise is known as it was made: that posterior holds its share of truths by
+definition, so that what it held is the luck of the repetitions, and its width the narrowest that may be claimed. Where
+buildings differ there is no such posterior.
 
 Each repetition is a line of the file `--out`; a run that was stopped goes on where it stood, and `--repetitions 0`
 prints the tables of what is there. The last rows are the negative control, the same posterior with the noise
@@ -28,15 +31,19 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.distance import cdist
+from scipy.stats import norm
+from scipy.stats import t as student
 
 import districts
 from calibray.calibration.certainty import certainty
+from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
 from calibray.inference.credible import credible
+from calibray.inference.posterior import Draws
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, markdown, numbers
 from calibray.tables.text import render
@@ -62,10 +69,14 @@ def _plain(district: District, truth: np.ndarray, random: np.random.Generator) -
 
 
 def _correlated(district: District, truth: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    factor = _factor(district)
+    return district.path_loss(truth) + NOISE_DB * factor @ random.standard_normal(len(factor))
+
+
+def _factor(district: District) -> np.ndarray:
     links = district.problem.setup.links
     place = np.hstack([links.rx, links.tx])
-    factor = np.linalg.cholesky(np.exp(-cdist(place, place) / RANGE_M) + 1e-9 * np.eye(len(place)))
-    return district.path_loss(truth) + NOISE_DB * factor @ random.standard_normal(len(place))
+    return np.linalg.cholesky(np.exp(-cdist(place, place) / RANGE_M) + 1e-9 * np.eye(len(place)))
 
 
 def _buildings(district: District, truth: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -95,6 +106,37 @@ WORLDS: dict[str, World] = {
     "outliers": _outliers,
     "student-t": _student,
 }
+
+
+def _whole(district: District, left: np.ndarray, mean: float = 0.0) -> np.ndarray:
+    return norm.logpdf(left, mean, NOISE_DB).sum(axis=1)
+
+
+def _shared(district: District, left: np.ndarray) -> np.ndarray:
+    white = np.linalg.solve(_factor(district), left.T)
+    return -0.5 * np.sum(white**2, axis=0) / NOISE_DB**2
+
+
+def _mixed(district: District, left: np.ndarray) -> np.ndarray:
+    parts = norm.logpdf(left, 0.0, NOISE_DB), norm.logpdf(left, OUTLIER_DB, NOISE_DB)
+    return np.logaddexp(np.log(1 - OUTLIERS) + parts[0], np.log(OUTLIERS) + parts[1]).sum(axis=1)
+
+
+def _tailed(district: District, left: np.ndarray) -> np.ndarray:
+    return student.logpdf(left, FREEDOM, scale=NOISE_DB * np.sqrt((FREEDOM - 2) / FREEDOM)).sum(axis=1)
+
+
+KNOWN: dict[str, Callable[[District, np.ndarray], np.ndarray]] = {
+    "random": _whole,
+    "correlated": _shared,
+    "offset": lambda district, left: _whole(district, left, OFFSET_DB),
+    "outliers": _mixed,
+    "student-t": _tailed,
+}
+"""Logarithm of the density of measured less modelled path loss [n, L] as the world makes it, but for a constant."""
+
+FAR: Final = 30.0
+"""Draws whose density is lower by this, in its logarithm, count for nothing."""
 
 
 @cache
@@ -134,16 +176,22 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     draws, found = told.posterior, []
     if draws is None:
         raise RuntimeError(f"{name}, {world}, {turn}: no draws; {told.remarks}")
+    known_weight = _known(district, world, problem, draws) if known.all() else None
     narrow = draws.weight * np.exp((UNDERSTATED - 1) * (draws.density - draws.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
         value = draws.point[:, k]
         sets = {str(level): credible(value, draws.weight, lower[k], upper[k], level) for level in LEVELS}
         control = credible(value, narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
+        luck = None
+        if known_weight is not None:
+            alike = credible(value, known_weight, lower[k], upper[k], LEVELS[0])
+            luck = {"held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])}
         found.append({
             "name": parameter,
             "verdict": told.intervals[parameter].verdict,
             "held": {level: bool(_holds(pieces, point[k])) for level, pieces in sets.items()},
-            "width": sum(high - low for low, high in sets["0.9"]) / (upper[k] - lower[k]),
+            "width": _width(sets["0.9"]) / (upper[k] - lower[k]),
+            "known": luck,
             "control": bool(_holds(control, point[k])),
         })  # fmt: skip
     return {
@@ -151,6 +199,23 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
         "noise": told.noise, "effective": draws.effective, "calls": told.calls,
         "seconds": time.process_time() - started,
     }  # fmt: skip
+
+
+def _known(district: District, world: str, problem: Problem, draws: Draws) -> np.ndarray | None:
+    """Weights of the draws where the noise is known as it was made [n]; None where it cannot be."""
+    if world not in KNOWN:
+        return None
+    near = np.flatnonzero(draws.density > draws.density.max() - FAR)
+    left = problem.objective.measured - problem.evaluate(draws.point[near]).modelled
+    found = np.full(len(draws.weight), -np.inf)
+    # Draws stand for a density: another one stands beside it by its ratio.
+    found[near] = np.log(draws.weight[near]) - draws.density[near] + KNOWN[world](district, left)
+    weight = np.exp(found - found.max())
+    return weight / weight.sum()
+
+
+def _width(pieces: tuple[tuple[float, float], ...]) -> float:
+    return sum(high - low for low, high in pieces)
 
 
 def _holds(pieces: tuple[tuple[float, float], ...], value: float) -> bool:
@@ -236,8 +301,9 @@ def tables(lines: list[dict[str, Any]]) -> list[Table]:
 def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
     columns = (
         Column("world"), Column("parameter"), numbers("repetitions"), numbers("90 % held"), numbers("95 % held"),
-        numbers("identified"), numbers("90 % held there"), numbers("95 % held there"), numbers("not identifiable"),
-        numbers("median width"), numbers("control, 90 %"),
+        numbers("noise known, 90 %"), numbers("identified"), numbers("90 % held there"), numbers("95 % held there"),
+        numbers("noise known, 90 % there"), numbers("not identifiable"), numbers("median width"),
+        numbers("by that, noise known"), numbers("control, 90 %"),
     )  # fmt: skip
     rows = []
     for world in dict.fromkeys(line["world"] for line in lines):
@@ -247,13 +313,25 @@ def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
             told = [entry for entry in mine if entry["verdict"] in ("identified", "weakly identified")]
             blind = np.mean([entry["verdict"] == "not identifiable" for entry in mine])
             rows.append((
-                world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), str(len(told)),
-                _share(told, "0.9"), _share(told, "0.95"), f"{blind:.2f}",
-                f"{np.median([entry['width'] for entry in mine]):.2f}",
+                world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), _lucky(mine), str(len(told)),
+                _share(told, "0.9"), _share(told, "0.95"), _lucky(told), f"{blind:.2f}",
+                f"{np.median([entry['width'] for entry in mine]):.2f}", _wider(mine),
                 f"{np.mean([entry['control'] for entry in told]):.2f}" if told and world == "random" else "-",
             ))  # fmt: skip
     seconds = sum(line["seconds"] for line in lines) / max(len(lines), 1)
     return Table(f"{title}: {len(lines)} repetitions, {seconds:.1f} s of CPU each", columns, tuple(rows))
+
+
+def _lucky(entries: list[dict[str, Any]]) -> str:
+    """How often the posterior held the truth whose noise is known."""
+    known = [entry["known"]["held"] for entry in entries if entry.get("known")]
+    return f"{np.mean(known):.2f}" if known else "-"
+
+
+def _wider(entries: list[dict[str, Any]]) -> str:
+    """Median of the widths by those of the posterior whose noise is known."""
+    ratio = [entry["width"] / entry["known"]["width"] for entry in entries if entry.get("known")]
+    return f"{np.median(ratio):.2f}" if ratio else "-"
 
 
 def _share(entries: list[dict[str, Any]], level: str) -> str:
