@@ -31,6 +31,7 @@ bench: setup
 
 docs: setup site
 	$(BIN)/python tools/check_docs.py
+	$(BIN)/python tools/run_docs.py
 
 # Fails on a link that leads nowhere; nothing is fetched, and the pages load nothing from elsewhere.
 site: $(VENV)/.docs

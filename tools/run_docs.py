@@ -1,0 +1,261 @@
+"""Run every command of Calibray that the documentation prints, page by page, in folders that hold what a reader has.
+
+Usage: `python tools/run_docs.py [PAGE...]`, for instance `python tools/run_docs.py README.md docs/index.md`. What fails
+is printed with its messages, and the exit status is 1; so is it where a page prints commands that nothing is prepared
+for. Commands that take hours or measured data are named here, with the reason.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import osmium
+import pandas as pd
+import pyogrio
+import rasterio
+import shapely
+from rasterio.transform import from_bounds
+
+import calibray as cb
+from calibray.scenarios.district import Building, building_meshes
+from calibray.scenes.meshes import Mesh, MeshObject, joined, write_scene
+from calibray.study import Setup, Study
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+TOWN = EXAMPLES / "bring_your_own"
+CALIBRAY = Path(sys.executable).with_name("calibray")
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")]
+AT_ONCE = 2  # pages
+LIMIT = 900.0  # for one command [s]
+
+_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_STUDY = re.compile(r"^```toml\n(version = 1\n.*?)^```", re.MULTILINE | re.DOTALL)
+_TYPED = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(calibray .*|cd .*)$")
+
+LEFT_OUT = {
+    "calibray run examples/nist_boulder.toml": "measured data is no part of the repository",
+    "calibray run examples/auckland_tower.toml": "measured data is no part of the repository",
+    "calibray validate examples/nist_boulder.toml": "measured data is no part of the repository",
+    "calibray compare study.toml": "25 runs of four methods take an hour; tests/test_comparison.py runs a small one",
+    "calibray compare --family": "20 problems take an hour; tests/test_comparison_family.py runs a small one",
+}
+"""How commands begin that are not run, and why."""
+
+
+def nothing(folder: Path) -> None:
+    """The page's commands need no file."""
+
+
+def repository(folder: Path) -> None:
+    """A clone, and links to predict at in the town that is calibrated on its way."""
+    shutil.copytree(EXAMPLES, folder / "examples")
+    town(folder / "examples" / "bring_your_own")
+
+
+def town(folder: Path) -> None:
+    """The example town; of its log one phone at every fourth stop, so that it takes seconds."""
+    shutil.copytree(TOWN, folder, dirs_exist_ok=True)
+    log = pd.read_csv(TOWN / "rsrp.csv")
+    stop = log.groupby(["longitude", "latitude"], sort=False).ngroup()
+    log[(stop % 4 == 0) & (log["device"] == "phone-a")].to_csv(folder / "rsrp.csv", index=False)
+    new_links(folder / "new-links.csv", (20.0, 10.0, 6.0), cell="cell-1", device="phone-a")
+
+
+def flat(folder: Path) -> None:
+    """The example flat."""
+    shutil.copytree(TOWN / "flat", folder, dirs_exist_ok=True)
+
+
+def hill(folder: Path) -> None:
+    """The example hill."""
+    shutil.copytree(TOWN / "hill", folder, dirs_exist_ok=True)
+
+
+def maps(folder: Path) -> None:
+    """The town's map as an extract, the hill's houses as a package, ground that rises, the flat in millimetres."""
+    with osmium.SimpleWriter(str(folder / "town.osm.pbf")) as writer:
+        for thing in osmium.FileProcessor(str(TOWN / "town.osm")):
+            writer.add(thing)
+    west, south, east, north = 9.985, 50.006, 9.995, 50.014
+    ground = np.linspace(100.0, 104.0, 40)[:, None] * np.ones(40)
+    with rasterio.open(
+        folder / "dem.tif", "w", driver="GTiff", width=40, height=40, count=1, dtype="float64", crs="EPSG:4326",
+        transform=from_bounds(west, south, east, north, 40, 40),
+    ) as raster:  # fmt: skip
+        raster.write(ground, 1)
+    houses = json.loads((TOWN / "hill" / "houses.geojson").read_text())["features"]
+    shapes = np.array([shapely.from_geojson(json.dumps(house["geometry"])) for house in houses])
+    heights = np.array([float(house["properties"]["height_m"]) for house in houses])
+    pyogrio.raw.write(
+        folder / "blocks.gpkg", shapely.to_wkb(shapes), [heights], ["height_m"], geometry_type="Polygon",
+        crs="EPSG:4326",
+    )  # fmt: skip
+    plan = pd.read_csv(TOWN / "flat" / "plan.csv")
+    plan[["x0", "y0", "x1", "y1", "thickness"]] *= 1000.0
+    plan.replace({"type": {"plasterboard": "drywall"}}).to_csv(folder / "flat.csv", index=False)
+
+
+def own_scene(folder: Path) -> None:
+    """The study that README prints, houses along a street, and links simulated on them with 1 dB of noise."""
+    houses = [
+        Building(f"house-{number}", np.array([0.0, side]) + box(28.0 * number - 14.0), 12.0, 0.0)
+        for number in range(7)
+        for side in (10.0, -20.0)
+    ]
+    walls = joined(building_meshes(house)[0] for house in houses)
+    ground = Mesh(
+        np.array([[-60.0, -60, 0], [220, -60, 0], [220, 60, 0], [-60, 60, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    constants = {"relative_permittivity": 5.0, "conductivity": 0.3, "thickness": 0.3}
+    objects = [MeshObject("houses", "walls", walls), MeshObject("plane", "ground", ground)]
+    write_scene(folder / "scene", objects, {"walls": constants, "ground": constants})
+    (folder / "study.toml").write_text(_STUDY.findall((ROOT / "README.md").read_text(encoding="utf-8"))[0])
+    random = np.random.default_rng(0)
+    table = pd.DataFrame({"rx_x_m": random.uniform(15.0, 170.0, 40), "rx_y_m": random.uniform(-8.0, 8.0, 40)})
+    table.assign(path_loss_db=100.0).to_csv(folder / "links.csv", index=False)
+    loss = cb.path_loss(Setup.open(Study.load(folder / "study.toml")).trace())
+    table.assign(path_loss_db=loss + 3.0 + random.normal(0.0, 1.0, 40)).to_csv(
+        folder / "links.csv", index=False
+    )
+    new_links(folder / "new-links.csv", (0.0, 0.0, 2.5))
+
+
+def box(west: float) -> np.ndarray:
+    """Footprint of a house, 18 m by 10 m [4, 2], [m]."""
+    return np.array([[west, 0.0], [west + 18.0, 0.0], [west + 18.0, 10.0], [west, 10.0]])
+
+
+def new_links(file: Path, tx: tuple[float, float, float], **labels: str) -> None:
+    """Write links to predict at: one transmitter, five receivers in a row."""
+    along = np.linspace(2.0, 12.0, 5)
+    table = pd.DataFrame(dict(zip(("tx_x", "tx_y", "tx_z"), tx, strict=True)), index=range(5))
+    table.assign(rx_x=tx[0] + along, rx_y=tx[1], rx_z=1.5, **labels).to_csv(file, index=False)
+
+
+PREPARED: dict[str, tuple[Callable[[Path], None], ...]] = {
+    "README.md": (own_scene,),
+    "docs/index.md": (repository,),
+    "docs/install.md": (nothing,),
+    "docs/bring-your-own.md": (town, flat, hill),
+    "docs/scenes.md": (maps,),
+    "docs/choosing-a-method.md": (nothing,),
+    "docs/case-studies/boulder.md": (repository,),
+    "docs/case-studies/auckland.md": (repository,),
+    "examples/README.md": (repository,),
+    "examples/octave_canyon/README.md": (repository,),
+}
+"""What a page's reader has: one preparation for all its blocks, or one for each."""
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A command, and how it ended.
+
+    Attributes:
+        page: The page that prints it.
+        command: The command.
+        seconds: Time that it took.
+        failure: What it said where it failed; empty if it succeeded.
+        reason: Why it was not run; empty if it was.
+    """
+
+    page: str
+    command: str
+    seconds: float = 0.0
+    failure: str = ""
+    reason: str = ""
+
+
+def commands(text: str) -> list[list[str]]:
+    """The commands of every block of code of a page that has any, lines that go on in the next one joined."""
+    shell = (block for language, block in _BLOCK.findall(text) if language in {"", "sh"})
+    blocks = (re.sub(r"\\\n\s*", "", block).splitlines() for block in shell)
+    typed = ([match[1] for line in block if (match := _TYPED.match(line))] for block in blocks)
+    return [block for block in typed if any(command.startswith("calibray") for command in block)]
+
+
+def run_page(page: str, blocks: list[list[str]]) -> Iterator[Ran]:
+    """Run the commands of a page one after the other, as a reader would.
+
+    Args:
+        page: The page, from the repository's root.
+        blocks: Its commands, block by block.
+
+    Yields:
+        How each ended.
+    """
+    prepared = PREPARED.get(page, ())
+    if len(prepared) not in {1, len(blocks)}:
+        yield Ran(
+            page, blocks[0][0], failure="nothing is prepared for this page: see PREPARED of tools/run_docs.py"
+        )
+        return
+    with tempfile.TemporaryDirectory(prefix="calibray-docs-") as name:
+        place = Path(name)
+        for number, block in enumerate(blocks):
+            if number < len(prepared):
+                place = Path(name) / f"block-{number}"
+                place.mkdir()
+                prepared[number](place)
+            for command in block:
+                if command.startswith("cd "):
+                    place /= command.removeprefix("cd ")
+                else:
+                    yield run(page, command, place)
+
+
+def run(page: str, command: str, place: Path) -> Ran:
+    """Run a command in a folder, unless it is left out."""
+    for start, reason in LEFT_OUT.items():
+        if command.startswith(start):
+            return Ran(page, command, reason=reason)
+    words, began = shlex.split(command, comments=True), time.monotonic()
+    try:
+        ended = subprocess.run(
+            [CALIBRAY, *words[1:]], cwd=place, capture_output=True, text=True, check=False, timeout=LIMIT
+        )
+    except subprocess.TimeoutExpired:
+        return Ran(page, command, LIMIT, f"took longer than {LIMIT:.0f} s")
+    said = f"exit status {ended.returncode}\n{ended.stdout}{ended.stderr}" if ended.returncode else ""
+    return Ran(page, command, time.monotonic() - began, said)
+
+
+def main(pages: list[str]) -> int:
+    """Run the commands of pages, of all if none is named, and print what came of them.
+
+    Args:
+        pages: The pages, from the repository's root.
+
+    Returns:
+        The number of commands that failed.
+    """
+    texts = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
+    asked = {page: found for page in pages or sorted(texts) if (found := commands(texts[page]))}
+    failed = 0
+    with ThreadPoolExecutor(AT_ONCE) as executor:
+        for each in executor.map(lambda page: list(run_page(page, asked[page])), asked):
+            for ran in each:
+                failed += bool(ran.failure)
+                ending = ran.failure or (f"not run: {ran.reason}" if ran.reason else f"{ran.seconds:.0f} s")
+                sys.stdout.write(f"{ran.page}: {ran.command}: {ending}\n")
+            sys.stdout.flush()
+    sys.stdout.write(f"{len(asked)} pages with commands, {failed} commands failed\n")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(bool(main(sys.argv[1:])))
