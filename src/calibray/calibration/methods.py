@@ -22,7 +22,7 @@ AUTO: Final = "auto"
 STARTS: Final = (16, 512)
 """Local searches on the largest and on small programs."""
 
-START_INTERACTIONS: Final = 15_000_000
+START_INTERACTIONS: Final = 4_000_000
 """Local searches times interactions between the two."""
 
 

@@ -53,7 +53,7 @@ def _group_gains(group: Group, pieces: Pieces, keep: Keep) -> slab.Pair:
     for step, letter in enumerate(group.signature):
         c_te, c_tm = next(coefficients)
         if letter == "r":
-            te, tm = _row(te, tm, c_te, c_tm, group.rotation[step])
+            te, tm = _row(te, tm, c_te, c_tm, group.rotation[step], keep)
             continue
         te, tm = _turn(group.rotation[step], te, tm)
         if letter == "c":
@@ -86,16 +86,15 @@ def _turn(rotation: jax.Array, a: slab.Pair, b: slab.Pair) -> tuple[slab.Pair, s
 
 
 def _row(
-    te: slab.Pair, tm: slab.Pair, c_te: slab.Pair, c_tm: slab.Pair, rotation: jax.Array
+    te: slab.Pair, tm: slab.Pair, c_te: slab.Pair, c_tm: slab.Pair, rotation: jax.Array, keep: Keep
 ) -> tuple[slab.Pair, slab.Pair]:
-    """Reflections and transmissions in a row, by one body that is compiled once."""
-
-    def meet(field: tuple, given: tuple) -> tuple[tuple, None]:
-        turn, one, other = given
-        a, b = _turn(turn, *field)
-        return (slab.multiply(one, a), slab.multiply(other, b)), None
-
-    return jax.lax.scan(meet, (te, tm), (rotation, c_te, c_tm))[0]
+    """Reflections and transmissions in a row; a loop of XLA would take twice as long, and no less to compile."""
+    for step, turn in enumerate(rotation):
+        te, tm = _turn(turn, te, tm)
+        te = slab.multiply((c_te[0][step], c_te[1][step]), te)
+        tm = slab.multiply((c_tm[0][step], c_tm[1][step]), tm)
+        te, tm = keep((te, tm))
+    return te, tm
 
 
 def _scatter(
