@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm, t
 
 from calibray.inference.credible import credible
-from calibray.inference.posterior import Draws, sample
+from calibray.inference.posterior import TOO_FEW, Draws, pooled, sample
 from calibray.inference.verdicts import verdicts
 
 NAMES = ("walls.relative_permittivity", "glass.relative_permittivity")
@@ -105,3 +105,23 @@ def test_credible_sets_hold_what_they_say():
     weight = norm.pdf(value, 5, 0.5)
     ((low, high),) = credible(value, weight / weight.sum(), 0.0, 10.0, 0.95)
     assert (low, high) == pytest.approx((5 - 0.98, 5 + 0.98), abs=0.12)
+
+
+def test_too_few_draws_are_not_taken_for_certainty():
+    # Twelve parameters of which the data tell much: a round or two of points find next to none that explain them.
+    dimension, size = 12, np.full(12, 0.003)
+    density = gaussian(np.linspace(0.2, 0.8, dimension), size)
+    start = np.linspace(0.2, 0.8, dimension)[None] + 0.02
+    found = sample(
+        density, np.zeros(dimension), np.ones(dimension), start, np.diag(np.full(dimension, 0.02))[None], batch=64,
+        rounds=1,
+    )  # fmt: skip
+    assert found.flattened
+    assert found.effective >= TOO_FEW
+    narrow = sample(
+        gaussian(np.full(2, 0.5), np.full(2, 0.1)), np.zeros(2), np.ones(2), np.full((1, 2), 0.5),
+        0.01 * np.eye(2)[None],
+    )  # fmt: skip
+    assert not narrow.flattened
+    assert pooled([found, found]).flattened
+    assert not pooled([narrow, narrow]).flattened

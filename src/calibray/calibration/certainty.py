@@ -22,6 +22,7 @@ from calibray.inference.marginal import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.posterior import ENOUGH, Draws, pooled, sample
 from calibray.inference.verdicts import verdicts
+from calibray.inference.widening import widened
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameters
 from calibray.progress import Progress
@@ -70,6 +71,12 @@ EXACT_DB: Final = 1e-6
 
 SURE: Final = 0.5
 """Weight from which on a departure from independent Gaussian errors is said aloud."""
+
+ROUGH: Final = (
+    "Draws that explain the data are too few among so many parameters: intervals are rough, and wider than the data "
+    "tell. Calibrate fewer parameters, or give them priors."
+)
+"""Said where the posterior was flattened."""
 
 DEPARTURES: Final = {
     CORRELATED: "Errors of neighbouring links are alike",
@@ -240,6 +247,11 @@ def _from_draws(
         point[index] = value
         return float(parameters.from_search(point)[index])
 
+    def in_unit(index: int, value: float) -> float:
+        point = parameters.lower.copy()
+        point[index] = value
+        return float(parameters.to_unit(point)[index])
+
     told = verdicts(
         posterior, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
         level=CONFIDENCE, shown=shown,
@@ -250,6 +262,8 @@ def _from_draws(
         found[name] = Interval(
             local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
         )
+        if posterior.flattened:
+            found[name] = widened(found[name], local[name], lambda value, k=index: in_unit(k, value))
     noise = explaining.weights(posterior.resampled(200))
     missed = _missed(problem, posterior, trail) if problem in engines else ()
     return replace(
@@ -258,7 +272,7 @@ def _from_draws(
         draws=_draws(problem, posterior),
         posterior=posterior,
         noise=noise,
-        remarks=(*offset.remarks, *_departures(noise), *missed),
+        remarks=(*offset.remarks, *_departures(noise), *missed, *(ROUGH,) * posterior.flattened),
     )
 
 

@@ -10,7 +10,7 @@ mixture of all proposals, so that none is lost and no basin has to be crossed fr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -31,6 +31,9 @@ ENOUGH: Final = 500.0
 LEAST: Final = 60.0
 """Effective points that kernels are taken from; where there are fewer, the density is flattened."""
 
+TOO_FEW: Final = 20.0
+"""Effective draws below which they do not tell where a posterior ends; the density is flattened until `LEAST` are."""
+
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Points [n, d] to the logarithm of the posterior, but for a constant [n]; -inf where it is none."""
 
@@ -43,11 +46,13 @@ class Draws:
         point: The points [n, d].
         density: Logarithm of the posterior there, but for a constant [n].
         weight: Their weights; they add up to one [n].
+        flattened: Whether so few draws were effective that the weights are those of a flatter, wider density.
     """
 
     point: NDArray[np.float64]
     density: NDArray[np.float64]
     weight: NDArray[np.float64]
+    flattened: bool = False
 
     @property
     def effective(self) -> float:
@@ -116,6 +121,8 @@ def sample(
         weight = np.exp(raw - raw.max())
         weight /= weight.sum()
         draws, turn = Draws(lower + unit * width, found, weight), len(share) - 2
+        if turn == rounds and draws.effective < TOO_FEW:
+            return replace(draws, weight=_flattened(raw), flattened=True)
         if turn == rounds or (turn and draws.effective >= enough):
             return draws
         kernels = _learned(unit, raw, random)
@@ -144,6 +151,7 @@ def pooled(parts: Sequence[Draws]) -> Draws:
         np.concatenate([part.point for part in parts]),
         np.concatenate([part.density for part in parts]),
         np.concatenate([part.weight for part in parts]) / len(parts),
+        any(part.flattened for part in parts),
     )
 
 
