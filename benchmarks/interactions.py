@@ -114,7 +114,7 @@ def measure(paths: Paths, kind: str) -> None:
     repeats = max(5, min(100, 10_000_000 // paths.num_interactions))
     value = seconds(lambda: engine.path_loss(next(turn)[None]), repeats)
     slope = seconds(lambda: engine.path_loss_and_jacobian(next(turn)[None]), repeats)
-    stored = layout(paths, np.float32, 2048, phases=False).program.nbytes
+    stored = layout(paths, np.float32, 256, phases=False).program.nbytes
     tabulated = engine.path_loss(points[:1])
     formula, difference = float("nan"), float("nan")
     if paths.num_interactions <= 1_000_000:
