@@ -113,7 +113,8 @@ def shown(comparison: FamilyComparison) -> Table:
             others = {name: value for name, value in median.items() if name != AUTO}
             rival = min(others, key=lambda name: others[name])
             wanted = f"{label(rival)}'s: {others[rival]:.4f}"
-            row(f"{label(AUTO)}, median at {calls} [dB]", wanted, median[AUTO], median[AUTO] <= others[rival] + DIGIT_DB)
+            met = median[AUTO] <= others[rival] + DIGIT_DB
+            row(f"{label(AUTO)}, median at {calls} [dB]", wanted, median[AUTO], met)
     columns = (Column("what"), Column("wanted"), numbers("measured"), Column("met"))
     return Table("", columns, tuple(rows))
 
