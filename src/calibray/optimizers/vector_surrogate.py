@@ -25,11 +25,11 @@ are left out better (on resonating panes 0.018 dB after 120 calls instead of 0.0
 d + 4 points for three parameters (it starts in another basin more often), and steps from the best points shortened as
 uncertainty grows (a trust region, on eight parameters: most of the excess left is other minima, not unfinished
 descents). A learned bend of every parameter, (exp(b x) - 1) / (exp(b) - 1), and a prior of the slopes of the trend
-divide the errors of prediction near the optimum by 2.9 after 2 (d + 1) points and by 1.4 after 4 (d + 1), on ten planted
-problems. With an initial design of d + 1 points, or d + 4 of up to four parameters, and descents in a trust region before
-the steps take turns, this gave 0.041 instead of 0.075 dB after 15 calls and 0.0064 instead of 0.0133 after 30, medians
-of fifteen planted problems. It is not kept, because such a model is surer of itself and the search stays in its basin:
-0.028 instead of 0.000 dB after 225 calls in a district with six parameters.
+divide the errors of prediction near the optimum by 2.9 after 2 (d + 1) points and by 1.4 after 4 (d + 1), on ten
+planted problems. With an initial design of d + 1 points, or d + 4 of up to four parameters, and descents in a trust
+region before the steps take turns, this gave 0.041 instead of 0.075 dB after 15 calls and 0.0064 instead of 0.0133
+after 30, medians of fifteen planted problems. It is not kept, because such a model is surer of itself and the search
+stays in its basin: 0.028 instead of 0.000 dB after 225 calls in a district with six parameters.
 
 In a batch every further candidate is chosen as if the earlier ones had come out as predicted. A failed
 evaluation enters the model with the residuals of the worst successful one.
