@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ import pytest
 import two_ray
 from calibray import engines
 from calibray.calibration.problem import Problem
-from calibray.engines.blocks import cut
+from calibray.engines.blocks import Blocks, cut
+from calibray.engines.crew import Here
+from calibray.engines.kinds.replay import _traced
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.objective import make_objective
 from calibray.inference.squares import total
@@ -63,6 +67,11 @@ def test_sums_of_blocks_are_those_of_all_links(tmp_path, name):
         assert share * told.T @ found.residuals[k] == pytest.approx(gradient, rel=1e-9, abs=1e-9)
     assert parted.squares(points).value == pytest.approx(expected.value, rel=1e-12)
     assert parted.modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
+    opening = partial(_traced, None)
+    poor = Blocks(
+        Here(at_most=1), parted.setup, parted.engine.blocks, opening
+    )  # two of three are opened each time
+    assert replace(parted, engine=poor).modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
 
 
 def made_up(count: int) -> tuple[Measurements, np.ndarray, np.ndarray]:

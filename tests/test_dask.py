@@ -58,7 +58,7 @@ def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
 
 def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_path, cluster):
     few = {"method": {"name": "least-squares", "options": {"starts": 4}}, "offset": {"bounds": [-5.0, 5.0]}}
-    parted = {**few, "engine": {"name": "replay", "block_links": 10}}
+    parted = {**few, "engine": {"name": "replay", "block_links": 15}}
     killed: list[int] = []
 
     def kill_one(stage: str, done: int, total: int | None) -> None:
@@ -72,7 +72,7 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
         found = calibrate(setup, executor=crew, progress=kill_one)
     assert killed
     # No block twice: those of the dead worker came from the cache.
-    assert sorted((tmp_path / two_ray.TRACED).read_text().split()) == ["10", "10", "10"]
+    assert sorted((tmp_path / two_ray.TRACED).read_text().split()) == ["15", "15"]
     whole = calibrate(Setup.open(two_ray.study(tmp_path, noise_db=1.0, **few), two_ray.TwoRay))
     assert found.parameters == pytest.approx(whole.parameters, rel=1e-9)
     assert found.rmse_db == pytest.approx(whole.rmse_db, rel=1e-9)

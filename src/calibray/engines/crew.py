@@ -14,8 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast, final
 
+from calibray.caching import folder
 from calibray.engines.pool import open_client, open_local_client
 from calibray.errors import EngineError, InputError
+from calibray.tracing.memory import available
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -88,11 +90,25 @@ class Crew(Protocol):
 
 @final
 class Here:
-    """This process: one block after the other."""
+    """This process: one block after the other.
+
+    Args:
+        at_most: Blocks that are kept at once; the others are made anew whenever they are asked. None for as many as
+            leave half of the memory free that was free at first.
+    """
+
+    def __init__(self, at_most: int | None = None) -> None:
+        self._at_most, self._reserve = at_most, available() // 2
 
     def keep(self, make: Callable[[Any], Any], given: Sequence[Any]) -> Kept:
         """Make one thing for every block; see `Crew.keep`."""
-        return _Lazily(make, list(given))
+        return _Lazily(make, list(given), self._room)
+
+    def _room(self, kept: int) -> bool:
+        if self._at_most is not None:
+            return kept < self._at_most
+        # Without a cache, what is not kept would be traced again and again.
+        return folder() is None or available() > self._reserve
 
     def ask(
         self,
@@ -112,19 +128,23 @@ class Here:
 
 @dataclass(eq=False)
 class _Lazily:
-    """Things made when they are first asked for."""
+    """Things made when they are asked for, and kept while there is room for so many."""
 
     make: Callable[[Any], Any]
     given: list[Any]
+    room: Callable[[int], bool]
     made: dict[int, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.given)
 
     def __getitem__(self, index: int) -> Any:
-        if index not in self.made:
-            self.made[index] = self.make(self.given[index])
-        return self.made[index]
+        if index in self.made:
+            return self.made[index]
+        made = self.make(self.given[index])
+        if self.room(len(self.made)):
+            self.made[index] = made
+        return made
 
 
 @dataclass(eq=False)

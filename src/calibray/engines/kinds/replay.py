@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from calibray.study.setup import Setup
 
 BLOCK_LINKS: Final = 1000
-"""Links of a block where workers are given and the study does not say."""
+"""Links of a block where workers are given and the study does not say,"""
+
+BLOCKS: Final = 64
+"""unless that makes more blocks than these: each has its sums, and its program is compiled."""
 
 
 @final
@@ -35,7 +38,7 @@ class ReplaySection(EngineSection):
         name: "replay".
         compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
         block_links: Trace and replay the links in blocks of so many at most; all at once if None, or in blocks of
-            `BLOCK_LINKS` where workers are given.
+            `BLOCK_LINKS` where workers are given, but no more than `BLOCKS` of them.
     """
 
     dear: ClassVar[bool] = False
@@ -70,7 +73,8 @@ class ReplaySection(EngineSection):
             from calibray.engines.crew import Here
 
             crew = Here() if executor is None else cast("Crew", executor)
-            blocks = cut(setup.links, self.block_links or BLOCK_LINKS)
+            size = self.block_links or max(BLOCK_LINKS, -(-len(setup.links) // BLOCKS))
+            blocks = cut(setup.links, size)
             return Blocks(crew, setup, blocks, partial(_traced, self.compress_db), progress=progress)
         return replay(setup, setup.trace(progress=progress) if paths is None else paths, self.compress_db)
 

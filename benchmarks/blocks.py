@@ -1,0 +1,200 @@
+"""Links in blocks: speed-up by a second worker, bytes that come back, and memory and time against the number of links.
+
+    python benchmarks/blocks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
+    python benchmarks/blocks.py bytes               # what a candidate moves, by number of links
+    python benchmarks/blocks.py links               # memory and time of a search, blocks repeated up to a million links
+    python benchmarks/blocks.py city --links 100000 # a campaign in Munich end to end, in one process
+
+Each has processes and a cache of its own. Measured values are a law of the distance with noise of 6 dB: how well they
+fit is no matter here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import calibray as cb
+from calibray import engines
+from calibray.calibration.methods import choose
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import search
+from calibray.engines.blocks import Blocks, cut
+from calibray.engines.crew import Crew, Here
+from calibray.engines.kinds import replay
+from calibray.measurements import links_from_frame
+from calibray.study import Setup, Study
+
+MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
+COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
+PARAMETERS = ("concrete", "marble", "brick")
+
+
+def study(engine: dict, starts: int) -> Study:
+    """A study of links in Munich, which are not in a file."""
+    return Study.from_content(
+        {
+            "version": 1,
+            "scene": {"file": "sionna:munich", "frequency": 3.5e9},
+            "links": {"file": "none.csv", "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db"},
+            "trace": {"max_depth": 3, "samples": 100_000},
+            "parameters": {f"{name}.relative_permittivity": {"bounds": [1.5, 12.0]} for name in PARAMETERS},
+            "offset": {"per": "mast", "bounds": [-60.0, 60.0]},
+            "method": {"name": "least-squares", "options": {"starts": starts}},
+            "engine": {"name": "replay", **engine},
+        }
+    )
+
+
+def campaign(count: int, engine: dict, starts: int = 16, seed: int = 0) -> Setup:
+    """Links from two masts to places drawn from a seed; those in buildings have no path, and are left out."""
+    random = np.random.default_rng(seed)
+    mast = random.integers(0, len(MASTS), count)
+    rx = np.c_[random.uniform(-300, 300, (count, 2)), np.full(count, 1.5)]
+    distance = np.linalg.norm(MASTS[mast] - rx, axis=1)
+    loss = 40 + 33 * np.log10(distance) + 6 * random.standard_normal(count)
+    table = pd.DataFrame(np.hstack([MASTS[mast], rx]), columns=COLUMNS)
+    return Setup.open(
+        study(engine, starts), links=links_from_frame(table.assign(path_loss_db=loss, mast=mast))
+    )
+
+
+def resident() -> float:
+    """Largest memory that this process has had so far [GiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+
+
+def timed(setup: Setup, crew: Crew | None) -> tuple[float, float, Problem]:
+    """Seconds of tracing and of search, and the problem solved."""
+    started = time.perf_counter()
+    problem = Problem.of(setup, engines.make(setup, executor=crew))
+    traced = time.perf_counter()
+    search(problem, choose(problem))
+    return traced - started, time.perf_counter() - traced, problem
+
+
+def speed_up(links: int) -> None:
+    """Trace and search with one worker and with two."""
+    alone = 0.0
+    for workers in (1, 2):
+        with (
+            tempfile.TemporaryDirectory() as cache,
+            pinned(CALIBRAY_CACHE=cache, JAX_COMPILATION_CACHE_DIR=None),
+            engines.open_crew(workers) as crew,
+        ):
+            # Libraries and the scene are loaded before the clock starts.
+            engines.make(campaign(2, {"block_links": 1}, seed=9), executor=crew)
+            tracing, searching, problem = timed(campaign(links, {"block_links": -(-links // 8)}), crew)
+        together = tracing + searching
+        alone = alone or together
+        print(
+            f"{workers} worker(s): {links} links ({problem.objective.num_counted} with a path), tracing "
+            f"{tracing:.1f} s, search {searching:.1f} s, {alone / together:.2f} times as fast as one"
+        )
+
+
+class pinned:
+    """Variables of the environment, set and put back; None leaves one out."""
+
+    def __init__(self, **values: str | None) -> None:
+        self.values, self.before = values, {name: os.environ.get(name) for name in values}
+
+    def __enter__(self) -> None:
+        self._put(self.values)
+
+    def __exit__(self, *_: object) -> None:
+        self._put(self.before)
+
+    def _put(self, values: dict[str, str | None]) -> None:
+        for name, value in values.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def moved(links: int) -> None:
+    """What the answers to a batch of candidates weigh, as they are sent."""
+    import pickle
+
+    for count in (links // 4, links):
+        setup = campaign(count, {"block_links": -(-count // 4)})
+        problem = Problem.of(setup, engines.make(setup))
+        engine = problem.engine
+        shares = problem.objective.shares(engine.blocks)
+        parts = engine.reducing(shares)(np.repeat(problem.parameters.start[None], 64, axis=0), True)
+        size = sum(len(pickle.dumps(part)) for part in parts)
+        whole = 64 * count * 8 * (1 + len(problem.parameters))
+        print(
+            f"{count} links in {len(parts)} blocks: {size / 64:.0f} bytes a candidate come back with derivatives; "
+            f"path loss and derivatives of the links themselves would be {whole / 64:,.0f}"
+        )
+
+
+def repeated(blocks: int, links: int) -> None:
+    """One block's links again and again, two blocks of them open at once; a search over all."""
+    one = campaign(links, {"block_links": links}, starts=4)
+    table = pd.concat([one.links.frame] * blocks, ignore_index=True)
+    setup = one.at(links_from_frame(table))
+    parts = [np.arange(links) + links * k for k in range(blocks)]
+    started = time.perf_counter()
+    engine = Blocks(Here(at_most=2), setup, parts, partial(replay._traced, None))
+    problem = Problem.of(setup, engine)
+    opened = time.perf_counter() - started
+    trail = search(problem, choose(problem))
+    seconds = time.perf_counter() - started - opened
+    print(
+        f"{blocks * links:>9,} links in {blocks:>4} blocks: {opened:.1f} s to open, {seconds:.1f} s for "
+        f"{trail.rt_calls} candidates, {1e6 * seconds / trail.rt_calls / blocks / links:.3f} us a link and candidate, "
+        f"peak memory {resident():.2f} GiB",
+        flush=True,
+    )
+
+
+def city(links: int) -> None:
+    """Calibrate end to end in one process."""
+    setup = campaign(links, {"block_links": max(1000, -(-links // replay.BLOCKS))})
+    planned = setup.tracer.plan(setup.links).seconds
+    print(
+        f"{links:,} links in {len(cut(setup.links, setup.study.engine.block_links))} blocks; told {planned:.0f} s"
+    )
+    started = time.perf_counter()
+    result = cb.calibrate(setup)
+    taken = time.perf_counter() - started
+    print(f"{taken:.0f} s ({result.trace_seconds:.0f} s tracing), peak memory {resident():.2f} GiB")
+
+
+def main() -> None:
+    """Run what was asked for, each size in a process of its own."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("what", choices=("speed-up", "bytes", "links", "city"))
+    parser.add_argument("--links", type=int, default=None, help="number of links, of a block with `links`")
+    parser.add_argument("--blocks", type=int, nargs="+", default=[10, 100, 1000])
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.what == "links" and not options.child:
+        with tempfile.TemporaryDirectory() as cache:
+            for blocks in options.blocks:
+                words = ["links", "--child", "--blocks", str(blocks), "--links", str(options.links or 1000)]
+                environment = os.environ | {"CALIBRAY_CACHE": cache}
+                subprocess.run([sys.executable, Path(__file__), *words], check=True, env=environment)
+        return
+    {
+        "speed-up": lambda: speed_up(options.links or 2000),
+        "bytes": lambda: moved(options.links or 400),
+        "links": lambda: repeated(options.blocks[0], options.links),
+        "city": lambda: city(options.links or 100_000),
+    }[options.what]()
+
+
+if __name__ == "__main__":
+    main()
