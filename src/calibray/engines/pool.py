@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -110,7 +111,12 @@ def open_local_client(workers: int) -> Iterator[Client]:
 
     # Blocks are as large as the study says, and a worker beyond some share of the memory would be ended by Dask.
     options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "memory_limit": 0}
-    with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster) as client:
+    # Ends of workers are told by who gives them blocks.
+    quiet = logging.ERROR
+    with (
+        LocalCluster(n_workers=workers, silence_logs=quiet, **options) as cluster,
+        Client(cluster) as client,
+    ):
         client.register_plugin(Cores(workers))
         yield client
 
