@@ -268,18 +268,20 @@ def main() -> None:
     for name in names:
         if given.repetitions:
             _district(name, given.folder)  # traced once, by this process
-        tasks = [
-            (name, world, turn, given.seed, given.starts, given.folder)
-            for turn in range(given.repetitions)
-            for world in worlds
-            if (name, world, turn) not in done
-        ]
-        for count, line in enumerate(_run(tasks, given.workers), start=1):
-            lines.append(line)
-            if given.out is not None:
-                with given.out.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-            print(f"{name}: {count} of {len(tasks)}", end="\r", file=sys.stderr)
+    # Turn by turn, so that a run that is stopped holds as many of every district and world.
+    tasks = [
+        (name, world, turn, given.seed, given.starts, given.folder)
+        for turn in range(given.repetitions)
+        for name in names
+        for world in worlds
+        if (name, world, turn) not in done
+    ]
+    for count, line in enumerate(_run(tasks, given.workers), start=1):
+        lines.append(line)
+        if given.out is not None:
+            with given.out.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+        print(f"{count} of {len(tasks)}", end="\r", file=sys.stderr)
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
         print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))

@@ -30,7 +30,7 @@ from calibray.progress import Progress
 COST: Final = 10
 """Replays of the draws by those of the calibration, at most; these take derivatives, which doubles their cost."""
 
-INTERACTIONS: Final = 50_000_000
+INTERACTIONS: Final = 100_000_000
 """Interactions times replays that draws may take in any case: some seconds."""
 
 SIZES: Final = ((512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
