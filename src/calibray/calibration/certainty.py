@@ -33,8 +33,8 @@ COST: Final = 10
 INTERACTIONS: Final = 100_000_000
 """Interactions times replays that draws may take in any case: some seconds."""
 
-SIZES: Final = ((512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
-"""Points of a round and rounds, the first that the cost allows."""
+SIZES: Final = ((512, 20), (512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
+"""Points of a round and rounds at most, the first that the cost allows; most posteriors take two to four rounds."""
 
 SHARED: Final = ((128, 4), (64, 3))
 """The same where several engines share them."""
