@@ -176,7 +176,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     draws, found = told.posterior, []
     if draws is None:
         raise RuntimeError(f"{name}, {world}, {turn}: no draws; {told.remarks}")
-    known_weight = _known(district, world, problem, draws) if known.all() else None
+    known_weight = _known(district, world, problem, draws) if known.all() and not draws.flattened else None
     narrow = draws.weight * np.exp((UNDERSTATED - 1) * (draws.density - draws.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
         value = draws.point[:, k]
