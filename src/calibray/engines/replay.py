@@ -22,10 +22,10 @@ BLOCK_INTERACTIONS: Final = 50_000
 LARGE: Final = 50_000
 """Interactions beyond which a program is large."""
 
-TABULATED: Final = 1_000
+TABULATED: Final = 5_000
 """Interactions beyond which coefficients may come from tables."""
 
-NODES: Final = 0.5
+NODES: Final = 0.25
 """Nodes of tables for each interaction, beyond which filling them would cost more than they spare."""
 
 TABLE_TOLERANCE: Final = 1e-4
