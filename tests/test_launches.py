@@ -144,3 +144,12 @@ def test_long_traces_are_announced():
     # Ten thousand times the rays take ten thousand times as long.
     longer = plan(MASTS, TraceSettings(samples=40_000_000_000, max_depth=5), 20_000_000, 1_000_000)
     assert longer.announcement(11).endswith("and 20 hours on two cores")
+
+
+def test_rays_added_in_rounds_take_a_launch_for_every_position():
+    found = plan(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
+    assert sorted(len(launch.links) for launch in found.launches) == [4, 7]
+    assert found.announcement(11) == (
+        "Tracing 11 links from 2 positions, rays added until path loss stands still; about 6 seconds on two cores, "
+        "longer where rays still find paths"
+    )

@@ -6,8 +6,10 @@ import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
@@ -15,6 +17,7 @@ from calibray.scenes import read_scene
 from calibray.tracing.launches import starts_at_receivers
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Trace, Tracer
+from calibray.tracing.sionna.chunks import without_empty_places
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -121,3 +124,14 @@ def test_diffuse_reflection_has_a_direction():
     assert not starts_at_receivers(MANY_TX.rx, MANY_TX.tx, SETTINGS)
     assert not starts_at_receivers(MANY_TX.tx, MANY_TX.rx, diffuse)
     assert not starts_at_receivers(MANY_TX.tx[:2], MANY_TX.rx[:2] * [[1], [2]], SETTINGS)
+
+
+def test_places_that_are_counted_but_not_filled_are_no_direct_paths(yard):
+    """A direct path is found once; Sionna RT 2.2 leaves some candidates empty, which would be more of them."""
+    buffer = PathsBuffer(3, 2, False)
+    buffer.set_interaction_type(mi.UInt(1), mi.UInt([0, 1, 0]), mi.Bool(True))
+    buffer.valid = mi.Bool([True, False, False])
+    left = without_empty_places(buffer)
+    assert left.buffer_size == 2
+    assert np.array(left.valid).tolist() == [True, False]
+    assert without_empty_places(left) is left

@@ -27,6 +27,8 @@ BUFFER_BYTES: Final = (50, 30)
 """The same in the tracer's buffer."""
 RATE: Final = 3e7
 """Rays x interactions x receivers a second that two cores of a processor trace, to say how long a trace will take."""
+SEARCH: Final = 3.0
+"""About how long two cores take with the rays of one position where they are added in rounds [s]."""
 SHORT: Final = 1.0
 """A trace of one launch that takes less is not worth a line [s]."""
 GRID: Final = 0.01
@@ -96,11 +98,13 @@ class Plan:
         launches: The launches; those to the same receivers follow each other.
         lanes: Rays times interactions times receivers of the largest one.
         buffer: Bytes of the buffer that holds the paths of a launch.
+        adaptive: Whether a launch is the first of several, and rays are added until path loss stands still.
     """
 
     launches: Sequence[Launch]
     lanes: int
     buffer: int
+    adaptive: bool = False
 
     @property
     def memory(self) -> int:
@@ -110,7 +114,7 @@ class Plan:
     @property
     def seconds(self) -> float:
         """About how long two cores of a processor take [s]."""
-        return len(self.launches) * self.lanes / RATE
+        return len(self.launches) * (SEARCH if self.adaptive else self.lanes / RATE)
 
     def announcement(self, links: int) -> str:
         """What a long trace will take, in a line.
@@ -123,6 +127,11 @@ class Plan:
         """
         if len(self.launches) == 1 and self.seconds < SHORT:
             return ""
+        if self.adaptive:
+            return (
+                f"Tracing {links:,} links from {len(self.launches):,} positions, rays added until path loss stands "
+                f"still; about {duration(self.seconds)} on two cores, longer where rays still find paths"
+            )
         return (
             f"Tracing {links:,} links in {len(self.launches):,} launches of up to {self.lanes:,} rays x interactions x "
             f"receivers; about {self.memory / 2**30:.1f} GiB of memory, besides that of the scene and the paths found, "
@@ -177,7 +186,7 @@ def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffe
     rays = -(-samples // pieces)
     largest = rays * settings.max_depth * (1 if alone else max(len(part) for _, part in receivers))
     size = buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth)
-    return Plan(Launches(receivers, settings, pieces), largest, size)
+    return Plan(Launches(receivers, settings, pieces), largest, size, alone)
 
 
 def seed_of(seed: int, piece: int) -> int:

@@ -49,6 +49,24 @@ def rays_towards(square: NDArray[np.float64] | None) -> Iterator[None]:
         sb_deterministic.fibonacci_lattice = whole
 
 
+def without_empty_places(buffer: PathsBuffer) -> PathsBuffer:
+    """Candidates without the places that Sionna RT 2.2 counts but does not fill, now and then with refraction.
+
+    Without an interaction, and of the first source and target, each would become a direct path between these two.
+
+    Args:
+        buffer: Candidates; direct paths among them are known to be valid.
+
+    Returns:
+        The same, if no place is empty, or a copy without those.
+    """
+    if not buffer.buffer_size:
+        return buffer
+    filled = buffer.valid | (buffer.get_interaction_type(mi.UInt(1), mi.Bool(True)) != 0)
+    found = dr.compress(filled)
+    return buffer if dr.width(found) == buffer.buffer_size else buffer.gather(found)
+
+
 def without_repeats(pieces: list[Chunk]) -> list[Chunk]:
     """Chunks of several launches to the same receivers, each path of a kind that is not sampled only once.
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
+from calibray.errors import EngineError
 from calibray.progress import Progress
 from calibray.tracing.launches import Launch, Plan, directions, seed_of
 from calibray.tracing.settings import ROUND
@@ -134,10 +135,7 @@ class Search:
             pieces: list[Chunk] = []
             for _ in range(max(sent, 1)):
                 chains = self._shoot(sent)
-                found = keys(chains, self.meshes)
-                known, fresh = _fresh(known, found)
-                # Sionna leaves a place empty now and then: without an interaction it would be a direct path.
-                fresh = fresh[found[fresh, 0] != 0]
+                known, fresh = _fresh(known, keys(chains, self.meshes))
                 sent += 1
                 if len(fresh):
                     pieces += self._try(chains.gather(mi.UInt(aligned(fresh, np.uint32))))
@@ -195,14 +193,22 @@ class Search:
         return Chunk(buffer, source, target, self.launch.links[np.array(end, dtype=np.int64)])
 
     def _keep(self, pieces: list[Chunk]) -> NDArray[np.float64]:
-        """Keep what was not found before, and tell the power that every link gained [R]."""
+        """Keep what was not found before, and tell the power that every link gained [R].
+
+        Raises:
+            EngineError: There is more than fits into memory.
+        """
         before = len(self.chunks)
-        same = [chunk for chunk in self.chunks if chunk.buffer.max_depth]
-        # The first one is kept in any case: it tells where the links' ends are.
+        # The first one holds the direct paths, and is kept in any case: it tells where the links' ends are.
+        earlier = self.chunks[1:]
         fresh = [chunk for chunk in pieces if len(chunk.link) or not before]
-        if same and fresh:
-            fresh = without_repeats([*same, *fresh])[len(same) :]
-        self.chunks += fresh
+        # A plane may count as two, by a rounding, and its chain be tried again.
+        self.chunks += without_repeats([*earlier, *fresh])[len(earlier) :] if before and fresh else fresh
+        if sum(len(chunk.link) for chunk in self.chunks) > self.room:
+            raise EngineError(
+                f"more paths than fit into memory, with {len(self.targets)} receivers at work; lower trace.max_depth, "
+                "or trace fewer links at once"
+            )
         gained = np.zeros(len(self.targets))
         order = np.argsort(self.launch.links)
         for chunk in self.chunks[before:]:

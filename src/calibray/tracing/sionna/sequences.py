@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from sionna.rt.utils import first_order_diffraction_point
 
+from calibray.errors import InputError
 from calibray.paths import Kind
 from calibray.tracing.sionna.arrays import aligned, per_interaction
 from calibray.tracing.unfolding import MARGIN, Surfaces, Unfolded, unfold
@@ -50,11 +51,19 @@ class Meshes:
 
     Args:
         scene: Mitsuba's scene.
+
+    Raises:
+        InputError: A shape is not made of triangles.
     """
 
     def __init__(self, scene: Any) -> None:
         corners, self._first, count = [], {}, 0
         for shape in scene.shapes():
+            if not shape.is_mesh():
+                raise InputError(
+                    f"trace.samples = 'auto': the shape {shape.id()!r} is not made of triangles; give a number, or "
+                    "export the scene with meshes alone"
+                )
             values = mi.traverse(shape)
             vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
             face = np.array(values["faces"], dtype=np.int64).reshape(-1, 3)

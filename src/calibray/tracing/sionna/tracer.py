@@ -41,7 +41,7 @@ from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
-from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_repeats
+from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_empty_places, without_repeats
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.rounds import search
@@ -344,7 +344,7 @@ class Tracer:
             size = min(4 * size, most)
         buffer.shrink()
         buffer.detach_geometry()
-        return buffer
+        return without_empty_places(buffer)
 
     def settle(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> None:
         """Compute the geometry of candidates by the method of images, and leave those that are paths.
