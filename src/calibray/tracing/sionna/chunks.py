@@ -63,7 +63,7 @@ def without_empty_places(buffer: PathsBuffer) -> PathsBuffer:
     if not buffer.buffer_size:
         return buffer
     filled = buffer.valid | (buffer.get_interaction_type(mi.UInt(1), mi.Bool(True)) != 0)
-    found = dr.compress(filled)
+    found = mi.UInt(dr.compress(filled))
     return buffer if dr.width(found) == buffer.buffer_size else buffer.gather(found)
 
 
