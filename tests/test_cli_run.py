@@ -212,7 +212,8 @@ def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
     pd.testing.assert_frame_equal(predicted[table.columns], table)
     expected = Result.load(folder / "out").links.after_db
     assert predicted.path_loss_db.to_numpy() == pytest.approx(expected.to_numpy(), abs=1e-3)
-    assert outcome.stderr == f"Warning: no path leads to 1 of 12 links, row {LOST_ROW}\n"
+    lost = f"1 of 12 links, row {LOST_ROW}\n"
+    assert outcome.stderr == f"Warning: no path leads to {lost}Warning: receiver inside a building: {lost}"
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])

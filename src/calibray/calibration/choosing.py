@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.calibration.problem import Problem
-from calibray.calibration.validate import TX_OFFSET, fitted_twins
+from calibray.calibration.validate import TX_OFFSET, fitted_twins, predicted
 from calibray.inference.nuisance import OFFSET
 from calibray.inference.objective import Objective
 from calibray.inference.rivals import fitted_law
@@ -14,8 +16,13 @@ from calibray.inference.validation import LAW, Validation
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.study import Study
 
+MOST: Final = 400
+"""Errors that are kept with the model."""
 
-def choose_model(problem: Problem, validation: Validation, best: NDArray[np.float64]) -> Chosen:
+
+def choose_model(
+    problem: Problem, validation: Validation, best: NDArray[np.float64]
+) -> tuple[Chosen, NDArray[np.float64]]:
     """Fit the model that held-out blocks speak for to all links that count.
 
     Kriging is not among those chosen from: it tells nothing beyond the measured places, which blocks are not about.
@@ -26,20 +33,29 @@ def choose_model(problem: Problem, validation: Validation, best: NDArray[np.floa
         best: The calibrated optimum, a point of the search space [d].
 
     Returns:
-        The model.
+        The model, and its path loss at all links [L], [dB].
     """
     name = validation.chosen
     count = int(np.count_nonzero(validation.block >= 0))
     basis = f"{name}, errors on {len(validation.labels)} blocks held out in turn"
-    size = validation.scale(name)
+    size, sizes = validation.scale(name), _some(validation.sizes(name))
     study, frequency = problem.setup.study, problem.setup.study.scene.frequency
     if name == LAW:
         law, rise = fitted_law(problem.setup.links, problem.objective, frequency)
-        return Chosen(name, None, _terms(law, rise[None], study), size, basis, count)
+        chosen = Chosen(name, None, _terms(law, rise[None], study), size, basis, count, sizes)
+        return chosen, predicted(law, rise)
     variant, point = fitted_twins(problem, best[None])[name]
     told = variant.evaluate(point[None])
     values = problem.parameters.named(problem.parameters.from_search(point))
-    return Chosen(name, values, _terms(variant.objective, told.modelled, study), size, basis, count)
+    chosen = Chosen(name, values, _terms(variant.objective, told.modelled, study), size, basis, count, sizes)
+    return chosen, predicted(variant.objective, told.modelled[0])
+
+
+def _some(sizes: NDArray[np.float64]) -> tuple[float, ...]:
+    """Errors that stand for all of them, ascending."""
+    if len(sizes) > MOST:
+        sizes = np.quantile(sizes, (np.arange(MOST) + 0.5) / MOST)
+    return tuple(sizes.tolist())
 
 
 def _terms(objective: Objective, path_loss: NDArray[np.float64], study: Study) -> tuple[ChosenTerm, ...]:

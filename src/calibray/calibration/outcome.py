@@ -19,12 +19,16 @@ from calibray.calibration.settle import largest
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
 from calibray.inference.comparing import compare
+from calibray.inference.diagnostics import shared_errors
+from calibray.inference.marginal import HEAVY
 from calibray.inference.nuisance import OFFSET
+from calibray.inference.residual_field import measured_errors
 from calibray.inference.rivals import log_distance
 from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.result import Result
+from calibray.result.residuals import ResidualField
 from calibray.study import Study
 from calibray.tracing.enclosed import Enclosed
 
@@ -111,7 +115,8 @@ def outcome(
         judged = _held_out(problem, trail, models)
     else:
         judged = _in_turn(validation, _rmse(problem, models.before, validation.block >= 0), fitted)
-        chosen = choose_model(problem, validation, parameters.to_search(trail.best))
+        chosen, by_chosen = choose_model(problem, validation, parameters.to_search(trail.best))
+        table = table.assign(chosen_db=by_chosen)
         if chosen.name != CALIBRATED:
             judged["judgement"] += (
                 f"Predictions go by the model {chosen.name!r}, which did best on the blocks: "
@@ -158,6 +163,7 @@ def outcome(
         free_offset_error_db=certainty.free_offset_error_db,
         remarks=(*([helper.remark] if helper.remark else []), *certainty.remarks, *judgement),
         chosen=chosen,
+        residual_field=_shared(problem, table),
         profile_calls=certainty.calls,
         profile_seconds=certainty.seconds,
         cheap_calls=0 if helper.model is None else helper.model.calls,
@@ -219,6 +225,16 @@ def _in_turn(validation: Validation, before_db: float | None, fitted: bool) -> d
         "residual_basis": f"{len(validation.labels)} blocks held out in turn",
         "judgement": (validation.sentence,),
     }
+
+
+def _shared(problem: Problem, table: pd.DataFrame) -> ResidualField | None:
+    """What neighbours' errors share under the model that predictions go by; None where they show nothing."""
+    links, noise = problem.setup.links, problem.setup.study.noise
+    if links.frequency is not None or noise.range_m == 0 or noise.kind == HEAVY:
+        return None
+    known, errors = measured_errors(table)
+    found = shared_errors(errors, np.hstack([links.tx, links.rx])[known])
+    return None if found is None else ResidualField(found.range_m, found.shared_db, found.own_db)
 
 
 def _terms(problem: Problem, coefficients: NDArray[np.float64]) -> dict[str, dict[str, float | None]]:

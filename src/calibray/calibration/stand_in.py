@@ -237,7 +237,7 @@ def ensemble(problem: Problem, trail: Trail, model: ReplayedModel | None = None)
     else:
         return None
     better = np.argsort(asked.value, kind="stable")[: max(2, len(asked.value) // 2)]
-    stretch = max(1.0, surprise(process, better))
+    stretch = max(1.0, surprise(process, better), surprise(process, np.arange(len(asked.value))))
     cost = asked.loss.size + (0 if replayed is None else _interactions(replayed.engine))
 
     functions = [drawn(process, random, 0.0), *(drawn(process, random, stretch) for _ in range(FUNCTIONS))]

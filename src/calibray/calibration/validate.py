@@ -244,11 +244,19 @@ def _minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCH
 
 
 def _at(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _predicted(problem.objective, problem.modelled(point[None])[0])
+    return predicted(problem.objective, problem.modelled(point[None])[0])
 
 
-def _predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss with the nuisance fitted to the links that count; a group that has none gets the mean [L], [dB]."""
+def predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Path loss with the nuisance fitted to the links that count; a group that has none gets the mean.
+
+    Args:
+        objective: What the model is fitted by.
+        path_loss: Path loss without it [L], [dB].
+
+    Returns:
+        Path loss with it [L], [dB].
+    """
     coefficients = objective.coefficients(path_loss[None])
     filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
     return objective.capped(path_loss) + objective.nuisance.contribution(filled)[0]

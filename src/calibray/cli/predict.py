@@ -13,8 +13,11 @@ from calibray.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-PREDICTED: Final = ("path_loss_db", "lower_db", "upper_db", "basis")
-"""The columns that `predict` adds, all but the first with --level alone."""
+PREDICTED: Final = ("path_loss_db", "lower_db", "upper_db")
+"""The columns that `predict` adds, all but the first with --level alone; others tell what was measured."""
+
+SAID: Final = ("basis", "remark")
+"""Columns of words, with --level."""
 
 
 def predict(
@@ -41,7 +44,7 @@ def predict(
         typer.Option(
             metavar="P",
             help="Add the interval that a measurement would lie in with this probability, as 0.9: columns lower_db, "
-            "upper_db and basis.",
+            "upper_db and basis, and a remark on places where no antenna should be.",
         ),
     ] = None,
     anyway: Anyway = False,
@@ -49,35 +52,47 @@ def predict(
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
     import numpy as np
+    import pandas as pd
 
     from calibray.cli.progress import progress_bars
     from calibray.files import check_table, write_table
-    from calibray.inference.prediction import as_links
+    from calibray.inference.prediction import as_links, interval, opened
+    from calibray.inference.quantity import as_measured
+    from calibray.inference.remarks import remarks
     from calibray.result import Result
-    from calibray.tables.text import rows_text
 
     result = Result.load(folder, anyway=anyway)
     study = result.study
     links = as_links(result, links_file)
-    _refuse_columns(links_file, links.frame, PREDICTED[: 1 if level is None else None])
+    names = PREDICTED[: 1 if level is None else None]
+    own = as_measured(study, links, pd.DataFrame(np.nan, index=links.frame.index, columns=list(names)))
+    _refuse_columns(links_file, links.frame, (*names, *own, *(() if level is None else SAID)))
     if out is not None:
         check_table(out, [links_file, *study.files()], overwrite)
     with progress_bars(log) as progress:
-        if level is None:
-            table = links.frame.assign(**{PREDICTED[0]: result.predict(links, progress, anyway=anyway)})
-        else:
-            found = result.predict_interval(links, level, progress, anyway=anyway)
-            table = links.frame.assign(**{name: found[name].to_numpy() for name in PREDICTED})
+        setup = opened(result, links, anyway=anyway)
+        told = interval(result, setup, level, progress)
+    odd = remarks(result, setup)
+    columns = {name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))}
+    columns |= as_measured(study, links, told) | ({} if level is None else {"remark": odd})
+    table = links.frame.assign(**columns)
     if out is None:
         typer.echo(table.to_csv(index=False), nl=False)
     else:
         write_table(out, table)
-    lost = links.row[np.isinf(table[PREDICTED[0]].to_numpy())].tolist()
-    if lost:
-        typer.echo(
-            f"Warning: no path leads to {len(lost)} of {len(links)} links, {rows_text(lost)}",
-            err=True,
-        )
+    _warn("no path leads to", links.row[np.isinf(told["path_loss_db"].to_numpy())].tolist(), len(links))
+    parts = [set(filter(None, each.split(", "))) for each in odd.tolist()]
+    for part in sorted(set().union(*parts)):
+        rows = [row for row, each in zip(links.row.tolist(), parts, strict=True) if part in each]
+        _warn(f"{part}:", rows, len(links))
+
+
+def _warn(what: str, rows: list[int], count: int) -> None:
+    """Say of which rows something is to be said, if of any."""
+    from calibray.tables.text import rows_text
+
+    if rows:
+        typer.echo(f"Warning: {what} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _refuse_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:

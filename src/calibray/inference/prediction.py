@@ -15,6 +15,10 @@ from calibray import fields
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
+from calibray.inference.quantity import as_measured
+from calibray.inference.reach import FEW, reach
+from calibray.inference.remarks import PLACES, remarks
+from calibray.inference.residual_field import carried, measured_errors
 from calibray.measurements import Measurements, links_from_frame, read_links
 from calibray.progress import Progress
 from calibray.study import Setup
@@ -25,6 +29,9 @@ if TYPE_CHECKING:
 
 TRANSMITTER: Final = "transmitter"
 """What a term of the model that was chosen has an offset for each of, without a column that says so."""
+
+BESIDE: Final = 0.1
+"""Share of their neighbours' common errors from which on links are said to lie beside these."""
 
 KnownTerm = tuple[str, NDArray[np.float64], "NDArray[np.str_] | None", dict[str, float]]
 """Name of a nuisance, its column [n], labels of the groups [n] if it has any, and the coefficient of each."""
@@ -79,10 +86,11 @@ def opened(result: Result, links: Measurements, *, anyway: bool = False) -> Setu
 
 def _path_loss(result: Result, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
     links, study = setup.links, result.study
+    beside = _beside(result, links)[0]
     if result.chosen is not None:
         loss, shift = _chosen(result, result.chosen, setup, progress, strangers=False)
-        return loss + shift.value[0]
-    shift = _shift(_terms(result, links), links, {}).value[0]
+        return loss + shift.value[0] + beside
+    shift = _shift(_terms(result, links), links, {}).value[0] + beside
     paths = setup.trace(result.materials, progress)
     if links.frequency is None:
         return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + shift
@@ -113,13 +121,17 @@ def predict_interval(
 
     Returns:
         One row per link: path_loss_db, lower_db, upper_db, and basis, what the interval was taken from. Where no path
-        leads, the path loss is infinite and the ends are missing.
+        leads, the path loss is infinite and the ends are missing. Where not path loss was measured, the three follow as
+        what was. Last, a remark on links that end beyond the scene, under the ground or inside a building.
 
     Raises:
         InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had too
             few links to tell the size of errors.
     """
-    return interval(result, opened(result, as_links(result, links), anyway=anyway), level, progress)
+    setup = opened(result, as_links(result, links), anyway=anyway)
+    told = interval(result, setup, level, progress)
+    own = as_measured(result.study, setup.links, told)
+    return told.assign(**own, remark=remarks(result, setup))
 
 
 def interval(
@@ -144,47 +156,55 @@ def interval(
         return pd.DataFrame({"path_loss_db": _path_loss(result, setup, progress)})
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must lie between 0 and 1, as 0.9")
+    added, share = _beside(result, links)
     if (chosen := result.chosen) is not None:
         loss, shift = _chosen(result, chosen, setup, progress, strangers=True)
-        size, free = chosen.residual_db, chosen.links
-        return _framed(
-            loss + shift.value[0], np.sqrt(size**2 + shift.spread**2), shift, level, free, chosen.basis
-        )
-    size, basis = _residual(result)
-    shift = _shift(_terms(result, links), links, result.draws, strangers=True)
-    names = setup.parameters.names
-    values = np.array([[result.parameters[name] for name in names]])
-    if result.draws:
-        values = np.vstack([values, np.stack([result.draws[name] for name in names], axis=1)])
-    modelled = replay(setup, setup.trace(result.materials, progress)).path_loss(values) + shift.value
-    best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
-    drawn = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
-    variance = size**2 + shift.spread**2 + (np.mean(drawn**2, axis=0) if len(drawn) else 0.0)
-    freedom = max(result.counts["calibrated_on"] - len(names), 1)
-    basis += "" if len(drawn) else ", parameters as if known"
-    return _framed(np.where(reached, best, np.inf), np.sqrt(variance), shift, level, freedom, basis)
-
-
-def _framed(
-    best: NDArray[np.float64],
-    deviation: NDArray[np.float64],
-    shift: Shift,
-    level: float,
-    freedom: int,
-    basis: str,
-) -> pd.DataFrame:
-    """Predictions with their intervals, Student's t as wide as a deviation [n], [dB]."""
-    reached = np.isfinite(best)
-    half = np.where(reached, stdtrit(freedom, (1 + level) / 2) * deviation, np.nan)
+        best, variance, basis = loss + shift.value[0], shift.spread**2, chosen.basis
+        size, sizes, freedom = chosen.residual_db, np.array(chosen.sizes_db), chosen.links
+    else:
+        size, basis, sizes = _residual(result)
+        shift = _shift(_terms(result, links), links, result.draws, strangers=True)
+        names = setup.parameters.names
+        values = np.array([[result.parameters[name] for name in names]])
+        if result.draws:
+            values = np.vstack([values, np.stack([result.draws[name] for name in names], axis=1)])
+        modelled = replay(setup, setup.trace(result.materials, progress)).path_loss(values) + shift.value
+        best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
+        drawn = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
+        variance = shift.spread**2 + (np.mean(drawn**2, axis=0) if len(drawn) else 0.0)
+        best = np.where(reached, best, np.inf)
+        freedom = max(result.counts["calibrated_on"] - len(names), 1)
+        basis += "" if len(drawn) else ", parameters as if known"
+    # Beside measured links only their own part of the errors is left open.
+    own = size if result.residual_field is None else min(result.residual_field.own_db, size)
+    deviation = np.sqrt((1.0 - share) * size**2 + share * own**2 + variance)
+    factor = (
+        float(stdtrit(freedom, (1 + level) / 2))
+        if len(sizes) < FEW
+        else reach(sizes, level) / max(size, 1e-9)
+    )
     said = np.where(shift.spread > 0, f"{basis}, group never measured", basis)
+    said = np.where(share > BESIDE, np.char.add(said, ", beside measured links"), said)
+    half = np.where(np.isfinite(best), factor * deviation, np.nan)
+    best = best + added
     return pd.DataFrame(
         {
             "path_loss_db": best,
             "lower_db": best - half,
             "upper_db": best + half,
-            "basis": np.where(reached, said, "no path"),
+            "basis": np.where(np.isfinite(best), said, "no path"),
         }
     )
+
+
+def _beside(result: Result, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What measured links nearby add to path loss [n], [dB], and the share of their common errors known then [n]."""
+    field = result.residual_field
+    if field is None or links.frequency is not None or not set(PLACES) <= set(result.links):
+        return np.zeros(len(links)), np.zeros(len(links))
+    known, errors = measured_errors(result.links)
+    measured = result.links[list(PLACES)].to_numpy(float)[known]
+    return carried(field, measured, errors, np.hstack([links.tx, links.rx]))
 
 
 def as_links(result: Result, links: Measurements | pd.DataFrame | Path) -> Measurements:
@@ -209,10 +229,14 @@ def as_links(result: Result, links: Measurements | pd.DataFrame | Path) -> Measu
     return links_from_frame(links, group, frequency)
 
 
-def _residual(result: Result) -> tuple[float, str]:
-    """Standard deviation of single links' errors [dB], and what it was taken from."""
+def _residual(result: Result) -> tuple[float, str, NDArray[np.float64]]:
+    """Standard deviation of single links' errors [dB], what it was taken from, and sizes of errors held out [k]."""
     if result.residual_db is not None:
-        return result.residual_db, f"errors of {result.residual_basis}"
+        table, sizes = result.links, np.zeros(0)
+        if result.residual_basis.endswith("links held out"):
+            away = np.abs(table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float))
+            sizes = np.sort(away[table["held_out"].to_numpy(bool) & np.isfinite(away)])
+        return result.residual_db, f"errors of {result.residual_basis}", sizes
     count = result.counts["calibrated_on"]
     freedom = count - len(result.parameters) - len(result.offsets_db)
     if freedom < 1:
@@ -220,7 +244,8 @@ def _residual(result: Result) -> tuple[float, str]:
             f"{result.study.path}: {count} links are too few to tell the size of errors; measure more, or predict "
             "without a level"
         )
-    return result.rmse_db * float(np.sqrt(count / freedom)), f"errors of {count} links calibrated on"
+    size = result.rmse_db * float(np.sqrt(count / freedom))
+    return size, f"errors of {count} links calibrated on", np.zeros(0)
 
 
 class Shift(NamedTuple):

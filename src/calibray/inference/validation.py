@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from calibray.inference.comparing import Judgement, compare
+from calibray.inference.reach import reach
 from calibray.tables import Column, Table, glance, numbers
 
 BEFORE: Final = "before + offset"
@@ -103,6 +103,17 @@ class Validation:
         """
         return float(np.sqrt(np.nanmean(self.errors[name][self.block >= 0] ** 2)))
 
+    def sizes(self, name: str) -> NDArray[np.float64]:
+        """Sizes of a model's held-out errors.
+
+        Args:
+            name: The model.
+
+        Returns:
+            They, ascending [dB].
+        """
+        return np.sort(np.abs(self.errors[name][self.block >= 0]))
+
     def summary(self) -> tuple[Table | str, ...]:
         """The models side by side, and what follows.
 
@@ -143,7 +154,7 @@ class Validation:
             size = float(np.sqrt(np.mean(others**2)))
             mine = errors[here]
             density.append(-0.5 * (mine / size) ** 2 - np.log(size * np.sqrt(2 * np.pi)))
-            inside.append(np.abs(mine) <= stdtrit(len(others), (1 + self.level) / 2) * size)
+            inside.append(np.abs(mine) <= reach(np.sort(np.abs(others)), self.level))
         judged = errors[self.block >= 0]
         return {
             "rmse_db": float(np.sqrt(np.mean(judged**2))),

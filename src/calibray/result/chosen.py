@@ -35,6 +35,7 @@ class Chosen:
         residual_db: Standard deviation of its errors on blocks held out in turn [dB].
         basis: What that was taken from.
         links: Number of links that it was taken from.
+        sizes_db: Sizes of these errors, ascending, evenly taken where they are many [dB]; empty in older results.
     """
 
     name: str
@@ -43,3 +44,4 @@ class Chosen:
     residual_db: float = 0.0
     basis: str = ""
     links: int = 1
+    sizes_db: tuple[float, ...] = ()

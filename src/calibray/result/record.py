@@ -18,6 +18,7 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.progress import Progress
 from calibray.result.chosen import Chosen, ChosenTerm
+from calibray.result.residuals import ResidualField
 from calibray.result.rows import COLUMNS, read_rows
 from calibray.result.stored import VERSION, read_stored
 from calibray.result.tables import summary
@@ -96,6 +97,8 @@ class Result:
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
         paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
         chosen: The model that did best on blocks held out in turn, which predictions go by; None where none were.
+        residual_field: What neighbouring links' errors share, which predictions beside measured links are corrected
+            by; None where they show nothing.
         prepared: What was left out, averaged or moved before rows were links, and how many of them.
     """
 
@@ -143,6 +146,7 @@ class Result:
     residual_db: float | None = None
     residual_basis: str = ""
     chosen: Chosen | None = None
+    residual_field: ResidualField | None = None
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -256,6 +260,7 @@ class Result:
             "residual_db": self.residual_db,
             "residual_basis": self.residual_basis,
             "chosen": None if self.chosen is None else asdict(self.chosen),
+            "residual_field": None if self.residual_field is None else asdict(self.residual_field),
         }
 
     @classmethod
@@ -288,6 +293,8 @@ class Result:
         if stored.chosen is not None:
             terms = tuple(ChosenTerm(**asdict(each)) for each in stored.chosen.terms)
             given["chosen"] = replace(Chosen(**asdict(stored.chosen)), terms=terms)
+        if stored.residual_field is not None:
+            given["residual_field"] = ResidualField(**asdict(stored.residual_field))
         given["intervals"] = {name: Interval(**asdict(each)) for name, each in stored.intervals.items()}
         given["materials"] = {name: Material(**asdict(each)) for name, each in stored.materials.items()}
         given["validation"] = read_validation(source.parent, len(links))
@@ -337,7 +344,8 @@ class Result:
             anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
         Returns:
-            One row per link: path_loss_db, lower_db, upper_db [dB], and basis, what the interval was taken from.
+            One row per link: path_loss_db, lower_db, upper_db [dB], and basis, what the interval was taken from; where
+            not path loss was measured, the three as what was; and remark, on a place where no link should be.
 
         Raises:
             InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had

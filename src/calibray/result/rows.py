@@ -19,7 +19,7 @@ HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f",
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """The columns of each file, and the kinds of their numbers."""
 
-MAYBE: Final = ("leverage", "depth")
+MAYBE: Final = ("leverage", "depth", "chosen_db")
 """Columns of numbers that are there where they could be known."""
 
 FIRST_NAMES: Final = {"result-links.csv": "links.csv", "result-history.csv": "history.csv"}

@@ -14,6 +14,7 @@ from calibray.errors import InputError
 from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.result.chosen import Chosen
+from calibray.result.residuals import ResidualField
 from calibray.spelling import shortened
 from calibray.study import Study
 from calibray.study.faults import explain
@@ -25,10 +26,12 @@ if TYPE_CHECKING:
     _Interval = Interval
     _Material = Material
     _Chosen = Chosen
+    _Field = ResidualField
 else:
     _Interval = checked(Interval, config=CLOSED, frozen=True)
     _Material = checked(Material, config=CLOSED, frozen=True)
     _Chosen = checked(Chosen, config=CLOSED, frozen=True)
+    _Field = checked(ResidualField, config=CLOSED, frozen=True)
 
 Count = Annotated[int, Field(ge=0)]
 Error = Annotated[float, Field(ge=0)]
@@ -95,6 +98,7 @@ class Stored(Section):
     residual_db: Error | None = None
     residual_basis: str = ""
     chosen: _Chosen | None = None
+    residual_field: _Field | None = None
 
 
 def read_stored(source: Path) -> tuple[Stored, Study]:
