@@ -1,6 +1,6 @@
 """What a coverage map costs beside a trace of as many receivers, and how Sionna's radio map solver differs from it.
 
-    python benchmarks/coverage_map.py [--cells 64] [--solver]
+    python benchmarks/coverage_map.py [--cells 64 | --whole] [--samples auto] [--solver]
 
 The demo district, one of its transmitters, an area of cells around it of 5 m, the values planted in its world. The map
 is timed against the same trace alone, both without the cache and each after a first run that compiles. With --solver,
@@ -29,13 +29,19 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, default=64)
-    parser.add_argument("--samples", type=int, default=50_000)
+    parser.add_argument(
+        "--samples",
+        type=lambda text: text if text == "auto" else int(text),
+        default=50_000,
+        help='rays, or "auto"',
+    )
+    parser.add_argument("--whole", action="store_true", help="all cells of the district")
     parser.add_argument("--solver", action="store_true")
     given = parser.parse_args()
     os.environ["CALIBRAY_CACHE"] = ""
     result = _result(given.samples)
     half = CELL * round(np.sqrt(given.cells)) / 2
-    bounds = (TX[0] - half, TX[1] - half, TX[0] + half, TX[1] + half)
+    bounds = None if given.whole else (TX[0] - half, TX[1] - half, TX[0] + half, TX[1] + half)
 
     def mapped() -> object:
         return cb.coverage_map(result, TX, cell=CELL, bounds=bounds)
@@ -54,7 +60,7 @@ def main() -> None:
         _solver(result, coverage)
 
 
-def _result(samples: int) -> cb.Result:
+def _result(samples: int | str) -> cb.Result:
     """A calibration of the district as `auto` finds it, quickly."""
     from calibray.scenarios import demo_study_path
 

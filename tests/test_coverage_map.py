@@ -124,6 +124,18 @@ def test_the_command_writes_a_map(folder, found, tmp_path):
     assert table.received_power_dbm.to_numpy() == pytest.approx(30 - found.path_loss_db.reshape(-1), abs=0.05)
     again = CliRunner().invoke(app, ["map", str(folder), "--column", "half"])
     assert again.exit_code == 2
+    refused = CliRunner().invoke(app, ["map", str(folder), "--samples", "many"])
+    assert refused.exit_code == 2
+    assert '--samples many: must be a whole number, or "auto"' in refused.stderr
+
+
+def test_rays_added_in_rounds_find_what_the_study_finds(result, found):
+    adaptive = cb.coverage_map(
+        result, TX, cell=30.0, bounds=AREA, columns=WEST, level=None, samples="auto"
+    ).path_loss_db
+    reached = np.isfinite(found.path_loss_db)
+    assert np.isfinite(adaptive)[reached].all()
+    assert (adaptive[reached] - found.path_loss_db[reached]).max() < 0.05
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from calibray.cli.console import Anyway, Overwrite, log
 from calibray.errors import InputError
+from calibray.spelling import shortened
 
 
 def map(
@@ -44,9 +45,9 @@ def map(
         ),
     ] = None,
     samples: Annotated[
-        int | None,
+        str | None,
         typer.Option(
-            metavar="N",
+            metavar="N|auto",
             help="Rays in place of the study's: the time goes with them, and with too few paths are missed.",
         ),
     ] = None,
@@ -86,7 +87,7 @@ def map(
             bounds=bounds,
             level=level or None,
             power_dbm=power,
-            samples=samples,
+            samples=None if samples is None else _samples(samples),
             columns=_columns(column or []),
             progress=progress,
             anyway=anyway,
@@ -97,6 +98,16 @@ def map(
     if len(names) < len(FILES):
         typer.echo("No GeoTIFF without rasterio; install it with: pip install 'calibray[scenes]'", err=True)
     typer.echo(f"Written to {target}: {', '.join(names)}", err=True)
+
+
+def _samples(given: str) -> int | Literal["auto"]:
+    """Rays, as the study takes them."""
+    if given == "auto":
+        return "auto"
+    try:
+        return int(given)
+    except ValueError:
+        raise InputError(f'--samples {shortened(given)}: must be a whole number, or "auto"') from None
 
 
 def _columns(given: list[str]) -> dict[str, object]:

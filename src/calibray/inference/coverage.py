@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -99,7 +99,7 @@ def coverage_map(
     bounds: Sequence[float] | None = None,
     level: float | None = 0.9,
     power_dbm: float | None = None,
-    samples: int | None = None,
+    samples: int | Literal["auto"] | None = None,
     columns: Mapping[str, object] | None = None,
     progress: Progress | None = None,
     anyway: bool = False,
@@ -115,7 +115,8 @@ def coverage_map(
         level: Probability that a measurement lies within the interval; None for no interval.
         power_dbm: Transmitted power [dBm], for a map of received power in place of path loss. After a calibration on
             RSRP 0 is taken, for the offset has the power in it.
-        samples: Rays in place of the study's; the time goes with them, and with too few paths are missed.
+        samples: Rays in place of the study's; the time goes with them, and with too few paths are missed. "auto" adds
+            rays until path loss stands still, and takes less time than many.
         columns: What the study's columns of groups, carriers or nuisances hold for this transmitter, by name. The
             group of an offset is taken from the links measured there, where these have one.
         progress: Called with the stage "tracing" after every launch.
@@ -179,7 +180,7 @@ def _transmitter(result: Result, tx: Sequence[float] | None) -> NDArray[np.float
     return known[0]
 
 
-def _with_samples(result: Result, samples: int) -> Result:
+def _with_samples(result: Result, samples: int | Literal["auto"]) -> Result:
     content = result.study.content()
     content["trace"]["samples"] = samples
     return replace(result, study=Study.from_content(content, result.study.path))
