@@ -21,10 +21,12 @@ from typer.testing import CliRunner
 
 import programs
 from calibray import interruption
+from calibray.calibration import calibrate
 from calibray.cli.app import app
 from calibray.cli.progress import progress_bars
 from calibray.engines import open_ledger
 from calibray.errors import EngineError
+from calibray.study import Study
 from test_cli_run import write_study
 
 # Its standard input becomes the terminal that Ctrl-C is typed in, which jobs in the background ignore by inheritance.
@@ -115,6 +117,21 @@ def test_what_fails_after_ctrl_c_is_an_interruption_and_nothing_else_is(pressed)
 
     with pytest.raises(KeyboardInterrupt if pressed else ValueError):
         work()
+
+
+def test_an_import_that_dropped_ctrl_c_is_an_interruption_of_a_calibration(monkeypatch, tmp_path):
+    """Mitsuba's does at times: its module then lacks what others look for in it."""
+
+    def opened(*_):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise AttributeError("Module 'mitsuba' has no attribute 'Scene'")
+
+    write_study(tmp_path, programs.content(tmp_path))
+    study = Study.load(tmp_path / "study.toml")
+    monkeypatch.setattr("calibray.study.Setup.open", opened)
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(study)
 
 
 def test_what_went_wrong_when_ctrl_c_was_pressed_is_told(monkeypatch, tmp_path):

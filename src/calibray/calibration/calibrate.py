@@ -21,7 +21,7 @@ from calibray.engines.crew import Crew
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.files import check_outputs
-from calibray.interruption import interruptible
+from calibray.interruption import interruptible, noticed
 from calibray.progress import Progress
 from calibray.result import FILES, Result
 from calibray.study import Setup, Study
@@ -29,6 +29,8 @@ from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import TracerFactory
 
 
+# Cut short, an import leaves modules half-made, and what fails then knows nothing of Ctrl-C.
+@noticed()
 @interruptible()
 def calibrate(
     study: Study | Setup,
