@@ -13,8 +13,9 @@ import two_ray
 from calibray import engines
 from calibray.calibration.problem import Problem
 from calibray.engines.blocks import Blocks, cut
-from calibray.engines.crew import Here
+from calibray.engines.crew import Here, open_crew
 from calibray.engines.kinds.replay import _traced
+from calibray.errors import InputError
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.objective import make_objective
 from calibray.inference.squares import total
@@ -113,3 +114,12 @@ def test_a_lost_path_and_a_link_left_out_are_as_in_one_piece():
     assert -products[0, :-1, -1] == pytest.approx(jacobian[0].T @ residuals[0], rel=1e-10, abs=1e-10)
     assert np.isinf(square[1])
     assert np.isinf(objective.rmse(loss)[1])
+
+
+@pytest.mark.parametrize("workers", [0, 300_000])
+def test_processes_that_no_machine_can_use_are_refused(workers):
+    with (
+        pytest.raises(InputError, match=f"--workers {workers}: must be at least 1 and at most"),
+        open_crew(workers),
+    ):
+        pass

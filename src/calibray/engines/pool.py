@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 PATIENCE = 30
 """How long to wait for a scheduler [s]."""
+
+FEW: Final = 8
+"""Worker processes that any machine may be asked for."""
 
 _ADDRESS: Final = re.compile(
     r"(?:(?:tcp|tls|wss?)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]{1,253}):(?P<port>[0-9]{1,5})"
@@ -100,10 +104,14 @@ def open_local_client(workers: int) -> Iterator[Client]:
         The client.
 
     Raises:
-        InputError: The number is not positive, or Dask is not installed.
+        InputError: The number is not positive or beyond what this machine can use, or Dask is not installed.
     """
-    if workers < 1:
-        raise InputError(f"--workers {workers}: must be at least 1")
+    most = max(os.cpu_count() or 1, FEW)
+    if not 1 <= workers <= most:
+        raise InputError(
+            f"--workers {workers}: must be at least 1 and at most {most}, each is a process that works all the time; "
+            "more of them need more machines, and --scheduler"
+        )
     _need_dask("--workers")
     from distributed import Client, LocalCluster
 
