@@ -80,9 +80,8 @@ def check() -> None:
         raise KeyboardInterrupt
 
 
-_pressed: list[
-    float
-] = []  # when, within `noticed`; there is one keyboard, and one handler of its signal, a process
+# When, within `noticed`; there is one keyboard, and one handler of its signal, a process.
+_pressed: list[float] = []
 
 
 def _press(_: int, __: FrameType | None) -> None:
