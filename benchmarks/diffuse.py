@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibray import engines
 from calibray.engines import Replay
 from calibray.engines.compression import compress
 from calibray.parameters import Parameter, Parameters
-from calibray.study import Study
+from calibray.study import Setup, Study
 from calibray.tracing.sionna import Tracer
 from timing import seconds
 
@@ -39,7 +38,8 @@ def main() -> None:
         print(f"no campaign under {data}: not measured")
         return
     study = Study.load(STUDY)
-    links, scene = study.measurements(), engines.make_scene(study)
+    setup = Setup.open(study)
+    links, scene = setup.links, setup.scene
     rough = {name: replace(scene.materials[name], scattering_coefficient=0.4) for name in NAMES}
     scene = replace(scene, materials={**scene.materials, **rough})
     settings = replace(study.trace, diffuse_reflection=True, max_depth=3, samples=samples)

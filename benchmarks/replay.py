@@ -16,7 +16,7 @@ import numpy as np
 
 from calibray import engines
 from calibray.scenarios import demo_study_path
-from calibray.study import Study
+from calibray.study import Setup, Study
 from calibray.tracing.sionna import Trace, Tracer
 from timing import seconds
 
@@ -46,9 +46,8 @@ def main() -> None:
     print(f"demo district: {replay.paths.num_links} links, {replay.paths.num_paths} paths, "
           f"{replay.paths.num_interactions} interactions")  # fmt: skip
     turn = iter(np.tile(points, (10, 1)))
-    stored = Tracer(engines.make_scene(study), study.scene.frequency, study.trace, *study.antenna_pair).find(
-        study.measurements()
-    )
+    setup = Setup.open(study)
+    stored = Tracer(setup.scene, study.scene.frequency, study.trace, *study.antenna_pair).find(setup.links)
     rows = [
         ("re-trace with Sionna RT", seconds(lambda: retrace.path_loss(next(turn)[None]), 3)),
         ("Sionna's field stage on stored paths", seconds(field_stage(stored, replay, points), 9)),

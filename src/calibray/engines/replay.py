@@ -16,13 +16,13 @@ from calibray.engines.protocol import check_candidates
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
-BLOCK_INTERACTIONS: Final = 50_000
-"""Interactions times candidates evaluated at once, whose numbers fit into a core's cache."""
+ANSWERS: Final = 2_000_000
+"""Derivatives by every material's constants that a call returns, at most."""
 
 LARGE: Final = 50_000
 """Interactions beyond which a program is large."""
 
-TABULATED: Final = 5_000
+TABULATED: Final = 30_000
 """Interactions beyond which coefficients may come from tables."""
 
 NODES: Final = 0.25
@@ -34,8 +34,8 @@ TABLE_TOLERANCE: Final = 1e-4
 FORETOLD: Final = 32
 """Candidates spread over the bounds that tell how fine tables must be, beside the first one."""
 
-LARGEST_BLOCK: Final = 16
-"""Candidates a call, at most; fewer are filled up, so that a program is compiled for one number of candidates."""
+LARGEST_BLOCK: Final = 32
+"""Candidates a call, at most; a program is compiled for this number, and fewer cost no more than they are."""
 
 
 class Replay:
@@ -119,12 +119,12 @@ class Replay:
         loss, jacobian = self._run(self._jacobian, candidates)
         return loss, jacobian
 
-    def _value(self, tables: jax.Array) -> tuple[jax.Array, float]:
-        return fields.path_losses(self._program, tables, self._combining, self._offsets)
+    def _value(self, tables: jax.Array, count: int) -> tuple[jax.Array, float]:
+        return fields.path_losses(self._program, tables, self._combining, self._offsets, count)
 
-    def _jacobian(self, tables: jax.Array) -> tuple[jax.Array, jax.Array, float]:
+    def _jacobian(self, tables: jax.Array, count: int) -> tuple[jax.Array, jax.Array, float]:
         loss, slope, error = fields.path_losses_and_slopes(
-            self._program, tables, self._fields, self._combining, self._offsets
+            self._program, tables, self._fields, self._combining, self._offsets, count
         )
         return loss, _chosen(slope, self._rows, self._places), error
 
@@ -136,7 +136,7 @@ class Replay:
             block = values[start : start + size]
             padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
             tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
-            *found, error = function(tables)
+            *found, error = function(tables, len(block))
             if error > TABLE_TOLERANCE:
                 self._refine()
                 continue
@@ -169,7 +169,7 @@ class Replay:
         """Candidates that a call takes: one where tables are filled for each."""
         if self._intervals is not None:
             return 1
-        room = BLOCK_INTERACTIONS // max(self.paths.num_interactions, 1)
+        room = ANSWERS // max(self.paths.num_links * len(self.materials) * len(self._fields), 1)
         return min(LARGEST_BLOCK, 1 << max(room, 1).bit_length() - 1)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.fields import slab
+from calibray.fields.circle import circle
 from calibray.paths import Paths
 
 Offsets = jax.Array | NDArray[np.float64] | None
@@ -64,7 +65,7 @@ def link_power(
     ports = gain[0].shape[1]
     nodes = jnp.array([[0.0], [1.0]]) if offsets is None else jnp.asarray(offsets)
     phase = -2 * jnp.pi * jnp.asarray(delay)[:, None] * (frequency + nodes[0])  # [P, q]
-    turn = jnp.cos(phase), jnp.sin(phase)
+    turn = circle(phase)
     rotated = slab.multiply((gain[0][..., None], gain[1][..., None]), turn)  # [R, T, P, q]
     real, imaginary = (total(jnp.moveaxis(part, 2, 0)) for part in rotated)  # [L, R, T, q]
     return (slab.power((real, imaginary)) * nodes[1]).sum(axis=(1, 2, 3)) / ports

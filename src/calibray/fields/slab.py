@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from scipy.constants import epsilon_0, speed_of_light
 
+from calibray.fields.circle import circle
+
 Pair = tuple[jax.Array, jax.Array]
 Values = TypeVar("Values")
 
@@ -70,8 +72,8 @@ def coefficients(
     """
     root = keep(_root((permittivity - 1) + cosine * cosine, loss), wavelength)  # sqrt(eta - sin^2 theta)
     scale = 2 * jnp.pi * thickness / wavelength
-    decay, turn = jnp.exp(scale * root[1]), scale * root[0]
-    phase = keep((decay * jnp.cos(turn), -decay * jnp.sin(turn)), wavelength)  # e^{-jq}, q of eq. 44
+    decay, (cosine_q, sine_q) = jnp.exp(scale * root[1]), circle(scale * root[0])
+    phase = keep((decay * cosine_q, -decay * sine_q), wavelength)  # e^{-jq}, q of eq. 44
     across = multiply(phase, phase)
     eta_cosine = permittivity * cosine, -loss * cosine
     half = (
