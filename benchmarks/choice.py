@@ -67,7 +67,7 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
     inner = validated(part)
-    found = models(part, np.zeros((0, len(problem.parameters))))
+    found = models(part)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
     judged = errors[inner.chosen][np.isfinite(errors[inner.chosen])]
     return inner.chosen, errors, (np.abs(judged) <= reach(inner.sizes(inner.chosen), LEVEL)).tolist()

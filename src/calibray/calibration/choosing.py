@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.calibration.problem import Problem
-from calibray.calibration.validate import TX_OFFSET, fitted_twins, predicted
+from calibray.calibration.twins import TX_OFFSET, minima, predicted, twins
 from calibray.inference.nuisance import OFFSET
 from calibray.inference.objective import Objective
 from calibray.inference.rivals import fitted_law
-from calibray.inference.validation import LAW, Validation
+from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.study import Study
+
+SEARCHES: Final = 32
+"""Local searches for the model's optimum, beside the one from the calibrated one."""
 
 MOST: Final = 400
 """Errors that are kept with the model."""
@@ -44,7 +47,11 @@ def choose_model(
         law, rise = fitted_law(problem.setup.links, problem.objective, frequency)
         chosen = Chosen(name, None, _terms(law, rise[None], study), size, basis, count, sizes)
         return chosen, predicted(law, rise)
-    variant, point = fitted_twins(problem, best[None])[name]
+    variant, point = twins(problem, best)[name], best
+    if name == BEFORE:
+        point = problem.parameters.to_search(problem.parameters.start)
+    elif name != CALIBRATED:
+        point = minima(variant, best[None], SEARCHES)[0]
     told = variant.evaluate(point[None])
     values = problem.parameters.named(problem.parameters.from_search(point))
     chosen = Chosen(name, values, _terms(variant.objective, told.modelled, study), size, basis, count, sizes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -10,30 +11,13 @@ from numpy.typing import NDArray
 
 from calibray import engines
 from calibray.calibration.heard import heard
-from calibray.calibration.methods import local_searches
 from calibray.calibration.problem import Problem
-from calibray.calibration.search import rounds
+from calibray.calibration.twins import NOTHING, fitted, predicted
 from calibray.calibration.weighing import weighed
-from calibray.engines.protocol import Differentiable
 from calibray.errors import EngineError, InputError
 from calibray.inference.blocks import blocks as parted
-from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_term, transmitters
-from calibray.inference.objective import Objective
 from calibray.inference.rivals import kriging, log_distance
-from calibray.inference.validation import (
-    BEFORE,
-    CALIBRATED,
-    FIELD,
-    KRIGING,
-    LAW,
-    PER_TX,
-    PRIOR,
-    PRIOR_PER_TX,
-    SLOPE,
-    Validation,
-)
-from calibray.optimizers import LeastSquares
-from calibray.parameters import LogNormal
+from calibray.inference.validation import BEFORE, CALIBRATED, FIELD, KRIGING, LAW, Validation
 from calibray.progress import Progress
 from calibray.study import Setup, Study
 from calibray.tracing.factory import SIONNA
@@ -44,18 +28,6 @@ BLOCKS: Final = 4
 
 MOST_BLOCKS: Final = 100
 """The largest number of spatial blocks, here as in a study."""
-
-SPREAD: Final = 0.3
-"""Standard deviation of the logarithm of a parameter around its start, where the model has priors."""
-
-MINIMA: Final = 24
-"""Minima over all links that the search without a block starts from, beside points of its own."""
-
-SEARCHES: Final = 32
-"""Points of its own."""
-
-TX_OFFSET: Final = "offset of the transmitter"
-"""Name of the term that gives each transmitter its offset."""
 
 TX: Final = "tx"
 """Label of a link's transmitter where the table has no such column: its position."""
@@ -132,8 +104,7 @@ def validated(
     """
     links, objective = problem.setup.links, problem.objective
     block, labels = _parted(problem, blocks, by)
-    searches = min(local_searches(_interactions(problem)), 128)
-    known = _minima(problem, np.zeros((0, len(problem.parameters))), searches)
+    known = {name: points for name, (_, points) in fitted(problem).items()}
     errors: dict[str, NDArray[np.float64]] = {}
     for number in range(len(labels)):
         here = block == number
@@ -175,19 +146,23 @@ def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
     return block, labels
 
 
-def models(part: Problem, known: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def models(
+    part: Problem, known: Mapping[str, NDArray[np.float64]] = NOTHING
+) -> dict[str, NDArray[np.float64]]:
     """Every model, fitted to the links that count.
 
     Args:
         part: The problem, other links without weight.
-        known: Points that searches start from beside their own [k, d].
+        known: Points that searches start from beside their own, by name of the model [k, d].
 
     Returns:
         Path loss at all links by name of the model [L], [dB]; NaN where nothing could be kriged.
     """
     setup, objective = part.setup, part.objective
-    twins = fitted_twins(part, known)
-    found = {name: _at(variant, point) for name, (variant, point) in twins.items()}
+    found = {
+        name: predicted(variant.objective, variant.modelled(points[:1])[0])
+        for name, (variant, points) in fitted(part, known).items()
+    }
     found[LAW] = log_distance(setup.links, objective, setup.study.scene.frequency)
     for name, law in ((KRIGING, LAW), (FIELD, CALIBRATED)):
         try:
@@ -196,93 +171,3 @@ def models(part: Problem, known: NDArray[np.float64]) -> dict[str, NDArray[np.fl
             # Too few or too many links, or all at one place: nothing to krige.
             found[name] = np.full(len(setup.links), np.nan)
     return found
-
-
-def fitted_twins(part: Problem, known: NDArray[np.float64]) -> dict[str, tuple[Problem, NDArray[np.float64]]]:
-    """Every model that knows the scene, fitted to the links that count.
-
-    Args:
-        part: The problem, other links without weight.
-        known: Points that searches start from beside their own [k, d].
-
-    Returns:
-        By name of the model: the problem that it solves, and where it found its optimum, a point of the search
-        space [d].
-    """
-    setup, objective, parameters = part.setup, part.objective, part.parameters
-    calibrated = _minima(part, known)
-    shifted = replace(part, objective=_with_term(objective, CONSTANT, setup))
-    found = {BEFORE: (shifted, parameters.to_search(parameters.start)), CALIBRATED: (part, calibrated[0])}
-    rows = objective.num_counted
-    noise = float(part.squares(calibrated[:1]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
-    prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
-    variants = {PRIOR: prior, SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup))}
-    if (per_tx := _per_transmitter(objective, setup)) is not None:
-        variants[PER_TX] = replace(part, objective=per_tx)
-        variants[PRIOR_PER_TX] = replace(prior, objective=replace(per_tx, noise_db=noise))
-    for name, variant in variants.items():
-        found[name] = variant, _minima(variant, calibrated)[0]
-    return found
-
-
-def _per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
-    """The objective with an offset for every transmitter, if there are several and it has none such."""
-    labels = transmitters(setup.links)
-    if len(np.unique(labels)) < 2 or any(len(term.labels) > 1 for term in objective.nuisance.terms):
-        return None
-    offset = make_term(setup.links, TX_OFFSET, labels=labels)
-    kept = [term for term in objective.nuisance.terms if term.by != CONSTANT]
-    return replace(objective, nuisance=Nuisance(len(setup.links), (*kept, offset)))
-
-
-def _minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHES) -> NDArray[np.float64]:
-    """Minima of a problem by local searches, the best first [k, d]."""
-    search = LeastSquares(*problem.parameters.search_bounds, starts=searches, x0=known[:MINIMA])
-    for _ in rounds(search, problem.squares):
-        pass
-    return search.minima
-
-
-def _at(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    return predicted(problem.objective, problem.modelled(point[None])[0])
-
-
-def predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss with the nuisance fitted to the links that count; a group that has none gets the mean.
-
-    Args:
-        objective: What the model is fitted by.
-        path_loss: Path loss without it [L], [dB].
-
-    Returns:
-        Path loss with it [L], [dB].
-    """
-    coefficients = objective.coefficients(path_loss[None])
-    filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
-    return objective.capped(path_loss) + objective.nuisance.contribution(filled)[0]
-
-
-def _with_term(objective: Objective, by: str, setup: Setup) -> Objective:
-    """The objective with one coefficient of a kind for all links, if it has none of that kind."""
-    if any(term.by == by for term in objective.nuisance.terms):
-        return objective
-    term = make_term(setup.links, f"{by} of all links", by)
-    terms = (*objective.nuisance.terms, term)
-    return replace(objective, nuisance=Nuisance(len(setup.links), terms))
-
-
-def _start_priors(problem: Problem) -> LogNormal:
-    """The study's priors, and one around the start of every other parameter that is positive."""
-    parameters, given = problem.parameters, problem.priors
-    place = [
-        k for k, each in enumerate(parameters) if k not in given.index and each.lower > 0 and each.start > 0
-    ]
-    return LogNormal(
-        (*given.index, *place),
-        (*given.centre, *(float(parameters.start[k]) for k in place)),
-        (*given.spread, *(SPREAD for _ in place)),
-    )
-
-
-def _interactions(problem: Problem) -> int:
-    return problem.engine.interactions if isinstance(problem.engine, Differentiable) else 1
