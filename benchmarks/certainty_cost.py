@@ -21,6 +21,7 @@ from calibray.calibration.methods import choose
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
 from calibray.calibration.validate import validated
+from calibray.inference.validation import CALIBRATED
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
@@ -42,7 +43,7 @@ def costs(problem: Problem) -> dict[str, tuple[float, int]]:
     for _ in range(2):  # the first compiles
         trail = timed("calibration", search, problem, choose(problem))
         timed("draws and verdicts", certainty, problem, trail)
-        validation = timed("validation", validated, problem)
+        validation = timed("validation", validated, problem, None, None, None, {CALIBRATED: trail.minima})
         best = problem.parameters.to_search(trail.best)
         timed("choice", choose_model, problem, validation, best)
     return found

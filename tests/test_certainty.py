@@ -9,6 +9,7 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibration import calibrate
+from calibray.calibration.outcome import UNJUDGED
 from calibray.calibration.problem import Problem
 from calibray.calibration.validate import validated
 from calibray.errors import InputError
@@ -169,6 +170,11 @@ def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
     assert found.residual_db == pytest.approx(found.holdout_rmse_db)
     assert any(remark.startswith("Calibration ") for remark in found.remarks)
     assert found.chosen.name.startswith("calibrated")
+
+
+def test_a_run_that_nothing_judges_says_how_to_have_it_judged(result, tmp_path, noisy):
+    assert UNJUDGED in result.remarks
+    assert UNJUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
 
 
 def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noisy):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import Final
 
 from calibray import engines
 from calibray.calibration.certainty import certainty
@@ -15,18 +16,23 @@ from calibray.calibration.outcome import outcome
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
 from calibray.calibration.settle import settle
+from calibray.calibration.twins import NOTHING
 from calibray.calibration.validate import check_engine, validated
 from calibray.calibration.weighing import weighed
 from calibray.engines.crew import Crew
 from calibray.engines.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.files import check_outputs
+from calibray.inference.validation import CALIBRATED
 from calibray.interruption import interruptible, noticed
 from calibray.progress import Progress
 from calibray.result import FILES, Result
 from calibray.study import Setup, Study
 from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import TracerFactory
+
+FEW: Final = 2
+"""Minima of a method that kept its best alone."""
 
 
 # Cut short, an import leaves modules half-made, and what fails then knows nothing of Ctrl-C.
@@ -97,7 +103,8 @@ def calibrate(
     problem, trail, gap = settle(problem, trail, progress)
     seconds = time.perf_counter() - traced
     told = certainty(problem, trail, progress, helper.model)
-    judged = validated(problem, progress=progress) if in_turn else None
+    known = {CALIBRATED: trail.minima} if len(trail.minima) > FEW else NOTHING
+    judged = validated(problem, progress=progress, known=known) if in_turn else None
     result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started, helper)
     if out is not None:
         # Asked before the work: what was computed is not lost to a file that came in the meantime.

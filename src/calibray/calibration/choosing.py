@@ -16,7 +16,7 @@ from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.study import Study
 
-SEARCHES: Final = 32
+SEARCHES: Final = 16
 """Local searches for the model's optimum, beside the one from the calibrated one."""
 
 MOST: Final = 400

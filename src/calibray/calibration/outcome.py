@@ -36,6 +36,12 @@ FEWEST: Final = 8
 """Links held out that a scale of residuals can be taken from."""
 
 
+UNJUDGED: Final = (
+    "No link was held out to tell which model predicts best elsewhere: say [holdout] blocks = 4, or ask calibray "
+    "validate."
+)
+"""Said where no link judges the calibration."""
+
 FAINT: Final = "expected too near the noise floor, left out"
 """What links are counted as that the model expects near the noise floor."""
 
@@ -178,10 +184,11 @@ def _rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_])
 
 def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
     """Accuracy on the links that a filter holds out, and what follows from it."""
-    objective, links, fitted = problem.objective, problem.setup.links, bool(problem.objective.nuisance.terms)
+    objective, links, study = problem.objective, problem.setup.links, problem.setup.study
+    fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
     judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
-    judgement: tuple[str, ...] = ()
+    judgement: tuple[str, ...] = () if judged.any() or study.engine.name != "replay" else (UNJUDGED,)
     errors = (models.after - objective.measured)[judged]
     if judged.any():
         rivals = {

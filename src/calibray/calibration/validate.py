@@ -86,7 +86,11 @@ def check_engine(study: Study) -> None:
 
 
 def validated(
-    problem: Problem, blocks: int | None = None, by: str | None = None, progress: Progress | None = None
+    problem: Problem,
+    blocks: int | None = None,
+    by: str | None = None,
+    progress: Progress | None = None,
+    known: Mapping[str, NDArray[np.float64]] = NOTHING,
 ) -> Validation:
     """Judge models on a problem that is set up, over all its links.
 
@@ -95,6 +99,7 @@ def validated(
         blocks: Number of spatial blocks; the study's if None and `by` is None.
         by: Column whose labels are held out in turn.
         progress: Called with the stage "validating".
+        known: Minima of the study's own model over all links, under its name [k, d]; looked for if absent.
 
     Returns:
         Held-out errors of every model.
@@ -104,7 +109,7 @@ def validated(
     """
     links, objective = problem.setup.links, problem.objective
     block, labels = _parted(problem, blocks, by)
-    known = {name: points for name, (_, points) in fitted(problem).items()}
+    known = {name: points for name, (_, points) in fitted(problem, known).items()}
     errors: dict[str, NDArray[np.float64]] = {}
     for number in range(len(labels)):
         here = block == number
