@@ -19,6 +19,9 @@ from calibray.result import Result, tables
 from calibray.study import Setup
 from calibray.tables.text import render
 
+CENSORED = planted.content("links.csv")["links"] | {
+    "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "unheard": "censor",
+}  # fmt: skip
 FEW = {"name": "auto", "options": {"starts": 64}}
 MARBLE = "marble.relative_permittivity"
 
@@ -120,6 +123,9 @@ def test_a_slope_is_found_reported_and_predicted_with(tmp_path, noisy):
         ({"nuisance": {"a": {"by": "constant", "prior": 0}}}, "prior"),
         ({"holdout": {"blocks": 4, "by": "half"}}, "one of where, blocks and by"),
         ({"holdout": {}}, "one of where, blocks and by"),
+        ({"links": CENSORED | {"noise_floor_dbm": None}}, "needs noise_floor_dbm"),
+        ({"links": CENSORED | {"average": {"by": "cell", "size": 5.0}}}, "leave one of them out"),
+        ({"links": CENSORED, "noise": {"range_m": 30.0}}, "leave one of them out"),
         ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"spread": 0.3}}}}, "one of itu and value"),
         ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"itu": "bread", "spread": 1}}}}, "bread"),
     ],

@@ -9,6 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import planted
+from calibray.calibration import calibrate
+from calibray.calibration.explaining import Explaining
 from calibray.calibration.heard import MARGIN, heard
 from calibray.calibration.problem import Problem
 from calibray.inference.nuisance import Nuisance, make_term
@@ -18,6 +21,7 @@ from calibray.measurements.preparation import prepare
 from calibray.measurements.reading import measured_links
 from calibray.measurements.tables import SourceTable
 from calibray.parameters import Parameter, Parameters
+from calibray.study import Setup
 
 STONE = Parameter("stone.relative_permittivity", 1.5, 12.0, 8.0)
 SLOPE, SPREAD_DB, LIMIT_DB = 5.0, 2.0, 115.0
@@ -118,3 +122,32 @@ def test_the_logarithm_of_a_mean_of_few_samples_is_put_right():
         made = prepare(SourceTable(pd.DataFrame(rows)), steps, (9.0, 9.0, 9.0), ("x", "y", "z"), "p")
         # The standard error is 0.022 dB, and higher orders leave some hundredths.
         assert made.table.frame["p"].mean() + 80.0 == pytest.approx(off, abs=0.09)
+
+
+def test_links_that_were_not_heard_are_counted_and_judge_nothing(tmp_path):
+    """A street of which a third is beyond the floor: what was not heard tells of materials what is known of it."""
+    table = planted.campaign(noise_db=0.3)
+    floor = float(-table["path_loss_db"].quantile(0.67))
+    table = table.assign(power=np.where(-table["path_loss_db"] > floor, -table["path_loss_db"], np.nan))
+    links = {
+        "file": "links.csv", "tx": list(planted.COLUMNS[:3]), "rx": list(planted.COLUMNS[3:]), "value": "power",
+        "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": floor, "unheard": "censor",
+    }  # fmt: skip
+    method = {"name": "auto", "options": {"starts": 64}}
+    found = calibrate(planted.study(tmp_path, table, links=links, method=method), engine=planted.engine())
+    missing = table["power"].isna().to_numpy()
+    assert found.links["unheard"].to_numpy(bool).tolist() == missing.tolist()
+    assert found.links["faint"].to_numpy(bool)[missing].all()
+    assert found.prepared["at or below the noise floor, counted as censored"] == missing.sum() == 4
+    assert found.counts["calibrated_on"] <= 8
+    held = [
+        interval.pieces[0][0] <= planted.TRUTH[name] <= interval.pieces[-1][1]
+        for name, interval in found.intervals.items()
+    ]
+    assert all(held)
+    problem = Problem.of(Setup.open(planted.study(tmp_path, table, links=links)), planted.engine())
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    explaining = Explaining.of(problem, best, 0.3**2, 5)
+    assert explaining.marginal.unheard.tolist() == missing.tolist()
+    kinds = {model.kind for model in explaining.marginal.models}
+    assert "correlated" not in kinds

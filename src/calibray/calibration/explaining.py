@@ -48,8 +48,9 @@ class Explaining:
             freedom: Number of links less that of unknowns.
         """
         objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
-        counted = np.flatnonzero(objective.weight > 0)
-        weight = objective.weight[counted]
+        weight, unheard = _taking_part(problem)
+        counted = np.flatnonzero(weight > 0)
+        weight, unheard = weight[counted], unheard[counted]
         scale = np.sqrt(weight * len(weight) / weight.sum())
         noise_db = float(np.sqrt(square * (freedom + len(problem.parameters)) / freedom))
         nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
@@ -60,7 +61,8 @@ class Explaining:
         models = noise_models(
             position,
             kind=None if section.kind == "auto" else section.kind,
-            range_m=None if section.range_m == "auto" else float(section.range_m),
+            # Errors that neighbours share make the probability of not being heard an integral over all of them.
+            range_m=0.0 if unheard.any() else None if section.range_m == "auto" else float(section.range_m),
             spread=None if section.heterogeneity == "auto" else float(section.heterogeneity),
             offset=not has_offset(problem),
         )
@@ -69,7 +71,7 @@ class Explaining:
                 position, kind="gaussian", range_m=0.0, spread=0.0, offset=not has_offset(problem)
             )
         ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
-        marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models)
+        marginal = Marginal.of(design[:, used], ridge, scale, position, noise_db, models, unheard)
         return cls(problem, marginal, design[:, held] @ coefficients[held], scale, counted)
 
     def without_negligible(self, explained: NDArray[np.float64]) -> Explaining:
@@ -129,12 +131,27 @@ class Explaining:
             self._loss(np.clip(candidates * np.exp(spread * corner), parameters.lower, parameters.upper))
             for corner in corners(len(parameters))
         ])  # fmt: skip
-        return Differing((there.mean(axis=0) - loss) * self.scale, there.var(axis=0) * self.scale**2)
+        with np.errstate(invalid="ignore"):  # Where no path leads to a link that was not heard either.
+            return Differing((there.mean(axis=0) - loss) * self.scale, there.var(axis=0) * self.scale**2)
 
     def _loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of the links that count [n, m], [dB]."""
         modelled = self.problem.observable.modelled(self.problem.engine, candidates)
         return self.problem.objective.capped(modelled)[:, self.counted]
+
+
+def _taking_part(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Weights of the links that tell something of the parameters [L], and which of them were not heard [L].
+
+    Where those that were not heard count, so do those that were though the model hardly expected it: together they
+    are no selection by luck.
+    """
+    objective, links = problem.objective, problem.setup.links
+    if links.unheard is None or problem.faint is None:
+        return objective.weight, np.zeros(len(links), dtype=bool)
+    # Where the model hears nothing either, it agrees, and there is nothing to learn.
+    there = problem.faint & ~problem.setup.held_out & np.isfinite(problem.before)
+    return np.where(there, links.weight, objective.weight), links.unheard
 
 
 def has_offset(problem: Problem) -> bool:

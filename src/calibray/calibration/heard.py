@@ -67,6 +67,8 @@ def heard(problem: Problem, progress: Progress | None = None) -> Problem:
             break
         objective = fewer
         problem = replace(problem, objective=objective)
+    if problem.faint is not None:
+        faint = faint | problem.faint
     return replace(problem, faint=faint) if faint.any() else problem
 
 

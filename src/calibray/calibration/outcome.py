@@ -110,6 +110,7 @@ def outcome(
             "held_out": setup.held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
             **({} if problem.faint is None else {"faint": problem.faint}),
+            **({} if links.unheard is None else {"unheard": links.unheard}),
             **_places(links),
             **({"offset_only_db": offset_only} if fitted else {}),
             **seen.columns,
@@ -155,7 +156,7 @@ def outcome(
         files=setup.files,
         paths=paths,
         power_shares=seen.power_shares,
-        prepared=links.prepared | ({} if problem.faint is None else {FAINT: int(problem.faint.sum())}),
+        prepared=links.prepared | _left_out(problem),
         validation=validation,
         nuisances={
             name: {label: value for label, value in values.items() if value is not None}
@@ -188,6 +189,8 @@ def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
     judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
+    if links.unheard is not None:
+        judged &= ~links.unheard
     judgement: tuple[str, ...] = () if judged.any() or study.engine.name != "replay" else (UNJUDGED,)
     errors = (models.after - objective.measured)[judged]
     if judged.any():
@@ -218,6 +221,13 @@ def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
         "residual_basis": basis,
         "judgement": judgement,
     }
+
+
+def _left_out(problem: Problem) -> dict[str, int]:
+    """How many links are left out that were heard, by what the model expects of them."""
+    faint, unheard = problem.faint, problem.setup.links.unheard
+    count = 0 if faint is None else int((faint if unheard is None else faint & ~unheard).sum())
+    return {FAINT: count} if count else {}
 
 
 def _in_turn(validation: Validation, before_db: float | None, fitted: bool) -> dict[str, Any]:

@@ -74,7 +74,8 @@ class Problem:
         before: What the engine answers to the values before calibration [L].
         observable: What is measured and modelled.
         priors: What is known of the parameters beforehand.
-        faint: Links left out because the model expects them near the noise floor [L]; None where none is.
+        faint: Links left out because they were not heard, or because the model expects them near the noise floor [L];
+            None where none is.
     """
 
     setup: Setup
@@ -102,17 +103,19 @@ class Problem:
         """
         study, links, held_out = setup.study, setup.links, setup.held_out
         before = observable.modelled(engine, engine.parameters.start[None])[0]
+        unheard = np.zeros(len(links), dtype=bool) if links.unheard is None else links.unheard
         objective = make_objective(
             links,
             np.isfinite(before),
-            ~held_out,
+            ~(held_out | unheard),
             nuisance=study_nuisance(study, links),
             ceiling_db=study.objective.ceiling_db,
             noise_db=_noise(study, links),
         )
         objective = replace(objective, measured=observable.measured(links))
-        _check_groups(links, objective, held_out & np.isfinite(before))
-        return cls(setup, engine, objective, before, observable, study.priors)
+        _check_groups(links, objective, held_out & ~unheard & np.isfinite(before))
+        priors = study.priors
+        return cls(setup, engine, objective, before, observable, priors, unheard if unheard.any() else None)
 
     @property
     def weighs_priors(self) -> bool:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.linalg import hadamard
 from scipy.special import gammaln
 
+from calibray.inference.censored import log_evidence
 from calibray.inference.neighbours import Whitener, pairwise, whitener
 
 OFFSET_DB: Final = 10.0
@@ -178,6 +179,7 @@ class Marginal:
         noise_db: Size of the noise that priors and the spread of materials are stated against [dB].
         models: The models.
         whiteners: What makes the errors of a correlated model independent, by its range and share.
+        unheard: Which links were not heard, so that their gaps are lower limits [m]; no model is "correlated" then.
     """
 
     design: NDArray[np.float64]
@@ -186,6 +188,7 @@ class Marginal:
     noise_db: float
     models: tuple[NoiseModel, ...]
     whiteners: dict[tuple[float, float], Whitener]
+    unheard: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -196,6 +199,7 @@ class Marginal:
         position: NDArray[np.float64],
         noise_db: float,
         models: Sequence[NoiseModel],
+        unheard: NDArray[np.bool_] | None = None,
     ) -> Marginal:
         """Set up the models over some links.
 
@@ -206,13 +210,15 @@ class Marginal:
             position: Where the links' ends stand [m, 3 or 6], [m].
             noise_db: Size of the noise, about [dB].
             models: The models.
+            unheard: Which links were not heard [m]; none if None.
 
         Returns:
             The density.
         """
+        unheard = np.zeros(len(scale), dtype=bool) if unheard is None else unheard
         places = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
         made = {place: whitener(position, scale, *place) for place in sorted(places)}
-        return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), made)
+        return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), made, unheard)
 
     @property
     def spread(self) -> float:
@@ -234,21 +240,19 @@ class Marginal:
             ValueError: A model asks what differing materials do, and it is not given.
         """
         found = np.full((len(gap), len(self.models)), -np.inf)
-        good = np.isfinite(gap).all(axis=1)
+        good = (np.isfinite(gap) | (self.unheard & (gap < 0))).all(axis=1)
         if not good.any():
             return found
         gap, white = gap[good], {}
         for index, model in enumerate(self.models):
             design, ridge = self._with_offset(model.offset)
-            if model.kind == HEAVY:
+            if self.unheard.any():
+                value = self._censored(gap, model, design, ridge, differing, good)
+            elif model.kind == HEAVY:
                 value = _student(gap, design, ridge / self.noise_db, model.freedom)
             elif model.kind == DIFFERING:
-                if differing is None:
-                    raise ValueError("a heterogeneous model needs what differing materials do")
-                # Both grow with the square of the spread, to the second order.
-                part = (model.spread / self.spread) ** 2
-                weight = 1.0 / (1.0 + part / self.noise_db**2 * differing.variance[good])
-                value = _weighted(gap - part * differing.shift[good], design, ridge, weight)
+                shift, weight = self._spread_out(model, differing, good)
+                value = _weighted(gap - shift, design, ridge, weight)
             elif model.kind == CORRELATED:
                 place = (model.range_m, model.share)
                 filter_ = self.whiteners[place]
@@ -274,6 +278,34 @@ class Marginal:
         return replace(
             self, models=tuple(model for model, keep in zip(self.models, kept, strict=True) if keep)
         )
+
+    def _censored(
+        self,
+        gap: NDArray[np.float64],
+        model: NoiseModel,
+        design: NDArray[np.float64],
+        ridge: NDArray[np.float64],
+        differing: Differing | None,
+        good: NDArray[np.bool_],
+    ) -> NDArray[np.float64]:
+        """Log density where some links were not heard [n]."""
+        if model.kind != DIFFERING:
+            return log_evidence(gap, self.unheard, design, ridge / self.noise_db, model.freedom)
+        shift, weight = self._spread_out(model, differing, good)
+        there = np.isfinite(shift) & np.isfinite(weight)  # Not where a corner loses a link's only path.
+        gap, weight = gap - np.where(there, shift, 0.0), np.where(there, weight, 1.0)
+        return log_evidence(gap, self.unheard, design, ridge / self.noise_db, weight=weight)
+
+    def _spread_out(
+        self, model: NoiseModel, differing: Differing | None, good: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Shift of the mean [n, m] and weights [n, m] where materials differ."""
+        if differing is None:
+            raise ValueError("a heterogeneous model needs what differing materials do")
+        # Both grow with the square of the spread, to the second order.
+        part = (model.spread / self.spread) ** 2
+        weight = 1.0 / (1.0 + part / self.noise_db**2 * differing.variance[good])
+        return part * differing.shift[good], weight
 
     def _with_offset(self, extra: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if not extra:

@@ -39,6 +39,8 @@ class Measurements:
         frequency: Carrier of each link [links], [Hz], or None where all have the study's.
         limit_db: Path loss [links], [dB], beyond which a link could not have been measured, or None where none is
             known.
+        unheard: Which links [links] were not heard, so that their path loss is at least `path_loss_db`; None where all
+            were.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
         prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
@@ -61,6 +63,7 @@ class Measurements:
     group: NDArray[np.str_] | None = None
     frequency: NDArray[np.float64] | None = None
     limit_db: NDArray[np.float64] | None = None
+    unheard: NDArray[np.bool_] | None = None
     table: SourceTable = field(default=None)  # type: ignore[assignment]
     prepared: dict[str, int] = field(default_factory=dict)
 
@@ -82,6 +85,8 @@ class Measurements:
             set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
         if self.limit_db is not None:
             set_field(self, "limit_db", _array("limit_db", self.limit_db, (count,)))
+        if self.unheard is not None:
+            set_field(self, "unheard", _array("unheard", self.unheard, (count,), np.bool_))
         if self.table is None:
             set_field(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
@@ -166,6 +171,7 @@ class Measurements:
             group=None if self.group is None else self.group[chosen],
             frequency=None if self.frequency is None else self.frequency[chosen],
             limit_db=None if self.limit_db is None else self.limit_db[chosen],
+            unheard=None if self.unheard is None else self.unheard[chosen],
             table=self.table.select(chosen),
             prepared=self.prepared,
         )

@@ -118,6 +118,11 @@ class Study(Section):
             raise InputError(
                 "links.quantity = 'rsrp' needs [offset]: what was transmitted is not known, and the offset takes it"
             )
+        if self.links.unheard == "censor" and self.noise.range_m not in ("auto", 0):
+            raise InputError(
+                f"links.unheard = 'censor' with noise.range_m = {self.noise.range_m:g}: links that were not heard are "
+                "counted one by one, as if their errors were not alike; leave one of them out"
+            )
         frequency = self.scene.frequency
         for name, material in self.materials.items():
             if material.itu is not None:

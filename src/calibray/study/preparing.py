@@ -46,6 +46,7 @@ def preparation(study: Study) -> Preparation:
         transmitter=links.transmitter,
         frame=scene_frame(study) if links.position == "geographic" else None,
         noise_floor_dbm=links.noise_floor_dbm,
+        censored=links.unheard == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
         keep=list(dict.fromkeys([*groups, *([links.frequency] if links.frequency else [])])),
         inside=inside,

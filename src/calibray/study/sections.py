@@ -151,6 +151,8 @@ class LinksSection(Section):
         transmitters: Table with a row for every transmitter, relative to the study file's folder.
         transmitter: Column, of both tables, that says which transmitter it is.
         noise_floor_dbm: Received powers at or below it, and missing ones, were not heard [dBm].
+        unheard: What becomes of rows that were not heard: "exclude" leaves them out; with "censor" the intervals count
+            that no more than the noise floor was received there.
         inside: What becomes of receivers on what buildings cover: "keep", "drop", or "move" to the nearest street.
         average: How samples are averaged.
     """
@@ -172,6 +174,7 @@ class LinksSection(Section):
     transmitters: Text | None = None
     transmitter: Text = "transmitter"
     noise_floor_dbm: float | None = None
+    unheard: Literal["exclude", "censor"] = "exclude"
     inside: Literal["keep", "drop", "move"] = "keep"
     average: AverageSection | None = None
 
@@ -181,6 +184,15 @@ class LinksSection(Section):
             raise InputError(
                 f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: is a received "
                 "power; filter losses by links.where"
+            )
+        if self.unheard == "censor" and self.noise_floor_dbm is None:
+            raise InputError(
+                "links.unheard = 'censor' needs noise_floor_dbm [dBm], below which nothing is heard"
+            )
+        if self.unheard == "censor" and self.average is not None:
+            raise InputError(
+                "links.unheard = 'censor' with [links.average]: averages count what was not heard at half of the noise "
+                "floor already; leave one of them out"
             )
         return self
 
