@@ -86,7 +86,7 @@ def log_evidence(
         step = np.linalg.solve(_damped(curvature, damping), slope[..., None])[..., 0]
         if not (np.sum(step * slope, axis=1) > SETTLED).any():
             break
-        trial = point + np.clip(step, -_longest(point), _longest(point))
+        trial = np.asarray(point + np.clip(step, -_longest(point), _longest(point)), dtype=np.float64)
         found = joint(trial, left, unheard, columns, ridge, freedom)
         better = found[0] > value
         point, value, slope, curvature = (

@@ -240,7 +240,7 @@ class Marginal:
             ValueError: A model asks what differing materials do, and it is not given.
         """
         found = np.full((len(gap), len(self.models)), -np.inf)
-        good = (np.isfinite(gap) | (self.unheard & (gap < 0))).all(axis=1)
+        good = np.asarray((np.isfinite(gap) | (self.unheard & (gap < 0))).all(axis=1))
         if not good.any():
             return found
         gap, white = gap[good], {}
