@@ -13,7 +13,16 @@ from scipy.constants import speed_of_light
 import synthetic
 from calibray.engines import Replay
 from calibray.engines.replay import TABLE_TOLERANCE
-from calibray.fields import FINEST, layout, material_table, path_losses, program, table_intervals, tabulation
+from calibray.fields import (
+    FINEST,
+    layout,
+    material_table,
+    path_losses,
+    program,
+    slab,
+    table_intervals,
+    tabulation,
+)
 from calibray.fields.contributions import contributions
 from calibray.fields.resolution import COARSEST
 from calibray.materials import Material, constants_matrix
@@ -138,3 +147,15 @@ def test_large_programs_are_tabulated_without_being_filled_up(monkeypatch: pytes
     plan = layout(paths, np.float64, 512).program
     assert all("r" not in group.signature for group in plan.groups)
     np.testing.assert_allclose(path_losses(plan, table)[0], padded, rtol=1e-12)
+
+
+def test_single_precision_holds_metals_at_low_frequencies():
+    cosine = jnp.linspace(1e-3, 1, 50)
+    copper = (jnp.asarray(1.0), slab.loss_term(jnp.asarray(5.8e7), jnp.asarray(300.0)))  # at 1 MHz, 1e12
+    given = (cosine, *copper, jnp.asarray(1e-3), jnp.asarray(300.0))
+    single = slab.coefficients(*(jnp.asarray(value, jnp.float32) for value in given), False)
+    double = slab.coefficients(*given, False)
+    assert single[0][0].dtype == jnp.float32
+    np.testing.assert_allclose(single, double, atol=1e-6)
+    for real, imaginary in double:
+        np.testing.assert_allclose(np.hypot(real, imaginary), 1, atol=2e-3)  # nearly all comes back

@@ -68,23 +68,33 @@ def coefficients(
         transmitted: Where the transmission coefficient is wanted in place of the reflection coefficient [...].
 
     Returns:
-        The two coefficients, each as (real, imaginary) [...].
+        The two coefficients, each as (real, imaginary) [...], in the precision of the cosine. They are computed in
+        double precision: the fourth power of a metal's permittivity is beyond the range of single precision.
     """
+    precision = cosine.dtype
+    cosine, permittivity, loss, thickness, wavelength = (
+        jnp.asarray(value, jnp.float64) for value in (cosine, permittivity, loss, thickness, wavelength)
+    )
     root = keep(_root((permittivity - 1) + cosine * cosine, loss), wavelength)  # sqrt(eta - sin^2 theta)
     scale = 2 * jnp.pi * thickness / wavelength
     decay, (cosine_q, sine_q) = jnp.exp(scale * root[1]), circle(scale * root[0])
     phase = keep((decay * cosine_q, -decay * sine_q), wavelength)  # e^{-jq}, q of eq. 44
     across = multiply(phase, phase)
     eta_cosine = permittivity * cosine, -loss * cosine
-    half = (
-        _divide((cosine - root[0], -root[1]), (cosine + root[0], root[1])),  # eq. 37a
-        _divide(
-            (eta_cosine[0] - root[0], eta_cosine[1] - root[1]),
-            (eta_cosine[0] + root[0], eta_cosine[1] + root[1]),
-        ),  # eq. 37b
+    te = _slab(
+        (cosine - root[0], -root[1]), (cosine + root[0], root[1]), phase, across, transmitted
+    )  # eq. 37a
+    tm = _slab(
+        (eta_cosine[0] - root[0], eta_cosine[1] - root[1]),
+        (eta_cosine[0] + root[0], eta_cosine[1] + root[1]),
+        phase,
+        across,
+        transmitted,
+    )  # eq. 37b
+    return (te[0].astype(precision), te[1].astype(precision)), (
+        tm[0].astype(precision),
+        tm[1].astype(precision),
     )
-    te, tm = (_slab(single, phase, across, transmitted) for single in keep(half, wavelength))
-    return te, tm
 
 
 def safe_sqrt(value: jax.Array) -> jax.Array:
@@ -125,22 +135,21 @@ def power(value: Pair) -> jax.Array:
     return value[0] * value[0] + value[1] * value[1]
 
 
-def _slab(half: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
-    square = multiply(half, half)
+def _slab(less: Pair, more: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
+    """Coefficient of a slab whose half space has R' = less / more, with one division for all."""
+    square, norm = multiply(less, less), multiply(more, more)
     loop = multiply(square, across)
-    denominator = 1 - loop[0], -loop[1]
-    reflected = multiply(half, (1 - across[0], -across[1]))  # eq. 43a
-    if transmitted is False:
-        return _divide(reflected, denominator)
-    through = multiply((1 - square[0], -square[1]), phase)  # eq. 43b
-    real, imaginary = (jnp.where(transmitted, t, r) for t, r in zip(through, reflected, strict=True))
-    return _divide((real, imaginary), denominator)
+    denominator = norm[0] - loop[0], norm[1] - loop[1]
+    wanted = multiply(multiply(less, more), (1 - across[0], -across[1]))  # eq. 43a
+    if transmitted is not False:
+        through = multiply((norm[0] - square[0], norm[1] - square[1]), phase)  # eq. 43b
+        wanted = tuple(jnp.where(transmitted, t, r) for t, r in zip(through, wanted, strict=True))
+    return _divide((wanted[0], wanted[1]), denominator)
 
 
 def _root(real: jax.Array, loss: jax.Array) -> Pair:
-    """Principal square root of real - j loss, with real >= 0 and loss >= 0."""
-    tiny = jnp.finfo(real.dtype).tiny ** 0.5
-    size = jnp.maximum(real, tiny)
+    """Principal square root of real - j loss, both at least 0; 1e-30 at least, whose fourth power is a number."""
+    size = jnp.maximum(real, 1e-60)
     modulus = jnp.sqrt(size * size + loss * loss)
     root = jnp.sqrt(0.5 * (modulus + size))
     return root, -0.5 * loss / root
