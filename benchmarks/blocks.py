@@ -28,7 +28,7 @@ from calibray import engines
 from calibray.calibration.methods import choose
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
-from calibray.engines.blocks import Blocks, cut
+from calibray.engines.blocks import Blocks, cut, seconds_to_trace
 from calibray.engines.crew import Cluster, Crew, Here
 from calibray.engines.kinds import replay
 from calibray.engines.pool import open_local_client
@@ -39,14 +39,14 @@ COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 PARAMETERS = ("concrete", "marble", "brick")
 
 
-def study(engine: dict, starts: int) -> Study:
+def study(engine: dict, starts: int, samples: int | str) -> Study:
     """A study of links in Munich, which are not in a file."""
     return Study.from_content(
         {
             "version": 1,
             "scene": {"file": "sionna:munich", "frequency": 3.5e9},
             "links": {"file": "none.csv", "tx": COLUMNS[:3], "rx": COLUMNS[3:], "value": "path_loss_db"},
-            "trace": {"max_depth": 3, "samples": 100_000},
+            "trace": {"max_depth": 3, "samples": samples},
             "parameters": {f"{name}.relative_permittivity": {"bounds": [1.5, 12.0]} for name in PARAMETERS},
             "offset": {"per": "mast", "bounds": [-60.0, 60.0]},
             "method": {"name": "least-squares", "options": {"starts": starts}},
@@ -55,7 +55,9 @@ def study(engine: dict, starts: int) -> Study:
     )
 
 
-def campaign(count: int, engine: dict, starts: int = 16, seed: int = 0) -> Setup:
+def campaign(
+    count: int, engine: dict, starts: int = 16, seed: int = 0, samples: int | str = 100_000
+) -> Setup:
     """Links from two masts to places drawn from a seed; those in buildings have no path, and are left out."""
     random = np.random.default_rng(seed)
     mast = random.integers(0, len(MASTS), count)
@@ -63,7 +65,7 @@ def campaign(count: int, engine: dict, starts: int = 16, seed: int = 0) -> Setup
     distance = np.linalg.norm(MASTS[mast] - rx, axis=1)
     loss = 40 + 33 * np.log10(distance) + 6 * random.standard_normal(count)
     links = cb.Measurements(tx=MASTS[mast], rx=rx, path_loss_db=loss, group=mast)
-    return Setup.open(study(engine, starts), links=links)
+    return Setup.open(study(engine, starts, samples), links=links)
 
 
 def resident() -> float:
@@ -167,13 +169,11 @@ def repeated(blocks: int, links: int) -> None:
     )
 
 
-def city(links: int) -> None:
+def city(links: int, samples: int | str) -> None:
     """Calibrate end to end in one process."""
-    setup = campaign(links, {"block_links": max(1000, -(-links // replay.BLOCKS))})
-    planned = setup.tracer.plan(setup.links).seconds
-    print(
-        f"{links:,} links in {len(cut(setup.links, setup.study.engine.block_links))} blocks; told {planned:.0f} s"
-    )
+    setup = campaign(links, {"block_links": max(1000, -(-links // replay.BLOCKS))}, samples=samples)
+    blocks = cut(setup.links, setup.study.engine.block_links)
+    print(f"{links:,} links in {len(blocks)} blocks; told {seconds_to_trace(setup, blocks):.0f} s of tracing")
     started = time.perf_counter()
     result = cb.calibrate(setup)
     taken = time.perf_counter() - started
@@ -186,6 +186,12 @@ def main() -> None:
     parser.add_argument("what", choices=("speed-up", "bytes", "links", "city"))
     parser.add_argument("--links", type=int, default=None, help="number of links, of a block with `links`")
     parser.add_argument("--blocks", type=int, nargs="+", default=[1, 10, 100])
+    parser.add_argument(
+        "--samples",
+        type=lambda word: word if word == "auto" else int(word),
+        default=100_000,
+        help="of `city`",
+    )
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.what == "links" and not options.child:
@@ -199,7 +205,7 @@ def main() -> None:
         "speed-up": lambda: speed_up(options.links or 2000),
         "bytes": lambda: moved(options.links or 400),
         "links": lambda: repeated(options.blocks[0], options.links),
-        "city": lambda: city(options.links or 100_000),
+        "city": lambda: city(options.links or 100_000, options.samples),
     }[options.what]()
 
 

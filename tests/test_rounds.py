@@ -87,6 +87,32 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
         convergence.check(yard, LINKS, rounds, path_loss)
 
 
+def test_rays_are_sent_out_once_for_all_links_of_a_position(
+    yard: Tracer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = (
+        SimpleNamespace(tx=LINKS.tx[some], rx=LINKS.rx[some]) for some in (slice(3), slice(3, None))
+    )
+    settings = replace(AUTO, seed=7)
+    alone = yard.with_settings(settings).trace(second)
+    yard.known_chains.clear()
+    tracer, sent = yard.with_settings(settings), []
+    search = tracer.candidates
+    monkeypatch.setattr(tracer, "candidates", lambda *given: sent.append(given[3]) or search(*given))
+    tracer.trace(first)
+    rays = sum(sent)
+    assert rays >= 1_000_000
+    after = tracer.trace(second)
+    assert sum(sent) - rays < rays / 2  # what the first links did not ask for, if anything
+    assert by_key(after).keys() == by_key(alone).keys()
+    np.testing.assert_array_equal(path_loss(after), path_loss(alone))
+    # Rays are reflected or pass by what a wall is made of: with other walls, they are sent out anew.
+    name, wall = next(iter(yard.scene.materials.items()))
+    tracer.trace(second, materials={name: replace(wall, relative_permittivity=30.0)})
+    assert sum(sent) >= 2 * rays
+    assert len(tracer.known_chains) == 2
+
+
 def test_links_turned_around_have_the_same_loss(yard: Tracer, rounds: Paths) -> None:
     plain = yard.with_settings(replace(AUTO, diffraction=False))
     assert len(plain.plan(LINKS).launches) == len(plain.plan(TURNED).launches) == 1

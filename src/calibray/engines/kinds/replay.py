@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from functools import partial
@@ -13,6 +14,7 @@ from pydantic import Field
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
 from calibray.progress import Progress
+from calibray.spelling import duration
 
 if TYPE_CHECKING:
     from calibray.engines.blocks import Blocks
@@ -28,6 +30,8 @@ BLOCK_LINKS: Final = 1000
 
 BLOCKS: Final = 64
 """unless that makes more blocks than these: each has its sums, and its program is compiled."""
+
+_LOG: Final = logging.getLogger(__name__)
 
 
 @final
@@ -69,12 +73,18 @@ class ReplaySection(EngineSection):
         # Before anything is traced.
         self._check_compressible(setup)
         if paths is None and (executor is not None or self.block_links is not None):
-            from calibray.engines.blocks import Blocks, cut
+            from calibray.engines.blocks import Blocks, cut, seconds_to_trace
             from calibray.engines.crew import Here
+            from calibray.study.setup import LONG
 
             crew = Here() if executor is None else cast("Crew", executor)
             size = self.block_links or max(BLOCK_LINKS, -(-len(setup.links) // BLOCKS))
             blocks = cut(setup.links, size)
+            if executor is None and (seconds := seconds_to_trace(setup, blocks)) > LONG:
+                _LOG.warning(
+                    "Tracing %s links in %d blocks; about %s on two cores",
+                    f"{len(setup.links):,}", len(blocks), duration(seconds),
+                )  # fmt: skip
             return Blocks(crew, setup, blocks, partial(_traced, self.compress_db), progress=progress)
         return replay(setup, setup.trace(progress=progress) if paths is None else paths, self.compress_db)
 

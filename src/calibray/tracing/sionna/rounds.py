@@ -12,6 +12,7 @@ the rays would have been.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.errors import EngineError
+from calibray.materials import Material
 from calibray.progress import Progress
 from calibray.tracing.launches import Launch, Plan, directions, seed_of
 from calibray.tracing.settings import ROUND
@@ -39,6 +41,8 @@ QUIET: Final = 2
 """Rounds in a row that may change nothing more before the search ends."""
 LAUNCHES: Final = 256
 """Launches of a source after which the search ends anyway: 64 million rays."""
+KEPT: Final = 4
+"""Positions whose chains are kept for the next links."""
 SIZE: Final = 100_000
 """Chains that the buffer of a launch holds at first."""
 BATCH: Final = 500_000
@@ -53,6 +57,7 @@ def search(
     ends: tuple[NDArray[np.float64], NDArray[np.float64]],
     backwards: bool,
     room: int,
+    constants: Mapping[str, Material],
     progress: Progress | None,
 ) -> tuple[tuple[Chunk, ...], dict[str, object]]:
     """Find the paths of links, the rays added in rounds.
@@ -63,6 +68,7 @@ def search(
         ends: Transmitter and receiver of every link [L, 3] each, [m].
         backwards: Whether the receivers send.
         room: Paths that fit into memory.
+        constants: The materials traced with.
         progress: Called with ("tracing", receivers traced, receivers in all) before the first position and after
             every one.
 
@@ -75,12 +81,12 @@ def search(
     others, done = ends[0 if backwards else 1], 0
     if progress is not None:
         progress("tracing", 0, len(others))
-    meshes = Meshes(tracer.mitsuba)
     chunks: list[Chunk] = []
     searches: list[Search] = []
     for launch in plan.launches:
         left = room - sum(len(chunk.link) for chunk in chunks)
-        searches.append(Search(tracer, meshes, launch, others[launch.links], backwards, left))
+        chains = SourceChains.of(tracer, launch.source, constants)
+        searches.append(Search(tracer, chains, launch, others[launch.links], backwards, left))
         searches[-1].run()
         chunks += searches[-1].chunks
         done += len(launch.links)
@@ -93,13 +99,81 @@ def search(
     return tuple(chunks), told
 
 
+class SourceChains:
+    """The chains of interactions that rays from a position meet.
+
+    They are the same for all receivers, so that rays are sent out once for all blocks of links that are traced here.
+
+    Args:
+        tracer: The tracer.
+        source: The position [3], [m].
+    """
+
+    def __init__(self, tracer: Tracer, source: NDArray[np.float64]) -> None:
+        self.meshes = Meshes(tracer.mitsuba)
+        self._tracer, self._source = tracer, source
+        self._known = np.zeros((0, 2 * tracer.settings.max_depth + 2), dtype=np.int64)
+        self._new: list[PathsBuffer | None] = []
+
+    @classmethod
+    def of(
+        cls, tracer: Tracer, source: NDArray[np.float64], constants: Mapping[str, Material]
+    ) -> SourceChains:
+        """Those found before, or none yet.
+
+        Args:
+            tracer: The tracer.
+            source: The position [3], [m].
+            constants: The materials that it traces with.
+
+        Returns:
+            The chains.
+        """
+        key = source.tobytes(), tracer.settings, tuple(constants.items())
+        if key not in tracer.known_chains:
+            while len(tracer.known_chains) >= KEPT:
+                del tracer.known_chains[next(iter(tracer.known_chains))]
+            tracer.known_chains[key] = cls(tracer, source)
+        return tracer.known_chains[key]
+
+    def new(self, number: int, room: int) -> PathsBuffer | None:
+        """Chains that a launch finds and those before it did not.
+
+        Args:
+            number: Number of the launch.
+            room: Paths that fit into memory.
+
+        Returns:
+            The chains; None where there are none.
+
+        Raises:
+            EngineError: There are more than fit into memory.
+        """
+        while len(self._new) <= number:
+            chains = self._shoot(len(self._new), room)
+            self._known, fresh = _fresh(self._known, keys(chains, self.meshes))
+            self._new.append(chains.gather(mi.UInt(aligned(fresh, np.uint32))) if len(fresh) else None)
+        return self._new[number]
+
+    def _shoot(self, number: int, room: int) -> PathsBuffer:
+        """Chains that the rays of one launch meet."""
+        seed = self._tracer.settings.seed
+        shift = np.random.default_rng([seed, number]).random((2, 1)) * (number > 0)
+        above = points(np.zeros((1, 3)))
+        with rays_towards((directions(0, ROUND, ROUND) + shift) % 1.0):
+            return self._tracer.candidates(
+                Unhidden(self._tracer.mitsuba), points(self._source[None]), above, ROUND,
+                seed_of(seed, number), False, SIZE, room,
+            )  # fmt: skip
+
+
 @dataclass
 class Search:
     """The search for the paths of one source.
 
     Attributes:
         tracer: The tracer.
-        meshes: The scene's triangles.
+        chains: What rays from the source meet.
         launch: The source, and its links.
         targets: The other ends of the links [R, 3], [m].
         backwards: Whether the source is the links' receiver.
@@ -110,7 +184,7 @@ class Search:
     """
 
     tracer: Tracer
-    meshes: Meshes
+    chains: SourceChains
     launch: Launch
     targets: NDArray[np.float64]
     backwards: bool
@@ -129,23 +203,21 @@ class Search:
         power = self._keep([self._direct()])
         if settings.max_depth == 0:
             return
-        known = np.zeros((0, 2 * settings.max_depth + 2), dtype=np.int64)
         sent, quiet = 0, 0
         while quiet < QUIET and sent < LAUNCHES:
             pieces: list[Chunk] = []
             for _ in range(max(sent, 1)):
-                chains = self._shoot(sent)
-                known, fresh = _fresh(known, keys(chains, self.meshes))
+                fresh = self.chains.new(sent, self.room)
                 sent += 1
-                if len(fresh):
-                    pieces += self._try(chains.gather(mi.UInt(aligned(fresh, np.uint32))))
+                if fresh is not None:
+                    pieces += self._try(fresh)
             gained = self._keep(pieces)
             with np.errstate(divide="ignore", invalid="ignore"):
                 rise = np.where(gained > 0, 10 * np.log10((power + gained) / power), 0.0)
             self.rays, self.change_db = sent * ROUND, float(rise.max())
             power += gained
             quiet = quiet + 1 if self.change_db <= STILL_DB else 0
-        if quiet < QUIET:
+        if quiet < QUIET and self.change_db > STILL_DB:
             _LOG.warning(
                 "%s rays from %s still changed path loss by up to %.2f dB: paths may be missing",
                 f"{self.rays:,}", self.launch.source.tolist(), self.change_db,
@@ -159,19 +231,9 @@ class Search:
         buffer = self.tracer.candidates(scene, *ends, 0, 0, direct, len(self.targets) + 2, self.room)
         return self._chunk(buffer, *ends)
 
-    def _shoot(self, number: int) -> PathsBuffer:
-        """Chains of the source that the rays of one launch meet."""
-        shift = np.random.default_rng([self.tracer.settings.seed, number]).random((2, 1)) * (number > 0)
-        above = points(np.zeros((1, 3)))
-        with rays_towards((directions(0, ROUND, ROUND) + shift) % 1.0):
-            return self.tracer.candidates(
-                Unhidden(self.tracer.mitsuba), points(self.launch.source[None]), above, ROUND,
-                seed_of(self.tracer.settings.seed, number), False, SIZE, self.room,
-            )  # fmt: skip
-
     def _try(self, chains: PathsBuffer) -> list[Chunk]:
         """The paths that chains are to any of the receivers."""
-        found = list(possible(unfolded(chains, self.launch.source, self.meshes), self.targets))
+        found = list(possible(unfolded(chains, self.launch.source, self.chains.meshes), self.targets))
         chain, target = (np.concatenate(part) for part in zip(*found, strict=True))
         chunks = []
         for start in range(0, len(chain), BATCH):

@@ -44,7 +44,7 @@ from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, poi
 from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_empty_places, without_repeats
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
 from calibray.tracing.sionna.reciprocity import turned_around
-from calibray.tracing.sionna.rounds import search
+from calibray.tracing.sionna.rounds import SourceChains, search
 from calibray.tracing.sionna.stored import Trace
 
 LANES: Final = 20_000_000
@@ -96,6 +96,7 @@ class Tracer:
         self._scene.frequency = self.frequency
         self._shape_material = shape_materials(self._scene)
         self._candidates, self._images = SBDeterministicCandidateGenerator(), ImageMethod()
+        self.known_chains: dict[Any, SourceChains] = {}
         self._fields = FieldCalculator()
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
@@ -191,7 +192,7 @@ class Tracer:
         constants = self.give(materials or {})
         room = paths_that_fit(available(), self.settings.max_depth)
         if self.settings.adaptive:
-            found, told = search(self, self.plan(links), (tx, rx), backwards, room, progress)
+            found, told = search(self, self.plan(links), (tx, rx), backwards, room, constants, progress)
             return Trace(self, constants, tx, rx, found, told)
         chunks: list[Chunk] = []
         pieces: list[Chunk] = []
