@@ -14,7 +14,8 @@ buildings differ there is no such posterior.
 
 Each repetition is a line of the file `--out`; a run that was stopped goes on where it stood, and `--repetitions 0`
 prints the tables of what is there. The last rows are the negative control, the same posterior with the noise
-understated by two, which must cover too seldom: the script fails if it does not.
+understated by two, which must cover too seldom: the script fails if it does not. It fails as well where a parameter
+is called not identifiable whose posterior with the noise known is narrower than a tenth of its range.
 """
 
 from __future__ import annotations
@@ -134,6 +135,9 @@ KNOWN: dict[str, Callable[[District, np.ndarray], np.ndarray]] = {
     "student-t": _tailed,
 }
 """Logarithm of the density of measured less modelled path loss [n, L] as the world makes it, but for a constant."""
+
+DETERMINED: Final = 0.1
+"""Width of the posterior with the noise known, of the range, below which a parameter is well determined."""
 
 FAR: Final = 30.0
 """Draws whose density is lower by this, in its logarithm, count for nothing."""
@@ -285,10 +289,21 @@ def main() -> None:
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
         print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))
+    told, denied = determined(lines)
+    print(f"Well determined with the noise known: {told} values; called not identifiable of them: {denied}.")
+    if denied:
+        sys.exit("well-determined parameters are called not identifiable")
     control = [entry["control"] for line in lines if line["world"] == "random" for entry in line["parameters"]
                if entry["verdict"] != "not identifiable"]  # fmt: skip
     if control and np.mean(control) > LEVELS[0] - 0.04:
         sys.exit("negative control: intervals with the noise understated by two cover as if they were right")
+
+
+def determined(lines: list[dict[str, Any]]) -> tuple[int, int]:
+    """Values that the data tell well where the noise is known, and those of them called not identifiable."""
+    entries = [entry for line in lines for entry in line["parameters"] if entry.get("known")]
+    verdicts = [entry["verdict"] for entry in entries if entry["known"]["width"] < DETERMINED]
+    return len(verdicts), verdicts.count("not identifiable")
 
 
 def tables(lines: list[dict[str, Any]]) -> list[Table]:

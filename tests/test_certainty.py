@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,19 +11,26 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibration import calibrate
+from calibray.calibration.certainty import certainty
 from calibray.calibration.outcome import UNJUDGED
 from calibray.calibration.problem import Problem
+from calibray.calibration.search import search
 from calibray.calibration.validate import validated
 from calibray.errors import InputError
 from calibray.inference.validation import CALIBRATED, LAW
+from calibray.measurements import links_from_frame
+from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
 from calibray.result import Result, tables
-from calibray.study import Setup
+from calibray.study import Setup, Study
 from calibray.tables.text import render
 
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "unheard": "censor",
 }  # fmt: skip
+STEPS = 31
+"""Values of every parameter that a posterior is taken on."""
+
 FEW = {"name": "auto", "options": {"starts": 64}}
 MARBLE = "marble.relative_permittivity"
 
@@ -230,3 +239,35 @@ def test_a_group_never_measured_gets_the_spread_of_the_others(tmp_path, noisy):
         planted.links().assign(half="east")
     )
     assert unseen.path_loss_db.to_numpy() == pytest.approx(middle / 2, abs=1e-6)
+
+
+def test_what_is_well_determined_is_never_called_not_identifiable():
+    """By the posterior with the noise known, on a grid; noise that drowns everything is the control."""
+    often = np.tile(np.arange(planted.LINKS), 4)
+    links = planted.links().iloc[often].reset_index(drop=True)
+    engine = engines.Replay(take_links(planted.engine().paths, often), planted.engine().parameters)
+    study = Study.from_content(planted.content("links.csv", offset={}))
+    problem = Problem.of(Setup.open(study, links=links_from_frame(links)), engine)
+    lower, upper = problem.parameters.search_bounds
+    axis = np.linspace(0.0, 1.0, STEPS)
+    unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    loss = problem.modelled(lower + unit * (upper - lower))
+    random = np.random.default_rng(11)
+    well = 0
+    for noise_db in (0.3, 0.3, 60.0):
+        truth = lower + random.uniform(0.1, 0.9, 3) * (upper - lower)
+        measured = problem.modelled(truth[None])[0] + noise_db * random.standard_normal(len(often))
+        gap = measured - loss
+        gap -= gap.mean(axis=1, keepdims=True)  # The offset has no prior.
+        density = np.exp(-0.5 * np.sum(gap**2, axis=1) / noise_db**2).reshape(3 * (STEPS,))
+        here = replace(problem, objective=replace(problem.objective, measured=measured))
+        told = certainty(here, search(here, LeastSquares(lower, upper, starts=32)))
+        for k, interval in enumerate(told.intervals.values()):
+            share = np.sort(density.sum(axis=tuple({0, 1, 2} - {k})))[::-1]
+            held = 1 + np.searchsorted(np.cumsum(share) / share.sum(), 0.9)
+            if held <= 0.1 * STEPS:
+                well += 1
+                assert interval.verdict != "not identifiable"
+            elif noise_db == 60.0:
+                assert interval.verdict == "not identifiable"
+    assert well >= 4
