@@ -43,7 +43,7 @@ import districts
 from calibray.calibration.certainty import certainty
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
-from calibray.inference.credible import credible
+from calibray.inference.credible import credible, credible_sets
 from calibray.inference.posterior import Draws
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, markdown, numbers
@@ -184,7 +184,9 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     narrow = draws.weight * np.exp((UNDERSTATED - 1) * (draws.density - draws.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
         value = draws.point[:, k]
-        sets = {str(level): credible(value, draws.weight, lower[k], upper[k], level) for level in LEVELS}
+        sets = dict(
+            zip(map(str, LEVELS), credible_sets(value, draws.weight, lower[k], upper[k], LEVELS), strict=True)
+        )
         control = credible(value, narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
         luck = None
         if known_weight is not None:

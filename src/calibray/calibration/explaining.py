@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.calibration.problem import Problem
-from calibray.inference.marginal import Differing, Marginal, corners, noise_models
+from calibray.inference.marginal import DIFFERING, Differing, Marginal, corners, noise_models
 from calibray.inference.nuisance import CONSTANT
 
 CHUNK: Final = 256
@@ -17,6 +17,10 @@ CHUNK: Final = 256
 
 FEWEST: Final = 8
 """Links below which noise is taken as independent and Gaussian, for they cannot tell another."""
+
+FAR: Final = 30.0
+"""Points that the other models explain worse than the best point by this, in the logarithm of the density, and by what
+heterogeneous ones explain better there, are not asked what buildings that differ would change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +33,7 @@ class Explaining:
         fixed: What coefficients at their bounds add to path loss [m], [dB].
         scale: Roots of the weights of the links that count, their mean square one [m].
         counted: Places of these links [m].
+        least: Density under the other models below which heterogeneous ones are not looked at, in its logarithm.
     """
 
     problem: Problem
@@ -36,6 +41,7 @@ class Explaining:
     fixed: NDArray[np.float64]
     scale: NDArray[np.float64]
     counted: NDArray[np.int64]
+    least: float = -np.inf
 
     @classmethod
     def of(cls, problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> Explaining:
@@ -76,7 +82,13 @@ class Explaining:
 
     def without_negligible(self, explained: NDArray[np.float64]) -> Explaining:
         """The same without models that explain little at any of some points, as this told of them [k, models]."""
-        return replace(self, marginal=self.marginal.reduced(explained))
+        marginal = self.marginal.reduced(explained)
+        apart = np.array([model.kind == DIFFERING for model in self.marginal.models])
+        least = -np.inf
+        if marginal.parted[0].models and apart.any():
+            best = float(np.logaddexp.reduce(explained[:, ~apart], axis=1).max())
+            least = best - FAR - max(0.0, float(explained[:, apart].max()) - best)
+        return replace(self, marginal=marginal, least=least)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of the posterior under every model, but for one constant [n, models].
@@ -117,9 +129,15 @@ class Explaining:
     def _part(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         candidates = self.problem.parameters.from_search(points)
         loss = self._loss(candidates)
-        differing = self._differing(candidates, loss) if self.marginal.spread else None
         gap = (self.problem.objective.measured[self.counted] - self.fixed - loss) * self.scale
-        found = self.marginal.densities(gap, differing)
+        found = np.full((len(points), len(self.marginal.models)), -np.inf)
+        apart = np.array([model.kind == DIFFERING for model in self.marginal.models])
+        alike, differing = self.marginal.parted
+        found[:, ~apart] = alike.densities(gap)
+        near = np.logaddexp.reduce(found, axis=1) >= self.least
+        if differing.models and near.any():
+            changed = self._differing(candidates[near], loss[near])
+            found[np.ix_(near, apart)] = differing.densities(gap[near], changed)
         if len(self.problem.priors):
             found -= 0.5 * np.sum(self.problem.priors.rows(candidates) ** 2, axis=1)[:, None]
         return found

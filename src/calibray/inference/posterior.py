@@ -34,6 +34,9 @@ LEAST: Final = 60.0
 TOO_FEW: Final = 20.0
 """Effective draws below which they do not tell where a posterior ends; the density is flattened until `LEAST` are."""
 
+BLOCK: Final = 256
+"""Points that kernels are evaluated at together, so that what is between stays within a core's cache."""
+
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Points [n, d] to the logarithm of the posterior, but for a constant [n]; -inf where it is none."""
 
@@ -187,15 +190,20 @@ class _Kernels:
         """Logarithm of the density at points [n]."""
         count, dimension = self.centre.shape
         inverse = np.linalg.inv(self.root)
-        square = np.empty((count, len(unit)))
-        for k in range(count):
-            square[k] = np.sum(((unit - self.centre[k]) @ inverse[k].T) ** 2, axis=1)
+        across = inverse.transpose(2, 0, 1).reshape(dimension, -1)
+        origin = np.einsum("kij,kj->ki", inverse, self.centre).ravel()
         constant = (
             gammaln((TAILS + dimension) / 2) - gammaln(TAILS / 2) - 0.5 * dimension * np.log(TAILS * np.pi)
         )
-        size = np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
-        each = constant - size[:, None] - 0.5 * (TAILS + dimension) * np.log1p(square / TAILS)
-        return np.logaddexp.reduce(each, axis=0) - np.log(count)
+        size = constant - np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
+        found = np.empty(len(unit))
+        for first in range(0, len(unit), BLOCK):
+            apart = (unit[first : first + BLOCK] @ across - origin).reshape(-1, count, dimension)
+            square = np.einsum("nki,nki->nk", apart, apart)
+            each = size - 0.5 * (TAILS + dimension) * np.log1p(square / TAILS)
+            top = each.max(axis=1)
+            found[first : first + BLOCK] = top + np.log(np.exp(each - top[:, None]).sum(axis=1))
+        return found - np.log(count)
 
 
 def _learned(unit: NDArray[np.float64], raw: NDArray[np.float64], random: np.random.Generator) -> _Kernels:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.inference.credible import credible
+from calibray.inference.credible import credible_sets
 from calibray.inference.posterior import Draws
 
 JUDGED: Final = 0.9
@@ -100,9 +100,8 @@ def verdicts(
     best = draws.point[np.argmax(draws.density)]
     found = []
     for index in range(len(names)):
-        pieces, told = (
-            credible(draws.point[:, index], draws.weight, float(lower[index]), float(upper[index]), held)
-            for held in (JUDGED, level)
+        pieces, told = credible_sets(
+            draws.point[:, index], draws.weight, float(lower[index]), float(upper[index]), (JUDGED, level)
         )
         low, high = pieces[0][0], pieces[-1][1]
         share = sum(end - start for start, end in pieces) / (upper[index] - lower[index])
