@@ -57,6 +57,23 @@ def test_a_basin_that_no_minimum_was_known_of_gets_its_share():
     assert "2 separate ranges" in verdict.reason
 
 
+def test_many_narrow_places_of_each_parameter_are_all_found():
+    """Reflections inside walls: six places for each of four parameters, 1296 together, and one minimum known."""
+    places, size, count = np.linspace(0.1, 0.9, 6), 0.006, 4
+    share = np.arange(1.0, 7.0) / 21.0
+
+    def density(points):
+        each = np.log(share) - 0.5 * ((points[..., None] - places) / size) ** 2
+        return np.logaddexp.reduce(each, axis=2).sum(axis=1)
+
+    one, wide = np.full((1, count), places[0]), np.diag(np.full(count, size**2))[None]
+    found = sample(density, np.zeros(count), np.ones(count), one, wide, rounds=20)
+    assert found.effective > 400
+    for value in found.point.T:
+        near = np.abs(value[:, None] - places) < 5 * size
+        assert found.weight @ near == pytest.approx(share, abs=0.08)
+
+
 def test_what_the_data_cannot_tell_spreads_over_its_bounds():
     def density(points):
         return -0.5 * ((points[:, 0] - 3.0) / 0.2) ** 2

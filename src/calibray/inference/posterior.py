@@ -2,9 +2,11 @@
 
 Importance sampling whose proposals learn (J.-M. Cornuet, J.-M. Marin, A. Mira and C. P. Robert, Adaptive multiple
 importance sampling, Scandinavian Journal of Statistics 39, 2012). The first points are spread over the whole box and
-around every minimum known, as wide as the curvature there says; each further round draws from Student-t kernels around
-points that explain the data, as wide as their neighbours lie. All points count, weighed by the posterior over the
-mixture of all proposals, so that none is lost and no basin has to be crossed from another.
+around every minimum known, as wide as the curvature there says. Half of each further round is drawn from Student-t
+kernels around points that explain the data, as wide as their neighbours lie; the other half takes each parameter by
+itself from what explains the data: reflections inside walls make each of several permittivities fit at many narrow
+places, and their combinations are more than any kernels could stand at. All points count, weighed by the posterior over
+the mixture of all proposals, so that none is lost and no basin has to be crossed from another.
 """
 
 from __future__ import annotations
@@ -36,6 +38,12 @@ TOO_FEW: Final = 20.0
 
 BLOCK: Final = 256
 """Points that kernels are evaluated at together, so that what is between stays within a core's cache."""
+
+BINS: Final = 200
+"""Places of a parameter's range that are told apart where it is taken by itself."""
+
+EVEN: Final = 0.1
+"""Share of these draws that is spread over the whole range."""
 
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Points [n, d] to the logarithm of the posterior, but for a constant [n]; -inf where it is none."""
@@ -112,7 +120,8 @@ def sample(
     even = design("sobol", batch, dimension, random)
     unit = np.concatenate([even, inside(basins.draw(batch, random))])
     found = density(lower + unit * width)
-    proposals, share = [basins], [float(batch), float(batch)]
+    proposals: list[_Kernels | _Learned] = [basins]
+    share = [float(batch), float(batch)]
     log_parts = [basins.log_density(unit)]
     while True:
         # Of the even points the density is 1; of those beyond the box, which were dropped, nothing is wanted.
@@ -128,16 +137,16 @@ def sample(
             return replace(draws, weight=_flattened(raw), flattened=True)
         if turn == rounds or (turn and draws.effective >= enough):
             return draws
-        kernels = _learned(unit, raw, random)
-        new = inside(kernels.draw(batch, random))
+        learned = _Learned(_kernels(unit, raw, random), _Apart.of(unit, _flattened(raw)))
+        new = inside(learned.draw(batch, random))
         log_parts = [
             np.concatenate([part, each.log_density(new)])
             for part, each in zip(log_parts, proposals, strict=True)
         ]
         unit = np.concatenate([unit, new])
         found = np.concatenate([found, density(lower + new * width)])
-        proposals.append(kernels)
-        log_parts.append(kernels.log_density(unit))
+        proposals.append(learned)
+        log_parts.append(learned.log_density(unit))
         share.append(float(batch))
 
 
@@ -206,7 +215,57 @@ class _Kernels:
         return found - np.log(count)
 
 
-def _learned(unit: NDArray[np.float64], raw: NDArray[np.float64], random: np.random.Generator) -> _Kernels:
+@dataclass(frozen=True, eq=False)
+class _Apart:
+    """Every parameter by itself, evenly within each of many places of its range.
+
+    Attributes:
+        share: Probability of every place, by parameter [d, BINS].
+    """
+
+    share: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, unit: NDArray[np.float64], weight: NDArray[np.float64]) -> _Apart:
+        share = np.stack([np.histogram(each, BINS, (0.0, 1.0), weights=weight)[0] for each in unit.T])
+        padded = np.pad(share, ((0, 0), (1, 1)), mode="edge")
+        share = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
+        return cls((1.0 - EVEN) * share / share.sum(axis=1, keepdims=True) + EVEN / BINS)
+
+    def draw(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Draw points [count, d]."""
+        place = np.stack([random.choice(BINS, count, p=each) for each in self.share], axis=1)
+        return (place + random.random(place.shape)) / BINS
+
+    def log_density(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithm of the density at points [n]."""
+        place = np.minimum((unit * BINS).astype(np.int64), BINS - 1)
+        return np.log(BINS * self.share[np.arange(len(self.share)), place]).sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """What a round draws from, half from each.
+
+    Attributes:
+        kernels: Around points that explain the data.
+        apart: Every parameter by itself.
+    """
+
+    kernels: _Kernels
+    apart: _Apart
+
+    def draw(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Draw points [count, d]."""
+        half = count // 2
+        return np.concatenate([self.kernels.draw(count - half, random), self.apart.draw(half, random)])
+
+    def log_density(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithm of the density at points [n]."""
+        return np.logaddexp(self.kernels.log_density(unit), self.apart.log_density(unit)) - np.log(2.0)
+
+
+def _kernels(unit: NDArray[np.float64], raw: NDArray[np.float64], random: np.random.Generator) -> _Kernels:
     """Kernels around points that explain the data, as wide as their neighbours lie."""
     weight = _flattened(raw)
     chosen = unit[_systematic(weight, 4 * KERNELS, random)]
