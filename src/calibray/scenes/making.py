@@ -21,10 +21,11 @@ from calibray.errors import InputError
 from calibray.extras import library
 from calibray.files import check_folder, write_text
 from calibray.materials import ITU_MATERIALS
+from calibray.scenes.alignment import align
 from calibray.scenes.cells import take_apart
 from calibray.scenes.extrusion import MILLIMETRE, ROOF, UNDERSIDE, WALL, WINDOW, Shell, Windows, extrude
 from calibray.scenes.footprints import Footprints
-from calibray.scenes.meshes import Mesh, MeshObject, welded, write_scene
+from calibray.scenes.meshes import MeshObject, welded, write_scene
 from calibray.scenes.terrain import Terrain, level_ground
 from calibray.spelling import did_you_mean
 
@@ -282,9 +283,10 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
     """One mesh a material, or a building and material, its name unlike that of any material."""
     names = [palette.of(kind).name for kind in range(4)]
     material = np.array(names)[shell.kind]
+    place = align(shell.corners).placed
     if buildings is None:
         return [
-            MeshObject(f"all-{name}", name, _mesh(shell.corners[material == name]))
+            MeshObject(f"all-{name}", name, welded(shell.corners[material == name], MILLIMETRE, place))
             for name in sorted(set(material))
         ]
     order = np.lexsort((material, shell.owner))
@@ -295,11 +297,7 @@ def _objects(shell: Shell, palette: Palette, buildings: Sequence[str] | None) ->
         MeshObject(
             f"{buildings[int(shell.owner[rows[0]])]}-{material[rows[0]]}",
             str(material[rows[0]]),
-            _mesh(shell.corners[rows]),
+            welded(shell.corners[rows], MILLIMETRE, place),
         )
         for rows in np.split(order, groups + 1)
     ]
-
-
-def _mesh(corners: NDArray[np.int64]) -> Mesh:
-    return welded(corners, MILLIMETRE)

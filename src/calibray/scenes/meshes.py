@@ -6,7 +6,7 @@ there is no wedge, and so no diffraction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.files import replacing
+
+Place = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""Where corners lie."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +65,13 @@ def joined(meshes: Iterable[Mesh]) -> Mesh:
     return Mesh(vertices[used], inverse.reshape(faces.shape))
 
 
-def welded(triangles: NDArray[np.integer], scale: float) -> Mesh:
+def welded(triangles: NDArray[np.integer], scale: float, place: Place | None = None) -> Mesh:
     """A mesh of triangles whose corners are whole multiples of a length: equal corners become one vertex.
 
     Args:
         triangles: Corners of every triangle, counter-clockwise seen from outside [F, 3, 3], [scale].
         scale: The length [m].
+        place: Where corners lie, if not at these multiples: [n, 3], [scale] -> [n, 3], [m].
 
     Returns:
         The mesh; triangles with two equal corners are left out.
@@ -80,7 +84,8 @@ def welded(triangles: NDArray[np.integer], scale: float) -> Mesh:
     vertices, faces = np.unique(np.reshape(triangles, (-1, 3)), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
     corners = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return joined([Mesh(vertices.astype(np.float64) * scale, faces[corners])])
+    where = vertices.astype(np.float64) * scale if place is None else place(vertices)
+    return joined([Mesh(where, faces[corners])])
 
 
 def ply_bytes(mesh: Mesh) -> bytes:

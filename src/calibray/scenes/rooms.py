@@ -16,6 +16,7 @@ from calibray.errors import InputError
 from calibray.extras import library
 from calibray.files import check_folder
 from calibray.materials import ITU_MATERIALS
+from calibray.scenes.alignment import align
 from calibray.scenes.cells import outside
 from calibray.scenes.extrusion import MILLIMETRE, Point, Stand, flat_triangles, upright
 from calibray.scenes.making import Made, SurfaceMaterial, finish
@@ -33,6 +34,8 @@ TYPES: Final = {
 """Types that are no materials of ITU-R P.2040's by themselves."""
 
 WALL_THICKNESS: Final = 0.12  # [m], of a wall of a P.2040 material whose thickness nothing tells
+ROUNDING: Final = 2.0
+"""Distance from its line at which a corner may lie by rounding [mm]: where walls of a plan cross, they are cut."""
 _REACH: Final = 0.03  # [m], how far beyond the middle of a wall another's end may miss it
 
 
@@ -201,9 +204,11 @@ def _walls(pieces: Pieces) -> list[MeshObject]:
             triangles[material] += upright(
                 left, right, sorted(levels[left]), sorted(levels[right]), low, high
             )
+    sheets = {name: np.array(corners, dtype=np.int64) for name, corners in sorted(triangles.items())}
+    place = align(np.concatenate(list(sheets.values())), ROUNDING).placed
     return [
-        MeshObject(f"all-{name}", name, welded(np.array(corners, dtype=np.int64), MILLIMETRE))
-        for name, corners in sorted(triangles.items())
+        MeshObject(f"all-{name}", name, welded(corners, MILLIMETRE, place))
+        for name, corners in sheets.items()
     ]
 
 
