@@ -63,6 +63,22 @@ def shortened(text: str, longest: int = LONGEST) -> str:
     return f"{text[:half]}...{text[-half:]}"
 
 
+def first_line(error: Exception) -> str:
+    """What a library says of a damaged file, which can break it anywhere.
+
+    Args:
+        error: What it raised.
+
+    Returns:
+        The first line of its message, or its type where it has none.
+
+    Example:
+        >>> first_line(KeyError())
+        'KeyError'
+    """
+    return shortened((str(error).strip() or type(error).__name__).splitlines()[0], 300)
+
+
 def duration(seconds: float) -> str:
     """A length of time in words, as coarse as an estimate.
 

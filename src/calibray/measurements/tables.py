@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.extras import library
 from calibray.files import exists
 from calibray.measurements.filters import evaluate
-from calibray.spelling import did_you_mean, shortened
+from calibray.measurements.workbooks import sheet_text
+from calibray.spelling import did_you_mean, first_line, shortened
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +168,10 @@ def _read_csv(path: Path) -> SourceTable:
         raise InputError(
             f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
         ) from None
+    return _parsed(path, text)
+
+
+def _parsed(path: Path, text: str) -> SourceTable:
     header, lines = _checked_layout(path, text)
     if not header:
         return SourceTable(pd.DataFrame())
@@ -212,11 +215,6 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
     return header, lines
 
 
-def _first_line(error: Exception) -> str:
-    """What a library says of a damaged file, which can break it anywhere."""
-    return shortened((str(error).strip() or type(error).__name__).splitlines()[0], 300)
-
-
 def _read_parquet(path: Path) -> SourceTable:
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
@@ -225,23 +223,11 @@ def _read_parquet(path: Path) -> SourceTable:
             f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
         ) from None
     except Exception as error:
-        raise InputError(f"{path}: not a Parquet file ({_first_line(error)}); export it again") from None
+        raise InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again") from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 
 def _read_excel(path: Path) -> SourceTable:
-    library("openpyxl", "excel")
-    try:
-        frame = pd.read_excel(path, engine="openpyxl")
-    except Exception as error:
-        raise InputError(f"{path}: not an Excel file ({_first_line(error)}); save it again") from None
-    named = [str(name) for name in frame.columns]
-    if repeated := [
-        name for name in named if re.fullmatch(r"(.*)\.\d+", name) and name.rpartition(".")[0] in named
-    ]:
-        name = repeated[0].rpartition(".")[0]
-        raise InputError(f"{path}: column {name!r} stands twice; rename one")
-    frame.columns = named
-    rows = np.arange(2, len(frame) + 2)
-    filled = frame.notna().any(axis=1).to_numpy()
-    return SourceTable(frame.loc[filled].reset_index(drop=True), rows[filled], str(path))
+    numbers, text = sheet_text(path)
+    table = _parsed(path, text)
+    return SourceTable(table.frame, np.array(numbers[1:], dtype=np.int64), table.source)
