@@ -57,7 +57,7 @@ def main() -> None:
     chosen = parser.parse_args()
     finished = []
     for kind in chosen.families:
-        with progress_bars(log) as progress:
+        with progress_bars(log()) as progress:
             part = compare_family(
                 kind, seed_range(chosen.seeds), chosen.methods, budget=chosen.budget, repeats=chosen.repeats,
                 out=chosen.runs, workers=chosen.workers, progress=progress,

@@ -72,7 +72,7 @@ def main() -> None:
                 f"{chosen.seeds} seeds, {chosen.budget} RT calls unless the method's name says otherwise."]  # fmt: skip
     for name in chosen.problems:
         title, arena = PROBLEMS[name]
-        with progress_bars(log) as progress:
+        with progress_bars(log()) as progress:
             finished = compare(
                 arena, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
                 out=chosen.runs / name, workers=chosen.workers, progress=progress,

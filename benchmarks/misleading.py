@@ -162,7 +162,7 @@ def main() -> None:
     places = [(kind, seed) for kind in chosen.families for seed in seed_range(chosen.seeds)]
     runs: dict[str, list[MethodRun]] = {name: [] for name in MODELS}
     lowest: list[float] = []
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
         for done, (kind, seed) in enumerate(places):
             progress("problems", done, len(places))
             arena = family_arena(kind, seed)

@@ -6,7 +6,6 @@ bad input, 130 for Ctrl-C. Commands import what they need when they run, so that
 
 from __future__ import annotations
 
-from importlib import metadata
 from typing import Annotated, Any, Final
 
 import typer
@@ -99,6 +98,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    # Help is plain text, which Rich would take as long to draw as all else takes.
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 """All commands; one more is a module with a function, named below."""
@@ -107,6 +108,8 @@ app = typer.Typer(
 def _print_version(wanted: bool) -> None:
     """Print the version and end, if it was asked for."""
     if wanted:
+        from importlib import metadata
+
         typer.echo(f"calibray {metadata.version('calibray')}")
         raise typer.Exit
 
@@ -138,5 +141,6 @@ COMMANDS = (  # one after the other, as `--help` lists them
     cache,
 )
 for command in COMMANDS:
-    app.command()(command)
+    # Of a summary that is not given Typer lists the beginning only.
+    app.command(short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
 app.add_typer(scene)

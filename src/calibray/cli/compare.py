@@ -94,7 +94,7 @@ def _on_study(
     typer.echo(
         f"{seeds * len(contenders):,} runs of {calls:,} RT calls together, less those kept in {out}", err=True
     )
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
         finished = run_all(
             partial(study_arena, study_file),
             names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
@@ -123,7 +123,7 @@ def _on_family(
     from calibray.tables.text import render
 
     check_outputs(out, FAMILY_FILES, (), overwrite)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
         finished = compare_family(
             kind, seeds, names, budget=budget, repeats=repeats, out=out, workers=workers, progress=progress
         )

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-log = Console(stderr=True, highlight=False)
-"""Where progress and messages go; data goes to stdout through `typer.echo`."""
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@cache
+def log() -> Console:
+    """Where progress and messages go; data goes to stdout through `typer.echo`.
+
+    Rich is loaded when something is to be shown: `--version` and `--help` do without it.
+    """
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
 
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)

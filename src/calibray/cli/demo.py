@@ -26,15 +26,17 @@ def demo(
 ) -> None:
     """Run the paper's experiment in the embedded district, and space mapping and auto beside it: tables and figures."""
     from calibray.cli.progress import progress_bars
-    from calibray.comparison.experiment import run_demo
-    from calibray.comparison.paper import tables
-    from calibray.files import check_outputs
-    from calibray.reporting.demo import FIGURES, write
-    from calibray.tables.text import render
 
-    check_outputs(out, ["result.json", *FIGURES], (), overwrite)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.comparison.experiment import run_demo
+        from calibray.comparison.paper import tables
+        from calibray.files import check_outputs
+        from calibray.reporting.demo import FIGURES, write
+        from calibray.tables.text import render
+
+        check_outputs(out, ["result.json", *FIGURES], (), overwrite)
         finished = run_demo(engine, seed, progress)
-    write(finished, out)
+        progress("writing", 0, None)
+        write(finished, out)
     typer.echo(render(*tables(finished)) + "\n")
     typer.echo(f"Written to {out}: result.json, {', '.join(FIGURES)}, and a folder for each method", err=True)

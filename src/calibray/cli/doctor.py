@@ -40,11 +40,13 @@ def doctor(
 
 def _machine() -> None:
     """Examine the machine."""
+    from calibray.cli.progress import progress_bars
     from calibray.diagnosis import examine
     from calibray.reporting.diagnosis import table
     from calibray.tables.text import render
 
-    with log.status("Trying Dr.Jit, Sionna RT and JAX"):
+    with progress_bars(log()) as progress:
+        progress("trying Dr.Jit, Sionna RT and JAX", 0, None)
         diagnosis = examine()
     typer.echo(render(table(diagnosis)))
     if not diagnosis.usable:
@@ -54,16 +56,17 @@ def _machine() -> None:
 def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
     """Examine a scene, or a study's scene with its antennas."""
     from calibray.cli.progress import progress_bars
-    from calibray.reporting import scenes as report
-    from calibray.scenes.diagnosis import diagnose
-    from calibray.study import Study
-    from calibray.tables.text import render
 
-    study = Study.load(subject) if subject.lower().endswith(".toml") else None
-    if plot is not None and study is None:
-        raise InputError(f"--plot: {subject} is a scene, whose antennas are not known; name a study file")
-    source = subject if study is None else study.scene_source
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.reporting import scenes as report
+        from calibray.scenes.diagnosis import diagnose
+        from calibray.study import Study
+        from calibray.tables.text import render
+
+        study = Study.load(subject) if subject.lower().endswith(".toml") else None
+        if plot is not None and study is None:
+            raise InputError(f"--plot: {subject} is a scene, whose antennas are not known; name a study file")
+        source = subject if study is None else study.scene_source
         found = diagnose(source, progress)
     typer.echo(render(*report.diagnosed(found), report.objects(found)))
     if plot is not None and study is not None:

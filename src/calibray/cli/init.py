@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from calibray.cli.console import log
 from calibray.errors import InputError
 
 
@@ -39,26 +40,35 @@ def init(
     ] = None,
 ) -> None:
     """Look at a scene and a table of links, tell what is assumed and why, and write a study that runs."""
+    from calibray.cli.progress import progress_bars
     from calibray.cli.sanity import warn
     from calibray.files import check_file, write_text
-    from calibray.reporting.scenes import assumed, save_positions
-    from calibray.study.draft import draft
-    from calibray.study.draft_text import SCHEMA_FILE
-    from calibray.study.schema import schema_text
-    from calibray.tables.text import render
 
     if out.exists() or out.is_symlink():
         raise InputError(f"{out}: is there already; name another file with --out, or remove it")
     inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
-    found = draft(scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track)
-    measured = found.study.measurements()
+    with progress_bars(log()) as progress:
+        from calibray.reporting.scenes import assumed, save_positions
+        from calibray.study.draft import draft
+        from calibray.study.draft_text import SCHEMA_FILE
+        from calibray.study.schema import schema_text
+        from calibray.tables.text import render
+
+        progress("looking at scene and links", 0, None)
+        found = draft(
+            scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track
+        )
+        measured = found.study.measurements()
     typer.echo(render(assumed(found)))
     counts = [f"{number} {what}" for what, number in measured.prepared.items()]
     typer.echo("\n" + ", ".join([f"{len(measured)} links", *counts]))
-    warn(found.study, measured)
+    with progress_bars(log()) as progress:
+        progress("checking positions", 0, None)
+        warn(found.study, measured)
+        if plot is not None:
+            save_positions(plot, found.study.scene_source, measured.tx, measured.rx, inputs)
     if plot is not None:
-        save_positions(plot, found.study.scene_source, measured.tx, measured.rx, inputs)
         typer.echo(f"Written to {plot}", err=True)
     schema = out.parent / SCHEMA_FILE
     if not schema.exists():

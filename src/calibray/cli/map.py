@@ -66,19 +66,21 @@ def map(
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""
-    import numpy as np
-
     from calibray.cli.progress import progress_bars
-    from calibray.files import check_outputs
-    from calibray.inference.coverage import coverage_map
-    from calibray.reporting.coverage import FILES, save_map
-    from calibray.result import Result
 
-    result, target = Result.load(folder, anyway=anyway), out or folder
-    inputs = result.study.files()
-    # Before anything is traced.
-    check_outputs(target, FILES, inputs, overwrite)
-    with progress_bars(log) as progress:
+    target = out or folder
+    with progress_bars(log()) as progress:
+        import numpy as np
+
+        from calibray.files import check_outputs
+        from calibray.inference.coverage import coverage_map
+        from calibray.reporting.coverage import FILES, save_map
+        from calibray.result import Result
+
+        result = Result.load(folder, anyway=anyway)
+        inputs = result.study.files()
+        # Before anything is traced.
+        check_outputs(target, FILES, inputs, overwrite)
         coverage = coverage_map(
             result,
             tx,
@@ -92,7 +94,8 @@ def map(
             progress=progress,
             anyway=anyway,
         )
-    names = save_map(coverage, target, inputs, overwrite)
+        progress("writing", 0, None)
+        names = save_map(coverage, target, inputs, overwrite)
     reached = np.isfinite(coverage.path_loss_db)
     typer.echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
     if len(names) < len(FILES):

@@ -51,28 +51,29 @@ def predict(
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
-    import numpy as np
-    import pandas as pd
-
     from calibray.cli.progress import progress_bars
-    from calibray.files import check_table, write_table
-    from calibray.inference.prediction import as_links, interval, opened
-    from calibray.inference.quantity import as_measured
-    from calibray.inference.remarks import remarks
-    from calibray.result import Result
 
-    result = Result.load(folder, anyway=anyway)
-    study = result.study
-    links = as_links(result, links_file)
-    names = PREDICTED[: 1 if level is None else None]
-    own = as_measured(study, links, pd.DataFrame(np.nan, index=links.frame.index, columns=list(names)))
-    _refuse_columns(links_file, links.frame, (*names, *own, *(() if level is None else SAID)))
-    if out is not None:
-        check_table(out, [links_file, *study.files()], overwrite)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        import numpy as np
+        import pandas as pd
+
+        from calibray.files import check_table, write_table
+        from calibray.inference.prediction import as_links, interval, opened
+        from calibray.inference.quantity import as_measured
+        from calibray.inference.remarks import remarks
+        from calibray.result import Result
+
+        result = Result.load(folder, anyway=anyway)
+        study = result.study
+        links = as_links(result, links_file)
+        names = PREDICTED[: 1 if level is None else None]
+        own = as_measured(study, links, pd.DataFrame(np.nan, index=links.frame.index, columns=list(names)))
+        _refuse_columns(links_file, links.frame, (*names, *own, *(() if level is None else SAID)))
+        if out is not None:
+            check_table(out, [links_file, *study.files()], overwrite)
         setup = opened(result, links, anyway=anyway)
         told = interval(result, setup, level, progress)
-    odd = remarks(result, setup)
+        odd = remarks(result, setup)
     columns = {name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))}
     columns |= as_measured(study, links, told) | ({} if level is None else {"remark": odd})
     table = links.frame.assign(**columns)

@@ -15,8 +15,11 @@ from rich.console import Console
 from calibray import interruption
 from calibray.progress import Progress
 
-EVERY: Final = 5.0
-"""Seconds between two lines where there is no terminal; work that is shorter prints none."""
+EVERY: Final = 4.0
+"""Seconds between two lines where there is no terminal; work that is shorter prints none.
+
+A command with two spells of work, one after the other, is silent for less than twice as long.
+"""
 
 
 STARTING: Final = "starting"
@@ -67,9 +70,10 @@ def _bars(console: Console) -> Iterator[Progress]:
         def report(stage: str, done: int, total: int | None) -> None:
             if STARTING in tasks:
                 bars.remove_task(tasks.pop(STARTING))
+            known = 1 if total is None and not done else total
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total, completed=done)
-            bars.update(tasks[stage], completed=done, total=total)
+                tasks[stage] = bars.add_task(stage, total=known, completed=done)
+            bars.update(tasks[stage], completed=done, total=known)
 
         yield report
 

@@ -25,12 +25,13 @@ def report(
 ) -> None:
     """Write a result as one HTML file that opens from disk: summary, values, figures, map, and the scene in 3-D."""
     from calibray.cli.progress import progress_bars
-    from calibray.reporting.page import FIGURES, FILE
-    from calibray.reporting.page import report as write
-    from calibray.result import Result
 
-    result = Result.load(folder)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.reporting.page import FIGURES, FILE
+        from calibray.reporting.page import report as write
+        from calibray.result import Result
+
+        result = Result.load(folder)
         pictures = folder / FIGURES if figures else None
         file = out or folder / FILE
         written = write(result, file, figures=pictures, overwrite=overwrite, progress=progress)

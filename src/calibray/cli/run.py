@@ -49,25 +49,28 @@ def run(
     ] = False,
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene and a report."""
-    from calibray.calibration import calibrate
-    from calibray.calibration.methods import check_method
     from calibray.cli.progress import progress_bars
-    from calibray.cli.sanity import warn
-    from calibray.engines import open_crew, open_executor
-    from calibray.files import check_outputs
-    from calibray.result import FILES, tables
-    from calibray.study import Study
-    from calibray.tables.text import render
 
-    study = Study.load(study_file).replace(method, seed, engine)
-    check_method(study.method.name)
-    check_outputs(out, FILES, study.files(), overwrite)
-    setup = study.opened()
-    warn(study, setup.links)
     try:
-        opened = open_crew if study.engine.parted else open_executor
-        with opened(workers, scheduler) as executor, progress_bars(log) as progress:
-            result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
+        # Loading libraries, tables and the scene takes seconds too.
+        with progress_bars(log()) as progress:
+            from calibray.calibration import calibrate
+            from calibray.calibration.methods import check_method
+            from calibray.cli.sanity import warn
+            from calibray.engines import open_crew, open_executor
+            from calibray.files import check_outputs
+            from calibray.result import FILES, tables
+            from calibray.study import Study
+            from calibray.tables.text import render
+
+            study = Study.load(study_file).replace(method, seed, engine)
+            check_method(study.method.name)
+            check_outputs(out, FILES, study.files(), overwrite)
+            setup = study.opened()
+            warn(study, setup.links)
+            opened = open_crew if study.engine.parted else open_executor
+            with opened(workers, scheduler) as executor:
+                result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
         typer.echo(_kept(out), err=True)
         raise
@@ -106,7 +109,7 @@ def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list
         from calibray.reporting import page
 
         folder = out / page.FIGURES if figures else None
-        with progress_bars(log) as progress:
+        with progress_bars(log()) as progress:
             page.report(result, out / page.FILE, figures=folder, overwrite=overwrite, progress=progress)
     except Exception as error:
         typer.echo(f"Warning: no report ({error}); try again with: calibray report {out}", err=True)

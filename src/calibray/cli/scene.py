@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -12,10 +12,15 @@ from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
+    from calibray.progress import Progress
     from calibray.scenes.footprints import Footprints
-    from calibray.scenes.making import SurfaceMaterial
+    from calibray.scenes.making import Made, SurfaceMaterial
 
-scene = typer.Typer(name="scene", no_args_is_help=True, add_completion=False)
+SUMMARY: Final = "Make a scene of an OpenStreetMap extract, of footprints with heights, or of a floor plan."
+
+scene = typer.Typer(
+    name="scene", help=SUMMARY, short_help=SUMMARY, no_args_is_help=True, add_completion=False
+)
 """The commands; `app.add_typer(scene)` adds them."""
 
 Out = Annotated[
@@ -60,11 +65,6 @@ PerBuilding = Annotated[
 ]
 
 
-@scene.callback()
-def describe() -> None:
-    """Make a scene of an OpenStreetMap extract, of footprints with heights, or of a floor plan."""
-
-
 @scene.command()
 def osm(
     extract: Annotated[Path, typer.Argument(metavar="EXTRACT", help="An .osm or .osm.pbf file.")],
@@ -83,14 +83,19 @@ def osm(
     per_building: PerBuilding = False,
 ) -> None:
     """Make a scene of the buildings of an OpenStreetMap extract."""
+    from calibray.cli.progress import progress_bars
     from calibray.files import check_folder
     from calibray.scenes.footprints import HeightRule
     from calibray.scenes.openstreetmap import read_openstreetmap
 
     check_folder(out)
-    with log.status(f"Reading {extract}"):
+    with progress_bars(log()) as progress:
+        progress("reading", 0, None)
         found, frame = read_openstreetmap(extract, _frame(origin, utm), HeightRule(storey, default_height))
-    _make(found, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building)
+        made = _made(
+            found, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building, progress,
+        )  # fmt: skip
+    _tell(made)
 
 
 @scene.command()
@@ -122,17 +127,22 @@ def footprints(
     per_building: PerBuilding = False,
 ) -> None:
     """Make a scene of building footprints with heights."""
+    from calibray.cli.progress import progress_bars
     from calibray.files import check_folder
     from calibray.scenes.footprints import HeightRule
     from calibray.scenes.vectors import read_footprints
 
     check_folder(out)
-    with log.status(f"Reading {file}"):
+    with progress_bars(log()) as progress:
+        progress("reading", 0, None)
         found, frame = read_footprints(
             file, _number_or_column(height), _number_or_column(bottom), name, levels, layer,
             _frame(origin, utm), HeightRule(storey, default_height),
         )  # fmt: skip
-    _make(found, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building)
+        made = _made(
+            found, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building, progress,
+        )  # fmt: skip
+    _tell(made)
 
 
 @scene.command()
@@ -157,17 +167,26 @@ def plan(
     ] = None,
 ) -> None:
     """Make a scene of a floor plan: one sheet for every wall, door and window."""
-    from calibray.reporting import scenes as report
+    from calibray.cli.progress import progress_bars
     from calibray.scenes.plan import read_plan
     from calibray.scenes.rooms import make_plan_scene
-    from calibray.tables.text import render
 
     types = _types(material or [])
-    made = make_plan_scene(read_plan(file, height, unit), out, types, floor, ceiling, merge)
+    with progress_bars(log()) as progress:
+        progress("making", 0, None)
+        made = make_plan_scene(read_plan(file, height, unit), out, types, floor, ceiling, merge)
+    _tell(made)
+
+
+def _tell(made: Made) -> None:
+    """Print what was made."""
+    from calibray.reporting import scenes as report
+    from calibray.tables.text import render
+
     typer.echo(render(report.made(made)))
 
 
-def _make(
+def _made(
     found: Footprints,
     frame: Frame,
     out: Path,
@@ -179,15 +198,14 @@ def _make(
     window_share: float,
     margin: float,
     per_building: bool,
-) -> None:
-    """Make a scene of footprints, and tell what was made."""
+    progress: Progress,
+) -> Made:
+    """A scene of footprints."""
     import numpy as np
 
-    from calibray.reporting import scenes as report
     from calibray.scenes.extrusion import Windows as Division
     from calibray.scenes.making import Palette, make_scene
     from calibray.scenes.terrain import lowered, read_terrain
-    from calibray.tables.text import render
 
     palette = Palette(
         wall=_material("walls", wall, 0.3),
@@ -197,12 +215,11 @@ def _make(
     windows = Division(window_share) if window_share else None
     surface = None
     if terrain is not None:
-        with log.status(f"Reading {terrain}"):
-            bounds = found.bounds + margin * np.array([-1, -1, 1, 1])
-            surface, frame = lowered(read_terrain(terrain, frame, bounds, spacing), frame)
+        bounds = found.bounds + margin * np.array([-1, -1, 1, 1])
+        surface, frame = lowered(read_terrain(terrain, frame, bounds, spacing), frame)
     typer.echo(f"Making a scene of {len(found)} buildings", err=True)
-    made = make_scene(found, out, frame, surface, palette, windows, margin, per_building=per_building)
-    typer.echo(render(report.made(made)))
+    progress("making", 0, None)
+    return make_scene(found, out, frame, surface, palette, windows, margin, per_building=per_building)
 
 
 def _frame(origin: str | None, utm: bool) -> Frame | None:

@@ -32,20 +32,21 @@ def suggest(
     overwrite: Overwrite = False,
 ) -> None:
     """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
-    from calibray.calibration.suggest import shown
-    from calibray.calibration.suggest import suggest as find
     from calibray.cli.progress import progress_bars
-    from calibray.files import check_table, write_table
-    from calibray.inference.prediction import as_links
-    from calibray.result import Result
-    from calibray.tables.text import render
 
-    result = Result.load(folder, anyway=anyway)
-    study = result.study
-    links = as_links(result, candidates_file)
-    if out is not None:
-        check_table(out, [candidates_file, *study.files()], overwrite)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.calibration.suggest import shown
+        from calibray.calibration.suggest import suggest as find
+        from calibray.files import check_table, write_table
+        from calibray.inference.prediction import as_links
+        from calibray.result import Result
+        from calibray.tables.text import render
+
+        result = Result.load(folder, anyway=anyway)
+        study = result.study
+        links = as_links(result, candidates_file)
+        if out is not None:
+            check_table(out, [candidates_file, *study.files()], overwrite)
         found = find(result, links, count, progress, anyway=anyway)
     typer.echo(json.dumps(found.to_dict("records"), indent=2) if as_json else render(*shown(found)))
     if out is not None:

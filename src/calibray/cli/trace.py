@@ -30,23 +30,24 @@ def trace(
     from functools import partial
 
     from calibray.cli.progress import progress_bars
-    from calibray.fields import path_loss
-    from calibray.files import check_file
-    from calibray.progress import staged
-    from calibray.reporting import trace as report
-    from calibray.study import Study
-    from calibray.tables.text import render
-    from calibray.tracing import convergence
 
-    study = Study.load(study_file)
-    _refuse_idleness(out, check)
-    if out is not None:
-        check_file(out, study.files(), overwrite)
-    setup = study.opened()
-    links, tracer = setup.links, setup.tracer
-    if told := tracer.plan(links).announcement(len(links)):
-        typer.echo(told, err=True)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.fields import path_loss
+        from calibray.files import check_file
+        from calibray.progress import staged
+        from calibray.reporting import trace as report
+        from calibray.study import Study
+        from calibray.tables.text import render
+        from calibray.tracing import convergence
+
+        study = Study.load(study_file)
+        _refuse_idleness(out, check)
+        if out is not None:
+            check_file(out, study.files(), overwrite)
+        setup = study.opened()
+        links, tracer = setup.links, setup.tracer
+        if told := tracer.plan(links).announcement(len(links)):
+            typer.echo(told, err=True)
         paths = tracer.trace(links, progress)
         if out is not None:
             paths.save(out)

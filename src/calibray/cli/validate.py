@@ -41,17 +41,18 @@ def validate(
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate without each block of links in turn, and judge the twin and its rivals by the block left out."""
-    from calibray.calibration.validate import validate as judge
     from calibray.cli.progress import progress_bars
-    from calibray.files import check_outputs
-    from calibray.result.validation import FILE, write_validation
-    from calibray.study import Study
-    from calibray.tables.text import render
 
-    study = Study.load(study_file)
-    if out is not None:
-        check_outputs(out, (FILE,), study.files(), overwrite)
-    with progress_bars(log) as progress:
+    with progress_bars(log()) as progress:
+        from calibray.calibration.validate import validate as judge
+        from calibray.files import check_outputs
+        from calibray.result.validation import FILE, write_validation
+        from calibray.study import Study
+        from calibray.tables.text import render
+
+        study = Study.load(study_file)
+        if out is not None:
+            check_outputs(out, (FILE,), study.files(), overwrite)
         found = judge(study, blocks=blocks, by=by, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
     if out is not None:
