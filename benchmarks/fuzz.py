@@ -1,6 +1,6 @@
 """Hostile input of every kind, thousands of cases from a seed; says what came of each kind, and what must not.
 
-Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W], or, to see one case again,
+Run with: python benchmarks/fuzz.py [--cases N] [--seed S] [--workers W] [--kinds NAME ...], or, to see one case again,
 python benchmarks/fuzz.py --seed S --case N [--keep DIR]
 
 Cases run one after the other in worker processes; one that hangs or crashes is counted and its worker replaced. As root
@@ -16,6 +16,7 @@ import os
 import queue
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -37,7 +38,7 @@ INSIDE = "CALIBRAY_FUZZ_PLACE"  # the temporary folder, set within the mount nam
 COST = re.compile(r"\b(GiB|MiB|GB|rays|minutes|hours|seconds|calls)\b")
 
 
-def work(place: Path, seed: int) -> None:
+def work(place: Path, seed: int, kinds: list[str]) -> None:
     """Run the cases whose numbers stand on standard input, and print what came of each."""
     from fuzzing.kinds import make
     from fuzzing.outcome import MEMORY, Case, Verdict, Watch, judge, peak, restart_peak
@@ -58,7 +59,7 @@ def work(place: Path, seed: int) -> None:
         os.ftruncate(2, 0)
         restart_peak()
         try:
-            case = make(seed, number, found, folder)
+            case = make(seed, number, found, folder, kinds)
         except Exception:
             case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
         # Told first, for who cannot be asked any more.
@@ -85,19 +86,27 @@ def _remove(folder: Path) -> None:
 class Worker:
     """A process that runs cases, and is started again when it is lost."""
 
-    def __init__(self, place: Path, name: str, seed: int) -> None:
-        self._place, self._errors, self._seed = place, place / f"{name}.err", seed
+    def __init__(self, place: Path, name: str, seed: int, kinds: list[str]) -> None:
+        self._place, self._errors, self._seed, self._kinds = place, place / f"{name}.err", seed, kinds
+        self._closed = False
         self._start()
 
     def _start(self) -> None:
+        """Start the process, which is ended again if this one is asked to end meanwhile."""
         command = [sys.executable, __file__, "--work", str(self._place), "--seed", str(self._seed)]
+        command += ["--kinds", *self._kinds] if self._kinds else []
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors.open("ab"), text=True,
             start_new_session=True,
         )  # fmt: skip
         self._lines: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._listen, args=(self._process, self._lines), daemon=True).start()
-        if self._next(START) != "ready\n":
+        try:
+            ready = self._next(START)
+        except SystemExit:
+            self.close()
+            raise
+        if ready != "ready\n":
             sys.exit(f"a worker does not start:\n{self._errors.read_text()[-3000:]}")
 
     @staticmethod
@@ -142,8 +151,14 @@ class Worker:
         self.end()
         verdict = "crash" if ended else "memory" if large else "announced" if COST.search(said) else "hang"
         lost = {"verdict": verdict, "detail": f"status {self._process.returncode}, {said}", "seconds": LIMIT}
-        self._start()
+        if not self._closed:
+            self._start()
         return lost
+
+    def close(self) -> None:
+        """End the process for good."""
+        self._closed = True
+        self.end()
 
     def end(self) -> None:
         """End the process and what it started."""
@@ -152,7 +167,9 @@ class Worker:
         self._process.wait()
 
 
-def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dict[str, object]]:
+def attack(
+    place: Path, numbers: list[int], seed: int, workers: int, kinds: list[str]
+) -> list[dict[str, object]]:
     """Run cases, with progress on stderr."""
     waiting: queue.Queue[int] = queue.Queue()
     for number in numbers:
@@ -174,23 +191,31 @@ def attack(place: Path, numbers: list[int], seed: int, workers: int) -> list[dic
                     file=sys.stderr,
                 )
 
-    first = Worker(place, "worker-0", seed)  # makes the world that the others find
-    threads = [threading.Thread(target=serve, args=(first,), daemon=True)] + [
-        threading.Thread(
-            target=lambda name: serve(Worker(place, name, seed)), args=(f"worker-{k}",), daemon=True
-        )
+    # The first makes the world that the others find.
+    team = [Worker(place, "worker-0", seed, kinds)]
+
+    def join(name: str) -> None:
+        team.append(Worker(place, name, seed, kinds))
+        serve(team[-1])
+
+    threads = [threading.Thread(target=serve, args=(team[0],), daemon=True)] + [
+        threading.Thread(target=join, args=(f"worker-{k}",), daemon=True)
         for k in range(1, min(workers, len(numbers)))
     ]
     started = time.monotonic()
     for thread in threads:
         thread.start()
     seen, told = sys.stderr.isatty(), started
-    while any(thread.is_alive() for thread in threads):
-        time.sleep(0.5)
-        if seen or time.monotonic() - told > 30:
-            told = time.monotonic()
-            line = f"{len(found)} of {len(numbers)} cases, {told - started:.0f} s"
-            print(line, end="\r" if seen else "\n", file=sys.stderr, flush=True)
+    try:
+        while any(thread.is_alive() for thread in threads):
+            time.sleep(0.5)
+            if seen or time.monotonic() - told > 30:
+                told = time.monotonic()
+                line = f"{len(found)} of {len(numbers)} cases, {told - started:.0f} s"
+                print(line, end="\r" if seen else "\n", file=sys.stderr, flush=True)
+    finally:
+        for worker in team:
+            worker.close()
     print(file=sys.stderr)
     if len(found) < len(numbers):
         sys.exit(f"only {len(found)} of {len(numbers)} cases were run: a worker could not be started")
@@ -220,7 +245,7 @@ def main(place: Path, chosen: argparse.Namespace) -> int:
     numbers = (
         [chosen.case] if chosen.case is not None else list(range(chosen.first, chosen.first + chosen.cases))
     )
-    found = attack(place, numbers, chosen.seed, chosen.workers)
+    found = attack(place, numbers, chosen.seed, chosen.workers, chosen.kinds)
     if chosen.case is not None:
         told = found[0]
         print(f"{told['kind']}: {told['note']}\n{told['verdict']}: {told['detail']}")
@@ -234,7 +259,18 @@ def _apart(place: str) -> int:
         'mount -o remount,bind,ro /dev; mount -t tmpfs -o size=1g tmpfs /dev/shm; exec "$@"'
     )
     command = ["unshare", "-m", "sh", "-c", script, "sh", sys.executable, *sys.argv]
-    return subprocess.run(command, check=False, env={**os.environ, INSIDE: place}).returncode
+    process = subprocess.Popen(command, env={**os.environ, INSIDE: place})
+    try:
+        return process.wait()
+    finally:
+        # Asked to end, which ends its workers too.
+        process.terminate()
+        process.wait()
+
+
+def _end(number: int, _: object) -> None:
+    """End on a signal as on an error, so that what was started is ended as well."""
+    sys.exit(128 + number)
 
 
 if __name__ == "__main__":
@@ -242,15 +278,17 @@ if __name__ == "__main__":
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", nargs="+", default=[], help="functions of fuzzing.kinds.SHARES, by name")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--case", type=int, help="run this one, and print all of it")
     parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work is not None:
-        work(options.work, options.seed)
+        work(options.work, options.seed, options.kinds)
         sys.exit()
     from fuzzing.outcome import ALLOWED, FORBIDDEN
 
+    signal.signal(signal.SIGTERM, _end)
     if INSIDE not in os.environ:
         with tempfile.TemporaryDirectory(prefix="calibray-fuzz-") as fresh:
             alone = ["unshare", "-m", "true"]

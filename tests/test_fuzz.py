@@ -25,11 +25,11 @@ from calibray.scenes.ply import check_ply
 from calibray.study import Study
 from calibray.study.reading import expand
 from calibray.tracing import gain_table
-from fuzzing import geometry, inputs, stored, world
+from fuzzing import geometry, inputs, stored, workbooks, world
 from fuzzing.outcome import ALLOWED, Watch, judge
 from test_bad_input import run, write
 
-LIGHT = (inputs.study, inputs.row_filter, inputs.table, geometry.mesh, geometry.antenna)
+LIGHT = (inputs.study, inputs.row_filter, inputs.table, workbooks.workbook, geometry.mesh, geometry.antenna)
 """Kinds that need nothing calibrated; cases that trace or run are the benchmark's."""
 FUZZ = settings(max_examples=60, deadline=None, derandomize=True, database=None)
 
@@ -46,6 +46,7 @@ def found(tmp_path_factory):
 def light(monkeypatch):
     monkeypatch.setattr(inputs, "DEEP", 0.0)
     monkeypatch.setattr(geometry, "TRACED", 0.0)
+    monkeypatch.setattr(workbooks, "SWOLLEN", tuple(each for each in workbooks.SWOLLEN if each[-1] < 10**5))
     monkeypatch.setattr(
         geometry, "_traced", lambda study, whole: lambda: len(Study.load(study).opened().scene.objects)
     )

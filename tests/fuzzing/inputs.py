@@ -298,10 +298,10 @@ def table(rng: Random, found: World, folder: Path) -> Case:
         case _:
             raw, note = damage(rng, text.encode()), "bytes"
     file.write_bytes(raw)
-    return Case("table", f"csv {note}", lambda: _read(file, _plain(raw)), names=("links.csv",))
+    return Case("table", f"csv {note}", lambda: read(file, plain(raw)), names=("links.csv",))
 
 
-def _read(file: Path, plain: list[list[float]] | None) -> list[float]:
+def read(file: Path, plain: list[list[float]] | None) -> list[float]:
     """What the package reads, once it is certain that it is what stands in the file."""
     links = read_measurements(file, [0.0, 0.0, 2.0], ["x", "y", 1.5], "loss", group="half", weight="w")
     rows = np.stack([*links.rx[:, :2].T, links.path_loss_db], axis=1)
@@ -310,7 +310,7 @@ def _read(file: Path, plain: list[list[float]] | None) -> list[float]:
     return rows.ravel().tolist()
 
 
-def _plain(raw: bytes) -> list[list[float]] | None:
+def plain(raw: bytes) -> list[list[float]] | None:
     """The numbers of a CSV file by the plainest means; None where something is no number."""
     try:
         rows = list(csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), skipinitialspace=True))
@@ -352,7 +352,7 @@ def _parquet(rng: Random, folder: Path) -> Case:
         plain = numbers.tolist() if np.isfinite(numbers).all() else None
     except Exception:
         plain = None
-    return Case("table", f"parquet {note}", lambda: _read(file, plain), names=("links.parquet",))
+    return Case("table", f"parquet {note}", lambda: read(file, plain), names=("links.parquet",))
 
 
-__all__ = ["Exited", "InputError", "row_filter", "study", "table"]
+__all__ = ["CELLS", "Exited", "InputError", "plain", "read", "row_filter", "study", "table"]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from random import Random
 
-from fuzzing import geometry, inputs, outside, stored
+from fuzzing import geometry, inputs, maps, outside, stored, workbooks
 from fuzzing.outcome import Case
 from fuzzing.world import World
 
@@ -22,11 +23,13 @@ SHARES = {
     stored.result: 8,
     outside.answer: 2,
     outside.line: 7,
+    workbooks.workbook: 5,
+    maps.coverage: 3,
 }
 """Cases of each kind of a hundred or so."""
 
 
-def make(seed: int, number: int, found: World, folder: Path) -> Case:
+def make(seed: int, number: int, found: World, folder: Path, names: Collection[str] = ()) -> Case:
     """A case: the same for the same seed and number, wherever it is made.
 
     Args:
@@ -34,10 +37,12 @@ def make(seed: int, number: int, found: World, folder: Path) -> Case:
         number: Number of the case.
         found: The world.
         folder: An empty folder for the case's files.
+        names: Names of the kinds to choose from; all if empty.
 
     Returns:
         The case.
     """
     rng = Random(f"{seed}/{number}")
-    kind = rng.choices(list(SHARES), list(SHARES.values()))[0]
+    shares = {kind: share for kind, share in SHARES.items() if not names or kind.__name__ in names}
+    kind = rng.choices(list(shares), list(shares.values()))[0]
     return kind(rng, found, folder)
