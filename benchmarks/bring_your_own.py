@@ -1,19 +1,25 @@
-"""How often the example town's planted materials lie in their 95 % intervals, over seeds of its log.
+"""How often what was planted lies in its 95 % interval, over seeds of the logs of the three example walks.
 
-    python benchmarks/bring_your_own.py [--seeds 40] [--first 0] [--keep-faint] [--biased]
+    python benchmarks/bring_your_own.py [--walks town flat hill] [--seeds 30] [--first 1000] [--keep-faint] [--biased]
+        [--out intervals.jsonl]
 
-Every seed is another walk through the town of `examples/bring_your_own`: other errors of position, other fading.
-Positions are drawn from some for each stop, so that all are traced once and no program is compiled twice; what is
-chosen, fitted and profiled is what `calibray run` does. --keep-faint fits all averages that were heard, --biased leaves
-the logarithm of their means as it is.
+Every seed is another walk through the places of `examples/bring_your_own`: other errors of position, other fading. The
+study is the one that `calibray init` writes for the example, the scene the one that `calibray scene` makes, and what is
+chosen, fitted and profiled is what `calibray run` does. So that all is traced once and no program compiled twice,
+positions are drawn from some for each stop of the town, and the track of the hill is one of a few. --keep-faint fits
+all averages that were heard, --biased leaves the logarithm of their means as it is; both concern the town, where there
+is a noise floor. Seeds that stand in --out are not run again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +29,8 @@ from scipy.stats import binomtest
 EXAMPLES = Path(__file__).parents[1] / "examples" / "bring_your_own"
 sys.path.insert(0, str(EXAMPLES))
 
+import make_flat as flat  # noqa: E402
+import make_hill as hill  # noqa: E402
 import make_town as town  # noqa: E402
 
 from calibray import engines  # noqa: E402
@@ -36,47 +44,85 @@ from calibray.measurements.preparation import prepare  # noqa: E402
 from calibray.measurements.tables import SourceTable  # noqa: E402
 from calibray.scenes.making import make_scene  # noqa: E402
 from calibray.scenes.openstreetmap import read_openstreetmap  # noqa: E402
-from calibray.study import Setup  # noqa: E402
+from calibray.scenes.plan import read_plan  # noqa: E402
+from calibray.scenes.rooms import make_plan_scene  # noqa: E402
+from calibray.scenes.terrain import lowered, read_terrain  # noqa: E402
+from calibray.scenes.vectors import read_footprints  # noqa: E402
+from calibray.study import Setup, Study  # noqa: E402
 from calibray.study.draft import draft  # noqa: E402
 
-CHOICES = 4  # recorded positions to draw from for each stop
-PLANTED = {
-    f"{name}.relative_permittivity": each["relative_permittivity"]
-    for name, each in (("walls", town.WALLS), ("ground", town.GROUND))
-}
+CHOICES = 4  # recorded positions to draw from for each stop of the town
+TRACKS = 3  # tracks along the hill
+MARGIN = 50.0  # [m], of ground about the houses, as `calibray scene` makes it
 
 
-def opened(folder: Path) -> tuple[Problem, list, np.ndarray]:
-    """The town's problem over all positions that may be recorded, the amplitudes at its stops, and the positions."""
+@dataclass(frozen=True)
+class Walk:
+    """A place whose truth is known.
+
+    Attributes:
+        planted: The constants that its intervals are to hold, by parameter.
+        problem: The problem of the walk of a seed.
+    """
+
+    planted: dict[str, float]
+    problem: Callable[[int], Problem]
+
+
+def constants(materials: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Constants of materials by parameter."""
+    return {f"{name}.{key}": value for name, values in materials.items() for key, value in values.items()}
+
+
+# The town: positions that may be recorded are links of one problem, of which a walk weighs those drawn and heard.
+
+
+def town_walk(folder: Path, biased: bool) -> Walk:
+    """The town, its phones and its noise floor."""
     found, frame = read_openstreetmap(EXAMPLES / "town.osm", town.FRAME)
+    places, gains = town.stopped(make_scene(found, folder / "planted", frame).path)
+    # The user's scene is made without the truth's frame.
+    found, frame = read_openstreetmap(EXAMPLES / "town.osm")
     scene = make_scene(found, folder, frame).path
-    places, gains = town.stopped(scene)
+
+    def placed(points: np.ndarray) -> np.ndarray:
+        degrees = town.FRAME.to_geographic(points)
+        return frame.to_scene(degrees[:, 0], degrees[:, 1], 0.0) + np.outer(points[:, 2], [0, 0, 1])
+
     rng = np.random.default_rng(2026)
     shape = (len(town.PHONE_DB), len(places), CHOICES)
     recorded = np.zeros((*shape, 3)) + places[:, None]
     recorded[..., :2] += rng.normal(0.0, town.GPS_ERROR, (*shape, 2))
-    drafted = draft(
+    recorded = placed(recorded.reshape(-1, 3)).reshape(recorded.shape)
+    study = draft(
         str(scene), EXAMPLES / "rsrp.csv", folder / "study.toml", EXAMPLES / "cells.csv", town.FREQUENCY
-    )
-    masts = np.repeat(list(town.MASTS.values()), recorded.size // 3, axis=0)
-    group = [
-        f"{cell} {phone}"
-        for cell in town.MASTS
-        for phone in town.PHONE_DB
-        for _ in range(recorded[0].size // 3)
-    ]
+    ).study
+    count = recorded.size // 3
     links = Measurements(
-        tx=masts,
+        tx=np.repeat(placed(np.array(list(town.MASTS.values()))), count, axis=0),
         rx=np.tile(recorded.reshape(-1, 3), (len(town.MASTS), 1)),
-        path_loss_db=np.full(len(masts), -town.FLOOR_DBM),
-        group=np.array(group),
-        limit_db=np.full(len(masts), -town.FLOOR_DBM),
+        path_loss_db=np.full(count * len(town.MASTS), -town.FLOOR_DBM),
+        group=np.repeat(
+            [f"{cell} {phone}" for cell in town.MASTS for phone in town.PHONE_DB], count // shape[0]
+        ),
+        limit_db=np.full(count * len(town.MASTS), -town.FLOOR_DBM),
     )
-    setup = Setup.open(drafted.study, links=links)
-    return Problem.of(setup, engines.make(setup)), gains, recorded
+    setup = Setup.open(study, links=links)
+    whole = Problem.of(setup, engines.make(setup))
+    cell_m = study.links.average.cell if study.links.average is not None else 0.0
+    materials = {"walls": town.WALLS, "ground": town.GROUND}
+    planted = {name: value for name, value in constants(materials).items() if "permittivity" in name}
+    return Walk(
+        planted,
+        lambda seed: _heard_in_town(
+            whole, gains, recorded, seed, Averaging("cell", cell_m, unbiased=not biased)
+        ),
+    )
 
 
-def walked(problem: Problem, gains: list, recorded: np.ndarray, seed: int, biased: bool) -> Problem:
+def _heard_in_town(
+    problem: Problem, gains: list[list[np.ndarray]], recorded: np.ndarray, seed: int, averaging: Averaging
+) -> Problem:
     """The problem of one walk: only the positions drawn and heard count."""
     rng = np.random.default_rng(seed)
     number = np.arange(len(problem.setup.links)).reshape(len(town.MASTS), *recorded.shape[:3])
@@ -87,11 +133,10 @@ def walked(problem: Problem, gains: list, recorded: np.ndarray, seed: int, biase
             for _ in range(town.SAMPLES):
                 for mast, (cell, eirp) in enumerate(town.EIRP_DBM.items()):
                     power = town.sample(gains[mast][stop], eirp + gain_db, rng)
-                    heard_dbm = power if power > town.FLOOR_DBM else None
+                    loud = round(power, 1) if power > town.FLOOR_DBM else None
                     place = recorded[phone, stop, choice]
-                    rows.append((number[mast, phone, stop, choice], cell, name, *place, heard_dbm))
+                    rows.append((number[mast, phone, stop, choice], cell, name, *place, loud))
     log = pd.DataFrame(rows, columns=["link", "cell", "device", "x", "y", "z", "rsrp"])
-    averaging = Averaging("cell", 3.3, unbiased=not biased)
     steps = Preparation(noise_floor_dbm=town.FLOOR_DBM, averaging=averaging, keep=("cell", "device"))
     table = prepare(
         SourceTable(log, source="log"), steps, (0.0, 0.0, 0.0), ("x", "y", "z"), "rsrp"
@@ -102,42 +147,161 @@ def walked(problem: Problem, gains: list, recorded: np.ndarray, seed: int, biase
     return replace(problem, objective=replace(problem.objective, measured=measured, weight=weight))
 
 
+# The flat and the hill: the same positions with other values, read from files as the user's are.
+
+
+def _again(study: Study, problem: Problem) -> Problem:
+    """The problem with the values that the study's table holds now."""
+    links = study.measurements()
+    if not np.array_equal(links.rx, problem.setup.links.rx):
+        raise RuntimeError("the links are others than those that were traced")
+    return replace(problem, objective=replace(problem.objective, measured=links.path_loss_db))
+
+
+def flat_walk(folder: Path) -> Walk:
+    """The flat, its laptop and three access points; floor and ceiling are planted as the scene makes them."""
+    gains = flat.heard()
+    scene = make_plan_scene(read_plan(flat.FOLDER / "plan.csv", 2.6), folder).path
+    table = folder / "rss.csv"
+    flat.measure(gains, np.random.default_rng(flat.SEED)).to_csv(table, index=False)
+    study = draft(
+        str(scene), table, folder / "study.toml", flat.FOLDER / "access_points.csv", flat.FREQUENCY
+    ).study
+    setup = study.opened()
+    whole = Problem.of(setup, engines.make(setup))
+    others = {
+        name: {"relative_permittivity": each.relative_permittivity, "conductivity": each.conductivity}
+        for name, each in setup.scene.materials.items()
+        if name in ("floor", "ceiling")
+    }
+
+    def problem(seed: int) -> Problem:
+        flat.measure(gains, np.random.default_rng(seed)).to_csv(table, index=False)
+        return _again(study, whole)
+
+    return Walk(constants(flat.PLANTED | others), problem)
+
+
+def hill_walk(folder: Path) -> Walk:
+    """The hill, its scanner and its track."""
+    gains = hill.heard()
+    found, frame = read_footprints(hill.FOLDER / "houses.geojson", "height_m", 0.0)
+    bounds = found.bounds + MARGIN * np.array([-1, -1, 1, 1])
+    terrain, frame = lowered(read_terrain(hill.FOLDER / "ground.tif", frame, bounds), frame)
+    scene = make_scene(found, folder, frame, terrain).path
+
+    @cache
+    def tracked(number: int) -> tuple[Study, Problem]:
+        place = folder / f"track-{number}"
+        place.mkdir()
+        rng = np.random.default_rng([2026, number])
+        (place / "walk.gpx").write_text(hill.track(rng))
+        hill.measure(gains, rng).to_csv(place / "power.csv", index=False)
+        study = draft(
+            str(scene), place / "power.csv", place / "study.toml", hill.FOLDER / "masts.csv", hill.FREQUENCY,
+            track=place / "walk.gpx",
+        ).study  # fmt: skip
+        setup = study.opened()
+        return study, Problem.of(setup, engines.make(setup))
+
+    def problem(seed: int) -> Problem:
+        study, whole = tracked(seed % TRACKS)
+        hill.measure(gains, np.random.default_rng(seed)).to_csv(study.links_path, index=False)
+        return _again(study, whole)
+
+    planted = {name: value for name, value in constants(hill.PLANTED).items() if "permittivity" in name}
+    return Walk(planted, problem)
+
+
+def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
+    """What comes of the walk of a seed."""
+    problem = walk.problem(seed)
+    problem = problem if keep_faint else heard(problem)
+    trail = search(problem, choose(problem))
+    told = certainty(problem, trail).intervals
+    best = problem.parameters.named(trail.best)
+    found = {
+        name: {
+            "planted": planted,
+            "found": best[name],
+            "pieces": [list(piece) for piece in told[name].pieces],
+            "verdict": str(told[name].verdict),
+        }
+        for name, planted in walk.planted.items()
+    }
+    return {"links": problem.objective.num_counted, "rmse_db": trail.best_rmse_db, "parameters": found}
+
+
+def holds(told: dict[str, object]) -> bool:
+    """Whether an interval holds what was planted."""
+    return any(low <= told["planted"] <= high for low, high in told["pieces"])
+
+
+def summary(entries: list[dict[str, object]]) -> Iterator[str]:
+    """How many intervals hold what was planted, a line for each walk and parameter."""
+    for walk in dict.fromkeys(entry["walk"] for entry in entries):
+        mine = [entry["parameters"] for entry in entries if entry["walk"] == walk]
+        for name in mine[0]:
+            told = [each[name] for each in mine]
+            count, sure = sum(map(holds, told)), [each for each in told if each["verdict"] == "identified"]
+            middle = np.median([each["found"] for each in told])
+            likely = binomtest(count, len(told)).proportion_ci()
+            yield (
+                f"{walk}, {name}: {told[0]['planted']:.4g} in {count} of {len(told)} intervals, "
+                f"{count / len(told):.2f} ({likely.low:.2f} to {likely.high:.2f}), of those called identified in "
+                f"{sum(map(holds, sure))} of {len(sure)}; found {middle:.4g} in the middle"
+            )
+
+
 def main() -> None:
-    """Print each seed's intervals and how many hold what was planted."""
+    """Run the seeds that are missing, and print how many intervals hold what was planted."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument(
+        "--walks", nargs="+", default=["town", "flat", "hill"], choices=["town", "flat", "hill"]
+    )
+    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--keep-faint", action="store_true")
     parser.add_argument("--biased", action="store_true")
+    parser.add_argument("--out", type=Path, help="keep what comes of each seed, and go on from there")
     arguments = parser.parse_args()
-    inside = {name: [] for name in PLANTED}
-    found = {name: [] for name in PLANTED}
-    with tempfile.TemporaryDirectory() as folder:
-        whole, gains, recorded = opened(Path(folder))
-        for seed in range(arguments.first, arguments.first + arguments.seeds):
-            problem = walked(whole, gains, recorded, seed, arguments.biased)
-            problem = problem if arguments.keep_faint else heard(problem)
-            trail = search(problem, choose(problem))
-            told = certainty(problem, trail).intervals
-            best = problem.parameters.named(trail.best)
-            line = [f"seed {seed}: {problem.objective.num_counted} links, {trail.best_rmse_db:.2f} dB"]
-            for name, planted in PLANTED.items():
-                each = told[name]
-                inside[name].append(any(low <= planted <= high for low, high in each.pieces))
-                found[name].append(best[name])
-                line.append(
-                    f"{name.split('.')[0]} {best[name]:.2f} ({each.lower:.2f} to {each.upper:.2f}, {each.verdict})"
+    lines = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
+    how = {"keep_faint": arguments.keep_faint, "biased": arguments.biased}
+    known = {(entry["walk"], entry["seed"]): entry for entry in map(json.loads, lines) if entry["how"] == how}
+    entries = []
+    for name in arguments.walks:
+        with tempfile.TemporaryDirectory() as folder:
+            walk = None
+            for seed in range(arguments.first, arguments.first + arguments.seeds):
+                if (name, seed) not in known:
+                    makers = {
+                        "town": lambda place: town_walk(place, arguments.biased), "flat": flat_walk, "hill": hill_walk,
+                    }  # fmt: skip
+                    walk = walk or makers[name](Path(folder))
+                    told = {
+                        "walk": name,
+                        "seed": seed,
+                        "how": how,
+                        **judged(walk, seed, arguments.keep_faint),
+                    }
+                    known[name, seed] = told
+                    if arguments.out:
+                        with arguments.out.open("a") as file:
+                            file.write(json.dumps(told) + "\n")
+                entry = known[name, seed]
+                entries.append(entry)
+                shown = (
+                    f"{parameter} {each['found']:.4g}{'' if holds(each) else ' NOT HELD'}"
+                    for parameter, each in entry["parameters"].items()
                 )
-            print("; ".join(line), flush=True)
-    for name, planted in PLANTED.items():
-        count, number = sum(inside[name]), len(inside[name])
-        sure = binomtest(count, number).proportion_ci()
-        print(
-            f"{name}: planted {planted:g} in {count} of {number} intervals, {count / number:.2f} "
-            f"({sure.low:.2f} to {sure.high:.2f}); found {np.median(found[name]):.2f} in the middle"
-        )
+                print(
+                    f"{name} {seed}: {entry['links']} links, {entry['rmse_db']:.2f} dB; {'; '.join(shown)}",
+                    flush=True,
+                )
+    for line in summary(entries):
+        print(line)
 
 
 if __name__ == "__main__":

@@ -46,20 +46,20 @@ def spots() -> np.ndarray:
     return np.array([(x, y) for x in (0.9, 2.3, 3.7, 4.8, 6.4, 7.7, 9.0) for y in (0.9, 2.4, 4.9, 6.2)])
 
 
-def main() -> None:
-    """Write the plan, the values, the access points and the truth."""
-    FOLDER.mkdir(exist_ok=True)
-    plan = pd.DataFrame(WALLS, columns=["x0", "y0", "x1", "y1", "type", "thickness"])
-    plan.to_csv(FOLDER / "plan.csv", index=False, lineterminator="\n")
+def heard() -> list[list[np.ndarray]]:
+    """Amplitudes of the paths from every access point to every spot, in the scene of the plan."""
     places = np.column_stack([spots(), np.full(len(spots()), HEIGHT)])
     with TemporaryDirectory() as folder:
         sheets, _ = merge_faces(read_plan(FOLDER / "plan.csv", 2.6))
         scene = make_plan_scene(sheets, folder).path
-        gains = amplitudes(
+        return amplitudes(
             scene, list(ACCESS_POINTS.values()), places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=500_000,
             refraction=True,
         )  # fmt: skip
-    rng = np.random.default_rng(SEED)
+
+
+def measure(gains: list[list[np.ndarray]], rng: np.random.Generator) -> pd.DataFrame:
+    """What the laptop shows at every spot, one column an access point [dBm]."""
     table = pd.DataFrame(spots(), columns=["x", "y"])
     for point, (name, eirp) in enumerate(EIRP_DBM.items()):
         power = [
@@ -67,6 +67,15 @@ def main() -> None:
             for spot in range(len(table))
         ]
         table[f"rss_{name}"] = np.round(10 * np.log10(power), 1)
+    return table
+
+
+def main() -> None:
+    """Write the plan, the values, the access points and the truth."""
+    FOLDER.mkdir(exist_ok=True)
+    plan = pd.DataFrame(WALLS, columns=["x0", "y0", "x1", "y1", "type", "thickness"])
+    plan.to_csv(FOLDER / "plan.csv", index=False, lineterminator="\n")
+    table = measure(heard(), np.random.default_rng(SEED))
     table.to_csv(FOLDER / "rss.csv", index=False, lineterminator="\n")
     points = pd.DataFrame(list(ACCESS_POINTS.values()), columns=["x", "y", "z"])
     points.insert(0, "ap", list(ACCESS_POINTS))

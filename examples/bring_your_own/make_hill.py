@@ -86,14 +86,14 @@ def way(seconds: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(SPEED * seconds, along, corners[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def main() -> None:
-    """Write the map, the log and the truth."""
-    FOLDER.mkdir(exist_ok=True)
-    write_houses()
-    write_ground()
-    rng = np.random.default_rng(SEED)
+def duration() -> int:
+    """How long the walk takes [s]."""
     length = np.linalg.norm(np.diff(np.array(CORNERS), axis=0), axis=1).sum()
-    duration = int(length / SPEED)
+    return int(length / SPEED)
+
+
+def heard() -> list[np.ndarray]:
+    """Amplitudes of the paths from the mast to where the scanner is in the midst of every second."""
     with TemporaryDirectory() as folder:
         found, frame = read_footprints(FOLDER / "houses.geojson", "height_m", 0.0)
         bounds = found.bounds + 50 * np.array([-1, -1, 1, 1])
@@ -109,17 +109,24 @@ def main() -> None:
             return place
 
         mast = placed(np.array([MAST[:2]]), MAST[2])
-        places = placed(way(np.arange(duration) + 0.5), HEIGHT)
-        gains = amplitudes(scene, mast, places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=200_000)[0]
+        places = placed(way(np.arange(duration()) + 0.5), HEIGHT)
+        return amplitudes(scene, mast, places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=200_000)[0]
+
+
+def measure(gains: list[np.ndarray], rng: np.random.Generator) -> pd.DataFrame:
+    """What the scanner writes."""
     rows = []
-    for value in range(duration * RATE):
+    for value in range(duration() * RATE):
         # Along one second the amplitudes stay, the phases do not.
         power = sample(gains[value // RATE], EIRP_DBM, rng)
-        heard = round(power, 1) if power > FLOOR_DBM else None
-        rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", heard))
-    log = pd.DataFrame(rows, columns=["time", "mast", "power_dbm"])
-    log.to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
-    seconds = np.arange(0, duration + TRACKED, TRACKED)
+        loud = round(power, 1) if power > FLOOR_DBM else None
+        rows.append(((START + pd.Timedelta(seconds=value / RATE)).isoformat(), "mast-1", loud))
+    return pd.DataFrame(rows, columns=["time", "mast", "power_dbm"])
+
+
+def track(rng: np.random.Generator) -> str:
+    """What the satellite receiver writes, as GPX."""
+    seconds = np.arange(0, duration() + TRACKED, TRACKED)
     recorded = way(seconds) + rng.normal(0.0, GPS_ERROR, (len(seconds), 2))
     degrees = FRAME.to_geographic(np.column_stack([recorded, np.zeros(len(seconds))]))
     points = [
@@ -127,13 +134,18 @@ def main() -> None:
         "</time></trkpt>"
         for second, (longitude, latitude, _) in zip(seconds, degrees, strict=True)
     ]
-    lines = [
-        '<gpx version="1.1" creator="calibray example"><trk><trkseg>',
-        *points,
-        "</trkseg></trk></gpx>",
-        "",
-    ]
-    (FOLDER / "walk.gpx").write_text("\n".join(lines))
+    head = '<gpx version="1.1" creator="calibray example"><trk><trkseg>'
+    return "\n".join([head, *points, "</trkseg></trk></gpx>", ""])
+
+
+def main() -> None:
+    """Write the map, the log and the truth."""
+    FOLDER.mkdir(exist_ok=True)
+    write_houses()
+    write_ground()
+    rng = np.random.default_rng(SEED)
+    measure(heard(), rng).to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
+    (FOLDER / "walk.gpx").write_text(track(rng))
     longitude, latitude, _ = FRAME.to_geographic([(*MAST[:2], 0.0)])[0]
     (FOLDER / "masts.csv").write_text(
         f"mast,longitude,latitude,height\nmast-1,{longitude:.7f},{latitude:.7f},{MAST[2]:g}\n"
