@@ -1,6 +1,7 @@
 """Links in blocks: speed-up by a second worker, bytes that come back, and memory and time against the number of links.
 
     python benchmarks/blocks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
+    python benchmarks/blocks.py validate            # the same of a validation by two blocks held out
     python benchmarks/blocks.py bytes               # what a candidate moves, by number of links
     python benchmarks/blocks.py links               # memory and time of a search, blocks repeated up to a million links
     python benchmarks/blocks.py city --links 100000 # a campaign in Munich end to end, in one process
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -28,15 +30,19 @@ from calibray import engines
 from calibray.calibration.methods import choose
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
-from calibray.engines.blocks import Blocks, cut, seconds_to_trace
+from calibray.engines.blocks import Blocks
 from calibray.engines.crew import Cluster, Crew, Here
 from calibray.engines.kinds import replay
+from calibray.engines.parts import block_size, cut, seconds_to_trace
 from calibray.engines.pool import open_local_client
 from calibray.study import Setup, Study
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
 COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 PARAMETERS = ("concrete", "marble", "brick")
+
+Work = Callable[[Setup, "Crew | None"], tuple[float, float]]
+"""An opened study, and where its blocks live, to the seconds of tracing and of the rest."""
 
 
 def study(engine: dict, starts: int, samples: int | str) -> Study:
@@ -73,19 +79,28 @@ def resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def timed(setup: Setup, crew: Crew | None) -> tuple[float, float, Problem]:
-    """Seconds of tracing and of search, and the problem solved."""
+def searched(setup: Setup, crew: Crew | None) -> tuple[float, float]:
+    """Seconds of tracing and of search."""
     started = time.perf_counter()
     problem = Problem.of(setup, engines.make(setup, executor=crew))
     traced = time.perf_counter()
     search(problem, choose(problem))
-    return traced - started, time.perf_counter() - traced, problem
+    return traced - started, time.perf_counter() - traced
 
 
-def speed_up(links: int) -> None:
-    """Trace and search with one worker and with two; by the clock, and by the processor time of the busiest process.
+def validated(setup: Setup, crew: Crew | None) -> tuple[float, float]:
+    """Seconds of tracing and of judging by two blocks."""
+    started, told = time.perf_counter(), []
+    cb.validate(setup, blocks=2, crew=crew, progress=lambda *_: told.append(time.perf_counter()))
+    traced = told[-3]
+    return traced - started, time.perf_counter() - traced
 
-    The second is what the clock would tell where nothing else runs and every process has a core.
+
+def speed_up(links: int, work: Work) -> None:
+    """Trace and search, or validate, with one worker and with two.
+
+    Told by the clock, and by the processor time of the busiest process: what the clock would tell where nothing else
+    runs and every process has a core.
     """
     alone: tuple[float, float] | None = None
     for workers in (1, 2):
@@ -98,13 +113,13 @@ def speed_up(links: int) -> None:
             # Libraries and the scene are loaded before the clock starts.
             engines.make(campaign(2, {"block_links": 1}, seed=9), executor=crew)
             before, here = client.run(time.process_time), time.process_time()
-            tracing, searching, _ = timed(campaign(links, {"block_links": -(-links // 8)}), crew)
+            tracing, searching = work(campaign(links, {"block_links": -(-links // 8)}), crew)
             after, lead = client.run(time.process_time), time.process_time() - here
             busy = [after[worker] - before[worker] for worker in after]
         together, critical = tracing + searching, max(busy) + lead
         alone = alone or (together, critical)
         print(
-            f"{workers} worker(s), {links} links: tracing {tracing:.1f} s, search {searching:.1f} s, "
+            f"{workers} worker(s), {links} links: tracing {tracing:.1f} s, the rest {searching:.1f} s, "
             f"{alone[0] / together:.2f} times as fast as one; processor time of workers "
             f"{', '.join(f'{each:.1f}' for each in busy)} s, and {lead:.1f} s here: {alone[1] / critical:.2f} times",
             flush=True,
@@ -171,7 +186,7 @@ def repeated(blocks: int, links: int) -> None:
 
 def city(links: int, samples: int | str) -> None:
     """Calibrate end to end in one process."""
-    setup = campaign(links, {"block_links": max(1000, -(-links // replay.BLOCKS))}, samples=samples)
+    setup = campaign(links, {"block_links": block_size(None, links)}, samples=samples)
     blocks = cut(setup.links, setup.study.engine.block_links)
     print(f"{links:,} links in {len(blocks)} blocks; told {seconds_to_trace(setup, blocks):.0f} s of tracing")
     started = time.perf_counter()
@@ -183,7 +198,7 @@ def city(links: int, samples: int | str) -> None:
 def main() -> None:
     """Run what was asked for, each size in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("what", choices=("speed-up", "bytes", "links", "city"))
+    parser.add_argument("what", choices=("speed-up", "validate", "bytes", "links", "city"))
     parser.add_argument("--links", type=int, default=None, help="number of links, of a block with `links`")
     parser.add_argument("--blocks", type=int, nargs="+", default=[1, 10, 100])
     parser.add_argument(
@@ -202,7 +217,8 @@ def main() -> None:
                 subprocess.run([sys.executable, Path(__file__), *words], check=True, env=environment)
         return
     {
-        "speed-up": lambda: speed_up(options.links or 2000),
+        "speed-up": lambda: speed_up(options.links or 2000, searched),
+        "validate": lambda: speed_up(options.links or 400, validated),
         "bytes": lambda: moved(options.links or 400),
         "links": lambda: repeated(options.blocks[0], options.links),
         "city": lambda: city(options.links or 100_000, options.samples),

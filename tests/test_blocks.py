@@ -12,9 +12,10 @@ import pytest
 import two_ray
 from calibray import engines
 from calibray.calibration.problem import Problem
-from calibray.engines.blocks import Blocks, cut
+from calibray.engines.blocks import Blocks
 from calibray.engines.crew import Here, open_crew
 from calibray.engines.kinds.replay import _traced
+from calibray.engines.parts import cut
 from calibray.errors import InputError
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.objective import make_objective

@@ -17,7 +17,7 @@ import calibray as cb
 from calibray.cli.app import app
 from calibray.coordinates import transformer
 from calibray.errors import InputError
-from calibray.inference import coverage
+from calibray.inference import shared_out
 from calibray.reporting.plan import footprints
 from calibray.scenes.ground import ground_heights
 from calibray.scenes.triangles import Triangles
@@ -56,7 +56,7 @@ def result(folder) -> cb.Result:
 def found(result) -> cb.coverage_map:
     """The map of both blocks in cells of 30 m, traced in two parts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(coverage, "BLOCK", 7)
+        patch.setattr(shared_out, "PIECE", 7)
         return cb.coverage_map(result, TX, cell=30.0, bounds=AREA, columns=WEST)
 
 

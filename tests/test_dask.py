@@ -6,16 +6,21 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import distributed
 import numpy as np
+import pandas as pd
 import pytest
 
 import planted
 import programs
 import two_ray
 from calibray import calibrate, engines
+from calibray.engines.parts import of_blocks
 from calibray.errors import InputError
+from calibray.measurements import Measurements, links_from_frame
 from calibray.study import Setup
 
 pytestmark = pytest.mark.filterwarnings("default")  # Dask closes sockets late
@@ -78,6 +83,38 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
     assert found.rmse_db == pytest.approx(whole.rmse_db, rel=1e-9)
     assert found.offsets_db == pytest.approx(whole.offsets_db, rel=1e-9)
     assert found.links["after_db"].to_numpy() == pytest.approx(whole.links["after_db"].to_numpy(), rel=1e-9)
+
+
+def doubled(folder: Path, links: Measurements) -> tuple[int, list[float]]:
+    """Work on a block, which the first process that comes to the third block does not survive."""
+    with (folder / "begun.txt").open("a") as file:
+        file.write(f"{os.getpid()} {links.row[0]}\n")
+    if 6 in links.row:
+        with suppress(FileExistsError):
+            (folder / "fatal").open("x").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid(), (2 * links.rx[:, 0]).tolist()
+
+
+def test_a_block_that_is_killed_is_done_again_and_what_is_shared_is_sent(tmp_path, cluster):
+    table = pd.DataFrame(np.zeros((12, 6)), columns=two_ray.COLUMNS).assign(rx_x=np.arange(1.0, 13.0))
+    done: list[int] = []
+    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
+        found = of_blocks(
+            crew,
+            doubled,
+            tmp_path,
+            links_from_frame(table),
+            2,
+            lambda stage, count, total: done.append(count),
+        )
+    told = {int(row): value for rows, (_, values) in found for row, value in zip(rows, values, strict=True)}
+    assert told == {row: 2.0 * (row + 1) for row in range(12)}
+    assert done == [2, 4, 6, 8, 10, 12]
+    begun = [line.split() for line in (tmp_path / "begun.txt").read_text().splitlines()]
+    (first, again) = (process for process, row in begun if row == "5")
+    assert first != again
+    assert first not in {str(process) for _, (process, _) in found[2:3]}
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):

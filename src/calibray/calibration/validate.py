@@ -14,6 +14,7 @@ from calibray.calibration.heard import heard
 from calibray.calibration.problem import Problem
 from calibray.calibration.twins import NOTHING, fitted, predicted
 from calibray.calibration.weighing import weighed
+from calibray.engines.crew import Crew
 from calibray.errors import EngineError, InputError
 from calibray.inference.blocks import blocks as parted
 from calibray.inference.rivals import kriging, log_distance
@@ -38,6 +39,7 @@ def validate(
     *,
     blocks: int | None = None,
     by: str | None = None,
+    crew: Crew | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
 ) -> Validation:
@@ -47,6 +49,7 @@ def validate(
         study: The study, opened or not; on the engine "replay".
         blocks: Number of spatial blocks, each held out in turn; the study's, or 4, if None and `by` is None.
         by: Column whose labels are held out in turn; "tx" for the place of the transmitter.
+        crew: Where blocks of links live that are traced and replayed together (`engines.open_crew`).
         progress: Called with the stages "tracing" and "validating".
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.
 
@@ -65,7 +68,7 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress))))
+    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, executor=crew))))
     return validated(problem, blocks, by, progress)
 
 

@@ -39,3 +39,13 @@ Anyway = Annotated[
     ),
 ]
 """Whether a result is used although what it was calibrated with changed."""
+
+Workers = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Processes here that blocks of links are shared out to."),
+]
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers take blocks of links."),
+]

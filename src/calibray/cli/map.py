@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calibray.cli.console import Anyway, Overwrite, log
+from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
 from calibray.spelling import shortened
 
@@ -62,6 +62,8 @@ def map(
         Path | None,
         typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into instead of DIR."),
     ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     anyway: Anyway = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -72,6 +74,7 @@ def map(
     with progress_bars(log()) as progress:
         import numpy as np
 
+        from calibray.engines import open_crew
         from calibray.files import check_outputs
         from calibray.inference.coverage import coverage_map
         from calibray.reporting.coverage import FILES, save_map
@@ -81,19 +84,21 @@ def map(
         inputs = result.study.files()
         # Before anything is traced.
         check_outputs(target, FILES, inputs, overwrite)
-        coverage = coverage_map(
-            result,
-            tx,
-            height=height,
-            cell=cell,
-            bounds=bounds,
-            level=level or None,
-            power_dbm=power,
-            samples=None if samples is None else _samples(samples),
-            columns=_columns(column or []),
-            progress=progress,
-            anyway=anyway,
-        )
+        with open_crew(workers, scheduler) as crew:
+            coverage = coverage_map(
+                result,
+                tx,
+                height=height,
+                cell=cell,
+                bounds=bounds,
+                level=level or None,
+                power_dbm=power,
+                samples=None if samples is None else _samples(samples),
+                columns=_columns(column or []),
+                progress=progress,
+                crew=crew,
+                anyway=anyway,
+            )
         progress("writing", 0, None)
         names = save_map(coverage, target, inputs, overwrite)
     reached = np.isfinite(coverage.path_loss_db)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Anyway, Overwrite, log
+from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ def predict(
             "upper_db and basis, and a remark on places where no antenna should be.",
         ),
     ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     anyway: Anyway = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -57,10 +59,11 @@ def predict(
         import numpy as np
         import pandas as pd
 
+        from calibray.engines import open_crew
         from calibray.files import check_table, write_table
-        from calibray.inference.prediction import as_links, interval, opened
+        from calibray.inference.prediction import as_links, opened
         from calibray.inference.quantity import as_measured
-        from calibray.inference.remarks import remarks
+        from calibray.inference.shared_out import predicted
         from calibray.result import Result
 
         result = Result.load(folder, anyway=anyway)
@@ -72,8 +75,9 @@ def predict(
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)
         setup = opened(result, links, anyway=anyway)
-        told = interval(result, setup, level, progress)
-        odd = remarks(result, setup)
+        with open_crew(workers, scheduler) as crew:
+            told = predicted(result, setup, level, progress, crew, remarked=True)
+        odd = told.remark.to_numpy()
     columns = {name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))}
     columns |= as_measured(study, links, told) | ({} if level is None else {"remark": odd})
     table = links.frame.assign(**columns)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, StudyFile, log
+from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, log
 from calibray.errors import InputError
+
+if TYPE_CHECKING:
+    from calibray.paths import Paths
+    from calibray.progress import Progress
+    from calibray.study import Setup
+    from calibray.tracing.convergence import Convergence
 
 
 def trace(
@@ -24,36 +30,35 @@ def trace(
             "'auto', tell what the last round of rays changed.",
         ),
     ] = False,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
-    from functools import partial
-
     from calibray.cli.progress import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.fields import path_loss
+        from calibray.engines import open_crew
+        from calibray.engines.crew import Here
+        from calibray.engines.traced import given_size, traced_in_blocks
         from calibray.files import check_file
-        from calibray.progress import staged
         from calibray.reporting import trace as report
         from calibray.study import Study
         from calibray.tables.text import render
-        from calibray.tracing import convergence
 
         study = Study.load(study_file)
         _refuse_idleness(out, check)
         if out is not None:
             check_file(out, study.files(), overwrite)
         setup = study.opened()
-        links, tracer = setup.links, setup.tracer
-        if told := tracer.plan(links).announcement(len(links)):
-            typer.echo(told, err=True)
-        paths = tracer.trace(links, progress)
-        if out is not None:
-            paths.save(out)
-        loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
-        again = check and not study.trace.adaptive
-        found = convergence.check(tracer, links, paths, loss, staged(progress, "checking")) if again else None
+        links, again = setup.links, check and not study.trace.adaptive
+        with open_crew(workers, scheduler) as crew:
+            if crew is None and given_size(setup) is None:
+                paths, found = _traced(setup, out, again, progress)
+            else:
+                paths, found = traced_in_blocks(setup, crew or Here(), check=again, progress=progress)
+                if out is not None:
+                    paths.save(out)
     typer.echo(render(report.found(paths, links.row, setup.enclosed)))
     if check and study.trace.adaptive:
         typer.echo("\n" + report.rounds(paths.settings, study.fidelity.tolerance_db))
@@ -61,6 +66,28 @@ def trace(
         typer.echo("\n" + render(*report.convergence(found, links.row, study.fidelity.tolerance_db)))
     if out is not None:
         typer.echo(f"Written to {out}", err=True)
+
+
+def _traced(
+    setup: Setup, out: Path | None, again: bool, progress: Progress
+) -> tuple[Paths, Convergence | None]:
+    """Trace all links at once, store the paths, and check them if asked to."""
+    from functools import partial
+
+    from calibray.fields import path_loss
+    from calibray.progress import staged
+    from calibray.tracing import convergence
+
+    study, links, tracer = setup.study, setup.links, setup.tracer
+    if told := tracer.plan(links).announcement(len(links)):
+        typer.echo(told, err=True)
+    paths = tracer.trace(links, progress)
+    if out is not None:
+        paths.save(out)
+    loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
+    return paths, convergence.check(
+        tracer, links, paths, loss, staged(progress, "checking")
+    ) if again else None
 
 
 def _refuse_idleness(out: Path | None, check: bool) -> None:

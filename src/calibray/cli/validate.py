@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, StudyFile, log
+from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, log
 
 
 def validate(
@@ -37,6 +37,8 @@ def validate(
             help="Write it into this folder, that of a result of the study: `calibray report DIR` shows it then.",
         ),
     ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -45,6 +47,7 @@ def validate(
 
     with progress_bars(log()) as progress:
         from calibray.calibration.validate import validate as judge
+        from calibray.engines import open_crew
         from calibray.files import check_outputs
         from calibray.result.validation import FILE, write_validation
         from calibray.study import Study
@@ -53,7 +56,8 @@ def validate(
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (FILE,), study.files(), overwrite)
-        found = judge(study, blocks=blocks, by=by, progress=progress)
+        with open_crew(workers, scheduler) as crew:
+            found = judge(study, blocks=blocks, by=by, crew=crew, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)

@@ -6,19 +6,16 @@ of its links. Blocks follow from the study alone, never from the machines, and s
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Final, final
-from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.crew import Crew
+from calibray.engines.parts import Shared, chosen, itself
 from calibray.engines.protocol import Differentiable, Reduced, Reduction, check_candidates
 from calibray.materials import Material
 from calibray.measurements import Measurements
@@ -33,36 +30,6 @@ Open = Callable[["Setup", Mapping[str, Material]], Differentiable]
 _TRACING: Final = Lock()
 """A process traces one block at a time."""
 
-_SHARED: WeakValueDictionary[bytes, Shared] = WeakValueDictionary()
-
-
-@final
-class Shared:
-    """An opened study that blocks share; a process unpacks it once, and loads the scene once.
-
-    Args:
-        setup: The study, with few links or many: a block brings its own.
-    """
-
-    def __init__(self, setup: Setup) -> None:
-        self.setup = setup
-
-    @cached_property
-    def packed(self) -> bytes:
-        """The study as bytes."""
-        return pickle.dumps(self.setup)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _unpacked, (self.packed,)
-
-
-def _unpacked(packed: bytes) -> Shared:
-    digest = hashlib.sha256(packed).digest()
-    found = _SHARED.get(digest)
-    if found is None:
-        found = _SHARED[digest] = Shared(pickle.loads(packed))
-    return found
-
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
@@ -75,7 +42,7 @@ class Recipe:
         open: Opens the engine over the links.
     """
 
-    shared: Shared
+    shared: Shared[Setup]
     links: Measurements
     materials: Mapping[str, Material]
     open: Open
@@ -92,7 +59,7 @@ class Block:
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
         with _TRACING:
-            self.engine = recipe.open(recipe.shared.setup.at(recipe.links), recipe.materials)
+            self.engine = recipe.open(recipe.shared.content.at(recipe.links), recipe.materials)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Block, (self._recipe,)
@@ -129,7 +96,7 @@ class Blocks:
         self._crew, self._setup, self._open = crew, setup, opening
         self.blocks, self.calls, self.parameters = blocks, 0, setup.parameters
         self.materials = {**setup.scene.materials, **(materials or {})}
-        links = [setup.links.select(_mask(each, len(setup.links))) for each in blocks]
+        links = [chosen(setup.links, each) for each in blocks]
         shared, done = Shared(setup.at(links[0])), 0
 
         def traced(index: int) -> None:
@@ -186,7 +153,7 @@ class Blocks:
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
         """What reduces the path loss of every block where that lives; see `Parted.reducing`."""
-        kept = self._crew.keep(_itself, reductions)
+        kept = self._crew.keep(itself, reductions)
 
         def reduced(candidates: NDArray[np.float64], derivatives: bool) -> list[Any]:
             given = check_candidates(candidates, len(self.parameters))
@@ -198,50 +165,6 @@ class Blocks:
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Blocks:
         """The same on paths traced with other materials; see `Parted.traced_with`."""
         return Blocks(self._crew, self._setup, self.blocks, self._open, materials, progress)
-
-
-def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
-    """Cut links into blocks of about equal numbers, with few positions to send rays from in each.
-
-    Args:
-        links: The links.
-        size: Number of links of a block, at most.
-
-    Returns:
-        Links of every block, in ascending order.
-
-    Example:
-        >>> links = Measurements(tx=[[0, 0, 9], [5, 0, 9]] * 2, rx=np.arange(12).reshape(4, 3), path_loss_db=[80] * 4)
-        >>> [block.tolist() for block in cut(links, 2)]
-        [[0, 2], [1, 3]]
-    """
-    ends = (np.unique(end, axis=0, return_inverse=True) for end in (links.tx, links.rx))
-    _, place = min(ends, key=lambda found: len(found[0]))
-    order = np.argsort(place.reshape(-1), kind="stable")
-    return [np.sort(part) for part in np.array_split(order, -(-len(order) // size))]
-
-
-def seconds_to_trace(setup: Setup, blocks: Sequence[NDArray[np.int64]]) -> float:
-    """About how long it takes to trace blocks here, one after the other.
-
-    Args:
-        setup: The opened study.
-        blocks: Links of every block.
-
-    Returns:
-        Seconds on two cores of a processor.
-
-    Raises:
-        InputError: The links cannot be traced.
-    """
-    links = (setup.links.select(_mask(each, len(setup.links))) for each in blocks)
-    return sum(setup.tracer.plan(each).seconds for each in links)
-
-
-def _mask(links: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    mask = np.zeros(count, dtype=bool)
-    mask[links] = True
-    return mask
 
 
 def _size(block: Block) -> tuple[int, bool]:
@@ -264,7 +187,3 @@ def _reduced(
     if derivatives:
         return reduction(*block.engine.path_loss_and_jacobian(candidates))
     return reduction(block.engine.path_loss(candidates), None)
-
-
-def _itself(given: Reduction) -> Reduction:
-    return given

@@ -16,9 +16,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
+from calibray.engines.crew import Crew
 from calibray.errors import InputError
 from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE
-from calibray.inference.prediction import as_links, interval, opened
+from calibray.inference.prediction import as_links, opened
+from calibray.inference.shared_out import piece_size, predicted
 from calibray.measurements.links import COINCIDENCE
 from calibray.progress import Progress
 from calibray.scenes.ground import ground_heights
@@ -30,11 +32,6 @@ if TYPE_CHECKING:
     from calibray.result import Result
 
 MOST_CELLS: Final = 1_000_000
-BLOCK: Final = 10_000
-"""Cells that are traced and evaluated at once."""
-
-DIFFUSE_BLOCK: Final = 50
-"""The same with diffuse reflection, which makes tens of thousands of paths a link."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +99,7 @@ def coverage_map(
     samples: int | Literal["auto"] | None = None,
     columns: Mapping[str, object] | None = None,
     progress: Progress | None = None,
+    crew: Crew | None = None,
     anyway: bool = False,
 ) -> CoverageMap:
     """Predict path loss over an area, with the interval that a measurement there would lie in.
@@ -120,6 +118,7 @@ def coverage_map(
         columns: What the study's columns of groups, carriers or nuisances hold for this transmitter, by name. The
             group of an offset is taken from the links measured there, where these have one.
         progress: Called with the stage "tracing" after every launch.
+        crew: Where blocks of cells are traced and predicted (`engines.open_crew`); here if None.
         anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
@@ -151,12 +150,12 @@ def coverage_map(
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
     wanted = np.flatnonzero(np.linalg.norm(rx - place, axis=1) > COINCIDENCE)
     found = np.full((3, len(rx)), np.nan)
-    size = DIFFUSE_BLOCK if study.trace.diffuse_reflection else BLOCK
+    size = piece_size(setup, crew)
     for start in range(0, len(wanted), size):
         block = wanted[start : start + size]
         rows = pd.DataFrame({**_ends(place, rx[block]), **held})
         setup = setup.at(as_links(result, rows))
-        told = interval(result, setup, level, _part(progress, int(block[0]), len(rx)))
+        told = predicted(result, setup, level, _part(progress, int(block[0]), len(rx)), crew)
         for row, name in enumerate(("path_loss_db", "lower_db", "upper_db")[: 1 if level is None else 3]):
             found[row, block] = told[name]
     loss, lower, upper = found.reshape(3, *z.shape)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from calibray.paths.interactions import Kind as Kind
     from calibray.paths.program import Paths as Paths
     from calibray.paths.program import concatenate as concatenate
+    from calibray.paths.program import join_links as join_links
     from calibray.paths.program import take as take
     from calibray.paths.program import take_links as take_links
     from calibray.paths.schema import SCHEMA_VERSION as SCHEMA_VERSION
@@ -22,6 +23,7 @@ _HOMES = {
     "Kind": "calibray.paths.interactions",
     "Paths": "calibray.paths.program",
     "concatenate": "calibray.paths.program",
+    "join_links": "calibray.paths.program",
     "seal": "calibray.paths.sealing",
     "take": "calibray.paths.program",
     "take_links": "calibray.paths.program",

@@ -8,7 +8,7 @@ transmit field and the last one in the receive field.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -210,6 +210,29 @@ def concatenate(parts: list[Paths]) -> Paths:
         vertex=_vertices([part.vertex for part in parts]),
     )
     return take(joined, np.argsort(joined.link, kind="stable"))
+
+
+def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
+    """Join path programs of links that were traced apart.
+
+    Args:
+        parts: At least one program, each with the places that its links have among all; together they have every link
+            once. All share frequency and materials.
+
+    Returns:
+        One program of all links, with the settings of the first.
+    """
+    count = sum(len(links) for links, _ in parts)
+    tx, rx = np.empty((count, 3)), np.empty((count, 3))
+    for links, part in parts:
+        tx[links], rx[links] = part.tx_position, part.rx_position
+    kind = parts[0][1].link.dtype
+    return concatenate(
+        [
+            replace(part, link=links[part.link].astype(kind), tx_position=tx, rx_position=rx)
+            for links, part in parts
+        ]
+    )
 
 
 def take(paths: Paths, index: NDArray[np.int64]) -> Paths:

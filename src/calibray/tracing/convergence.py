@@ -6,7 +6,7 @@ an average over rays, scatters. What a second, finer trace changes is an estimat
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,3 +128,21 @@ def check(
         )
     finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=settings.seed + 1))
     return compare(before, finer.trace(links, progress), settings.samples, path_loss)
+
+
+def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
+    """What tracing again changed, of links that were traced apart.
+
+    Args:
+        parts: At least one record, each with the places that its links have among all; together they have every link
+            once.
+
+    Returns:
+        One record of all links.
+    """
+    count = sum(len(links) for links, _ in parts)
+    change = np.empty(count)
+    before, after = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    for links, part in parts:
+        change[links], before[links], after[links] = part.change_db, part.paths_before, part.paths_after
+    return Convergence(parts[0][1].samples, change, before, after)

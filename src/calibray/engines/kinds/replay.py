@@ -25,12 +25,6 @@ if TYPE_CHECKING:
     from calibray.paths import Paths
     from calibray.study.setup import Setup
 
-BLOCK_LINKS: Final = 1000
-"""Links of a block where workers are given and the study does not say,"""
-
-BLOCKS: Final = 64
-"""unless that makes more blocks than these: each has its sums, and its program is compiled."""
-
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -42,7 +36,7 @@ class ReplaySection(EngineSection):
         name: "replay".
         compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
         block_links: Trace and replay the links in blocks of so many at most; all at once if None, or in blocks of
-            `BLOCK_LINKS` where workers are given, but no more than `BLOCKS` of them.
+            `parts.BLOCK_LINKS` where workers are given, but no more than `parts.BLOCKS` of them.
     """
 
     dear: ClassVar[bool] = False
@@ -73,13 +67,13 @@ class ReplaySection(EngineSection):
         # Before anything is traced.
         self._check_compressible(setup)
         if paths is None and (executor is not None or self.block_links is not None):
-            from calibray.engines.blocks import Blocks, cut, seconds_to_trace
+            from calibray.engines.blocks import Blocks
             from calibray.engines.crew import Here
+            from calibray.engines.parts import block_size, cut, seconds_to_trace
             from calibray.study.setup import LONG
 
             crew = Here() if executor is None else cast("Crew", executor)
-            size = self.block_links or max(BLOCK_LINKS, -(-len(setup.links) // BLOCKS))
-            blocks = cut(setup.links, size)
+            blocks = cut(setup.links, block_size(self.block_links, len(setup.links)))
             if executor is None and (seconds := seconds_to_trace(setup, blocks)) > LONG:
                 _LOG.warning(
                     "Tracing %s links in %d blocks; about %s on two cores",
