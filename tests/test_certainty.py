@@ -12,6 +12,7 @@ import planted
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.calibration.certainty import certainty
+from calibray.calibration.explaining import Explaining
 from calibray.calibration.outcome import UNJUDGED
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
@@ -271,3 +272,29 @@ def test_what_is_well_determined_is_never_called_not_identifiable():
             elif noise_db == 60.0:
                 assert interval.verdict == "not identifiable"
     assert well >= 4
+
+
+def test_points_that_explain_nothing_are_not_asked_what_differing_buildings_change():
+    """Fewer replays for the same densities wherever these matter."""
+    study = Study.from_content(planted.content("links.csv"))
+    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
+    measured = planted.campaign(noise_db=0.02).path_loss_db.to_numpy()
+    problem = replace(problem, objective=replace(problem.objective, measured=measured))
+    lower, upper = problem.parameters.search_bounds
+    best = problem.parameters.to_search(np.array([planted.TRUTH[name] for name in problem.parameters.names]))
+    square = float(problem.squares(best[None]).value[0] ** 2)
+    whole = Explaining.of(problem, best, square, problem.freedom)
+    screened = replace(whole.without_negligible(whole(best[None])), marginal=whole.marginal)
+    near = best + 0.001 * (upper - lower) * np.random.default_rng(2).standard_normal((20, 3))
+    points = np.concatenate(
+        [np.random.default_rng(1).uniform(lower, upper, (300, 3)), near.clip(lower, upper)]
+    )
+    calls = problem.engine.calls
+    all_of_them = whole(points)
+    every, calls = problem.engine.calls - calls, problem.engine.calls
+    found = screened(points)
+    assert problem.engine.calls - calls < 0.8 * every
+    high = all_of_them.max(axis=1) > all_of_them.max() - 20.0
+    assert high.sum() >= 5
+    assert found[high] == pytest.approx(all_of_them[high], abs=1e-9)
+    assert (np.isneginf(found) | np.isclose(found, all_of_them)).all()
