@@ -83,9 +83,8 @@ class Explaining:
     def without_negligible(self, explained: NDArray[np.float64]) -> Explaining:
         """The same without models that explain little at any of some points, as this told of them [k, models]."""
         marginal = self.marginal.reduced(explained)
-        apart = np.array([model.kind == DIFFERING for model in self.marginal.models])
-        least = -np.inf
-        if marginal.parted[0].models and apart.any():
+        apart, least = _differing_models(self.marginal), -np.inf
+        if apart.any() and not _differing_models(marginal).all():
             best = float(np.logaddexp.reduce(explained[:, ~apart], axis=1).max())
             least = best - FAR - max(0.0, float(explained[:, apart].max()) - best)
         return replace(self, marginal=marginal, least=least)
@@ -131,13 +130,12 @@ class Explaining:
         loss = self._loss(candidates)
         gap = (self.problem.objective.measured[self.counted] - self.fixed - loss) * self.scale
         found = np.full((len(points), len(self.marginal.models)), -np.inf)
-        apart = np.array([model.kind == DIFFERING for model in self.marginal.models])
-        alike, differing = self.marginal.parted
-        found[:, ~apart] = alike.densities(gap)
+        apart = _differing_models(self.marginal)
+        found[:, ~apart] = _only(self.marginal, ~apart).densities(gap)
         near = np.logaddexp.reduce(found, axis=1) >= self.least
-        if differing.models and near.any():
+        if apart.any() and near.any():
             changed = self._differing(candidates[near], loss[near])
-            found[np.ix_(near, apart)] = differing.densities(gap[near], changed)
+            found[np.ix_(near, apart)] = _only(self.marginal, apart).densities(gap[near], changed)
         if len(self.problem.priors):
             found -= 0.5 * np.sum(self.problem.priors.rows(candidates) ** 2, axis=1)[:, None]
         return found
@@ -156,6 +154,17 @@ class Explaining:
         """Path loss of the links that count [n, m], [dB]."""
         modelled = self.problem.observable.modelled(self.problem.engine, candidates)
         return self.problem.objective.capped(modelled)[:, self.counted]
+
+
+def _differing_models(marginal: Marginal) -> NDArray[np.bool_]:
+    """Which models ask what buildings that differ do to path loss [models]."""
+    return np.array([model.kind == DIFFERING for model in marginal.models], dtype=bool)
+
+
+def _only(marginal: Marginal, wanted: NDArray[np.bool_]) -> Marginal:
+    """The density under some of its models [models]."""
+    chosen = (model for model, want in zip(marginal.models, wanted.tolist(), strict=True) if want)
+    return replace(marginal, models=tuple(chosen))
 
 
 def _taking_part(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

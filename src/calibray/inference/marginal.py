@@ -226,15 +226,6 @@ class Marginal:
         spreads = sorted({model.spread for model in self.models if model.kind == DIFFERING})
         return spreads[len(spreads) // 2] if spreads else 0.0
 
-    @property
-    def parted(self) -> tuple[Marginal, Marginal]:
-        """The density under the models that need nothing but path loss, and that under the heterogeneous ones."""
-        groups: tuple[list[NoiseModel], list[NoiseModel]] = ([], [])
-        for model in self.models:
-            groups[model.kind == DIFFERING].append(model)
-        alike, differing = (replace(self, models=tuple(group)) for group in groups)
-        return alike, differing
-
     def densities(self, gap: NDArray[np.float64], differing: Differing | None = None) -> NDArray[np.float64]:
         """Logarithm of each model's weight times the density of the measurements.
 
