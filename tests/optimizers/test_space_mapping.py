@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate, discrepancy
+from calibray.optimizers.averaged import CAPPED, UNLIKELY, Track, averaged
 from calibray.optimizers.box import Box
 from calibray.optimizers.cheap_model import Constants, Differenced
-from calibray.optimizers.corrected import correct
+from calibray.optimizers.corrected import constants_fit, correct
 from calibray.optimizers.discrepancy import Seen
 from calibray.optimizers.sampling import design
 
@@ -108,6 +109,63 @@ def test_slopes_of_a_corrected_model_are_those_of_its_predictions():
         move = step * np.eye(2)[axis]
         central = (corrected.predict(point + move)[0] - corrected.predict(point - move)[0]) / (2.0 * step)
         assert slope[0, :, axis] == pytest.approx(central[0], rel=1e-4, abs=1e-4)
+
+
+def corrected_by(count: int):
+    """The cheap model, told 1.8 where 1.1 is true, corrected by some answers, and constants to start members from."""
+    box, model = Box.between(LOWER, UPPER), cheap(1.8)
+    unit = design("sobol", count, 2, np.random.default_rng(0))
+    cloud = design("sobol", 64, 2, np.random.default_rng(2))
+    starts = np.log(1.8) + 0.5 * np.random.default_rng(1).standard_normal((16, 1))
+    return correct(model, box, unit, answered(box.from_unit(unit)), cloud, starts), starts
+
+
+def test_members_pass_through_the_answers_and_come_together_with_their_number():
+    spread = []
+    for count in (1, 8):
+        corrected, starts = corrected_by(count)
+        drawn = averaged(corrected, starts, np.random.default_rng(3))
+        assert drawn.members[0] is corrected
+        assert len(drawn.members) > 4
+        spread.append(np.std([np.exp(member.constants) for member in drawn.members[1:]]))
+        for member in drawn.members:
+            assert member.predict(corrected.rest.seen.unit)[0] == pytest.approx(corrected.residuals, abs=0.02)
+    assert spread[1] < 0.2 * spread[0]
+
+
+def test_members_that_explain_the_answers_worse_are_left_out(monkeypatch):
+    corrected, starts = corrected_by(3)
+    monkeypatch.setattr("calibray.optimizers.averaged.STEPS", 0)  # each stays where it starts
+    kept = averaged(corrected, starts, np.random.default_rng(3)).members[1:]
+    fit = constants_fit(corrected)
+    given = corrected.model.constants
+    cost = [
+        0.5 * np.sum(fit((start[None] - given.lower) / (given.upper - given.lower))[0] ** 2)
+        for start in starts
+    ]
+    least = 0.5 * np.sum(fit((corrected.constants[None] - given.lower) / (given.upper - given.lower))[0] ** 2)
+    assert 0 < len(kept) < len(starts)
+    assert len(kept) == np.sum(np.array(cost) - least < UNLIKELY * 4)
+
+
+def test_what_members_disagree_about_is_in_doubt_until_it_is_told():
+    corrected, starts = corrected_by(1)
+    model, far = averaged(corrected, starts, np.random.default_rng(3)), np.array([0.9, 0.2])
+    told = model.predict(far[None])
+    apart = np.var([part[0] for part in told.parts], axis=0).mean()
+    assert told.variance[0] > apart > 1e-3
+    after = model.with_point(far).predict(far[None])
+    assert after.mean == pytest.approx(told.mean, abs=0.01)
+    assert after.variance[0] < 0.01 * told.variance[0]
+
+
+def test_errors_beyond_what_was_expected_stretch_what_is_expected_next():
+    track = Track()
+    assert track.stretch == 1.0
+    track.note(np.zeros(4), 2.0, np.full(4, 4.0))
+    assert track.stretch == pytest.approx(0.5 * (1.0 + 8.0))
+    track.note(np.zeros(4), 1e-30, np.full(4, 4.0))
+    assert track.stretch == pytest.approx((1.0 + 8.0 + CAPPED) / 3.0)
 
 
 def test_a_cheap_model_of_pure_noise_costs_three_calls_at_most():

@@ -136,17 +136,18 @@ class Corrected:
         seen = _seen(self.model, self.response, unit, cheap)
         return cheap, slope, seen, _known(self.model, self.response, slope)
 
-    def with_point(self, point: NDArray[np.float64]) -> Corrected:
-        """Pretend that a point had been evaluated and had come out as predicted.
+    def with_point(self, point: NDArray[np.float64], told: NDArray[np.float64]) -> Corrected:
+        """Pretend that a point had been evaluated.
 
         Args:
             point: The point of the unit cube [d].
+            told: Its residuals [1, m].
 
         Returns:
-            A model with the same mean, certain at that point too.
+            A model certain at that point too.
         """
         unit = np.vstack([self.rest.seen.unit, point])
-        residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
+        residuals = np.vstack([self.residuals, told])
         cheap, seen = self.seen(unit)
         rest = discrepancy.solve(seen, residuals - cheap, self.rest.hyper, self.rest.scale)
         return replace(self, residuals=residuals, rest=rest)
@@ -242,27 +243,50 @@ def descended(
             return end.value
 
 
-def _adjusted(corrected: Corrected, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The constants [q] that explain the answers best, the covariance of what remains kept."""
+def constants_fit(
+    corrected: Corrected,
+    centre: NDArray[np.float64] | None = None,
+    noise: NDArray[np.float64] | None = None,
+) -> Callable[[NDArray[np.float64]], Residuals]:
+    """The least squares problem of the constants, the covariance of what remains kept.
+
+    Args:
+        corrected: The model whose constants are fitted.
+        centre: Centre of their prior [q]; that of the cheap model if None.
+        noise: What the answers are disturbed by, in their standard deviations [n m]; nothing if None.
+
+    Returns:
+        Constants, in the unit cube between their bounds [s, q], to rows and their Jacobian; half the sum of squares of
+        the rows is their negative log density.
+    """
     model, rest, given = corrected.model, corrected.rest, corrected.model.constants
     points, width = corrected.box.from_unit(rest.seen.unit), given.upper - given.lower
     (count, links), size = corrected.residuals.shape, len(given.centre)
     whiten = np.linalg.inv(rest.lower)
     weight = np.sqrt(rest.precision)
     prior_slope = np.diag(width / given.spread)
+    believed = given.centre if centre is None else centre
+    shift = np.zeros(count * links) if noise is None else noise
 
     def evaluate(unit: NDArray[np.float64]) -> Residuals:
         constants = given.lower + unit * width
         told = model.answer(np.tile(points, (len(unit), 1)), np.repeat(constants, count, axis=0))
         remains = corrected.residuals - told.residuals.reshape(-1, count, links)
-        rows = (whiten @ remains * weight).reshape(len(unit), -1)
+        rows = (whiten @ remains * weight).reshape(len(unit), -1) + shift
         slope = told.by_constant.reshape(-1, count, links * size)
         slope = -(whiten @ slope).reshape(-1, count, links, size) * weight[:, None] * width
-        rows = np.hstack([rows, (constants - given.centre) / given.spread])
+        rows = np.hstack([rows, (constants - believed) / given.spread])
         prior = np.broadcast_to(prior_slope, (len(unit), size, size))
         return rows, np.concatenate([slope.reshape(len(unit), -1, size), prior], axis=1)
 
-    ended = descended((starts - given.lower) / width, evaluate, STEPS, 1e-4)
+    return evaluate
+
+
+def _adjusted(corrected: Corrected, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The constants [q] that explain the answers best, the covariance of what remains kept."""
+    given = corrected.model.constants
+    width = given.upper - given.lower
+    ended = descended((starts - given.lower) / width, constants_fit(corrected), STEPS, 1e-4)
     return given.lower + ended.unit[np.argmin(ended.cost)] * width
 
 

@@ -2,13 +2,18 @@
 
 Who knows the physics has a model of the dear model already: simpler, perhaps told wrong constants, and free. Its
 minimum is the first call. After every call the cheap model is corrected until it answers as the dear one did
-(`corrected.py`), and searched for its minima by many local searches, in all basins at once. Steps take turns:
+(`corrected.py`), and searched for its minima by many local searches, in all basins at once. Steps are of two kinds:
 
-- *exploitation*: the lowest minimum of the corrected model within a trust region, a box around the best point that is
-  halved by a step that does not improve and doubled by one that does;
+- *exploitation*: of the minima of the corrected model within a trust region, a box around the best point that is
+  halved by a step that does not improve and doubled by one that does, the one that is lowest when what is not known of
+  the model is counted in;
 - *exploration*: the point of the largest expected improvement over the whole box, by draws of what remains, as in
-  `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. It also takes the place
-  of an exploitation that repeats itself.
+  `vector_surrogate.py`. Minima of the corrected model in other basins are among the candidates. It follows an
+  exploitation that gained next to nothing, and takes the place of one that would repeat a point.
+
+Both count in that few answers leave the constants of the cheap model open, and how far off predictions have been so
+far (`averaged.py`). Without that, on planted districts, steps go half way across the box to minima lower than any that
+there is, call after call.
 
 The cheap model is trusted only while it helps. Each point is predicted from all the others, once by the corrected model
 and once by the same process without a cheap model. Where the sum of squared errors is more than `MISLED` times as large
@@ -30,6 +35,7 @@ from scipy.spatial.distance import cdist
 from calibray.optimizers import discrepancy
 from calibray.optimizers.archive import Archive, Evaluations, Objective, merged, root_mean_square
 from calibray.optimizers.arguments import whole
+from calibray.optimizers.averaged import Averaged, Track, averaged
 from calibray.optimizers.box import Box
 from calibray.optimizers.cheap_model import CheapModel
 from calibray.optimizers.corrected import Corrected, cheap_and_slope, correct, descended
@@ -39,7 +45,7 @@ from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
-from calibray.optimizers.vector_surrogate import VectorSurrogate, expected_improvement
+from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
 
 CLOUD: Final = 64
 """Points at which the cheap model's response is measured."""
@@ -62,17 +68,26 @@ TRIED: Final = 6
 CANDIDATES: Final = 300
 """Drawn over the box, and as many around the best points."""
 
-DRAWS: Final = 128
-"""Of what remains, for the expected improvement."""
+DRAWS: Final = 512
+"""Of what remains, for the expected improvement, of all members together."""
 
 APART: Final = 0.003
 """Distance in the unit cube below which two minima are taken for one."""
+
+MEMBERS: Final = 8
+"""Models with other constants that the first steps are averaged over."""
+
+AVERAGED: Final = 10
+"""Calls up to which they are."""
 
 SEPARATION: Final = 1e-3
 """Distance in the unit cube below which a point is taken for one already evaluated."""
 
 REACHES: Final = (0.02, 1.0)
 """Smallest and largest half width of the trust region."""
+
+GAINED: Final = 1e-3
+"""Share of the objective that a step has to gain for another of its kind."""
 
 JUDGED: Final = 3
 """Calls from which on the cheap model is judged."""
@@ -139,8 +154,11 @@ class SpaceMapping(Optimizer):
         self.noisy = noisy
         self._model, self._objective = model, objective
         self._corrected: Corrected | None = None
+        self._members = np.empty((0, 0))
+        self._track, self._expected = Track(), np.empty((0, d))
+        self._foretold: list[tuple[NDArray[np.float64], float]] = []
         self._minima = np.empty((0, d))
-        self._reach = REACHES[1]
+        self._reach, self._stalled = REACHES[1], False
         self._seed = whole("seed", seed, at_least=0)
         self._rng = np.random.default_rng(self._seed)
         self._session = Session(self.box, self.uses, self._search, objective)
@@ -178,10 +196,11 @@ class SpaceMapping(Optimizer):
                     self._corrected = None
                     yield from self._without(archive, left)
                     return
-                chosen = self._choose(self._corrected, archive, turn, count)
+                self._look_back(unit, residuals)
+                chosen = self._choose(self._averaged(self._corrected), archive, count)
             before = archive.best.y if len(archive) else np.inf
             yield self.box.from_unit(chosen)
-            self._resize(turn, archive.best.y < before)
+            self._take_stock(archive.best.y, before)
             left, turn = left - count, turn + count
 
     def _without(self, archive: Archive, left: int) -> Search:
@@ -216,49 +235,84 @@ class SpaceMapping(Optimizer):
         self._minima = distinct(ended, APART).unit
         return np.vstack([self._minima[turn:], self._rng.random((count, d))])[:count]
 
-    def _choose(self, corrected: Corrected, archive: Archive, turn: int, count: int) -> NDArray[np.float64]:
+    def _averaged(self, corrected: Corrected) -> Averaged:
+        """The corrected model and others that explain the answers; half of them go on from those before."""
+        given = corrected.model.constants
+        if len(corrected.residuals) > AVERAGED or not len(given.centre):
+            return Averaged((corrected,))
+        draws = given.centre + given.spread * self._rng.standard_normal((MEMBERS, len(given.centre)))
+        starts = np.vstack([*self._members[: MEMBERS // 2], np.clip(draws, given.lower, given.upper)])
+        found = averaged(corrected, starts[:MEMBERS], self._rng)
+        self._members = np.array([member.constants for member in found.members])
+        return found
+
+    def _look_back(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
+        """Compare what was answered to the last batch with what was expected."""
+        for point, (mean, variance) in zip(self._expected, self._foretold, strict=True):
+            row = int(np.argmin(np.abs(unit - point).max(axis=1)))
+            if np.abs(unit[row] - point).max() < 1e-9:  # else it failed
+                self._track.note(mean, variance, residuals[row])
+
+    def _choose(self, model: Averaged, archive: Archive, count: int) -> NDArray[np.float64]:
         """The next batch [count, d]."""
         told, d = archive.all(), self.box.dimension
         taken = self.box.to_unit(told.x)[np.argsort(told.y, kind="stable")]
         best = float(root_mean_square(archive.leading.errors)[0])
         near = np.clip(taken[0] + self._reach * self._rng.uniform(-1.0, 1.0, (KEPT, d)), 0.0, 1.0)
         starts = np.vstack([taken[:KEPT], near, self._minima[:KEPT], design("sobol", SEARCHES, d, self._rng)])
-        ended = descended(starts, corrected.mean_and_slope, 30, 1e-6)
+        ended = descended(starts, model.members[0].mean_and_slope, 30, 1e-6)
         self._minima = distinct(ended, APART).unit
         chosen: list[NDArray[np.float64]] = []
-        for place in range(turn, turn + count):
+        self._foretold = []
+        for place in range(count):
             fresh = self._minima[_separation(self._minima, taken) > SEPARATION]
-            within = np.abs(fresh - taken[0]).max(axis=1) <= self._reach
-            if place % 2 == 1 and within.any():
-                point = fresh[np.argmax(within)]
+            within = fresh[np.abs(fresh - taken[0]).max(axis=1) <= self._reach]
+            if (place % 2 == 1) == self._stalled and len(within):
+                point = within[np.argmin(self._expected_square(model, within))]
             else:
-                point = self._explored(corrected, taken, fresh, best)
+                point = self._explored(model, taken, fresh, best)
             chosen.append(point)
+            outlook = model.predict(point[None])
+            self._foretold.append((outlook.mean[0], float(outlook.variance[0])))
             if len(chosen) < count:
-                corrected, taken = corrected.with_point(point), np.vstack([taken, point])
-        return np.array(chosen)
+                model, taken = model.with_point(point), np.vstack([taken, point])
+        self._expected = np.array(chosen)
+        return self._expected
+
+    def _expected_square(self, model: Averaged, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean square of the residuals to be expected at points [k]."""
+        outlook = model.predict(unit)
+        return np.mean(outlook.mean**2, axis=1) + self._track.stretch * outlook.variance
 
     def _explored(
         self,
-        corrected: Corrected,
+        model: Averaged,
         taken: NDArray[np.float64],
         fresh: NDArray[np.float64],
         best: float,
     ) -> NDArray[np.float64]:
         """The point of the largest expected improvement [d]; `taken` are the points told, best first."""
-        d = self.box.dimension
+        d, stretch = self.box.dimension, self._track.stretch
         near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
         reach = 10.0 ** self._rng.uniform(-2.5, -0.5, (CANDIDATES, 1))
         around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
         candidates = np.vstack([fresh, self._rng.random((CANDIDATES, d)), around])
         candidates = candidates[_separation(candidates, taken) > SEPARATION]
-        normal = self._rng.standard_normal((DRAWS, len(corrected.root)))
-        return candidates[np.argmax(expected_improvement(corrected, candidates, best, normal))]
+        outlook, gain = model.predict(candidates), np.zeros(len(candidates))
+        draws = max(1, DRAWS // len(model.members))
+        for member, (own, share) in zip(model.members, outlook.parts, strict=True):
+            mean = outlook.mean + np.sqrt(stretch) * (own - outlook.mean)
+            normal = self._rng.standard_normal((draws, len(member.root)))
+            gain += improvement(mean, stretch * share, normal @ member.root, best)
+        return candidates[np.argmax(gain)]
 
-    def _resize(self, turn: int, better: bool) -> None:
-        """Halve or double the trust region after an exploitation."""
-        if turn % 2 == 1:
-            self._reach = float(np.clip(self._reach * (2.0 if better else 0.5), *REACHES))
+    def _take_stock(self, best: float, before: float) -> None:
+        """Resize the trust region after an exploitation, and explore once where it gained too little."""
+        if self._stalled or not np.isfinite(before):
+            self._stalled = False
+            return
+        self._reach = float(np.clip(self._reach * (2.0 if best < before else 0.5), *REACHES))
+        self._stalled = best > (1.0 - GAINED) * before
 
 
 def misleads(corrected: Corrected) -> bool:

@@ -233,11 +233,11 @@ class VectorSurrogate(Optimizer):
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around, fresh])
         candidates = candidates[_separation(candidates, taken) > SEPARATION]
         normal = self._rng.standard_normal((DRAWS, len(model.root)))
-        improvement = expected_improvement(model, candidates, best, normal)
-        if not improvement.any():  # less likely than one draw in all; so the point nearest to improving
+        gain = expected_improvement(model, candidates, best, normal)
+        if not gain.any():  # less likely than one draw in all; so the point nearest to improving
             centre, spread = mean_square(model, candidates)
             return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))], 0.0
-        return candidates[np.argmax(improvement)], best - np.sqrt(max(best**2 - improvement.max(), 0.0))
+        return candidates[np.argmax(gain)], best - np.sqrt(max(best**2 - gain.max(), 0.0))
 
     def _seen_by_model(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(self._logarithmic, np.log(np.where(self._logarithmic, x, 1.0)), x)
@@ -288,8 +288,23 @@ def expected_improvement(
     Returns:
         Expected improvement [k]; 0 where no draw improves.
     """
-    mean, share = model.predict(x)
-    scatter = normal @ model.root  # residuals [draws, m] with the prior covariance
+    return improvement(*model.predict(x), normal @ model.root, best)
+
+
+def improvement(
+    mean: NDArray[np.float64], share: NDArray[np.float64], scatter: NDArray[np.float64], best: float
+) -> NDArray[np.float64]:
+    """The same from what is predicted.
+
+    Args:
+        mean: Residuals at points [k, m].
+        share: Their variance there, by the prior one [k].
+        scatter: Draws of residuals with the prior covariance [draws, m].
+        best: The root mean square of the best residuals so far.
+
+    Returns:
+        Expected improvement [k].
+    """
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ scatter.T), np.sum(scatter**2, axis=1)
     square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across
     return np.maximum(best**2 - square / mean.shape[1], 0.0).mean(axis=1)
