@@ -313,8 +313,9 @@ def tables(lines: list[dict[str, Any]]) -> list[Table]:
     found = []
     for name in dict.fromkeys(line["district"] for line in lines):
         found.append(_table(f"{name}", [line for line in lines if line["district"] == name], by_name=True))
-    found.append(_table("all districts", lines, by_name=False))
-    return found
+    if len(found) > 1:
+        found.append(_table("all districts, by parameter", lines, by_name=True))
+    return [*found, _table("all districts", lines, by_name=False)]
 
 
 def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
@@ -333,7 +334,8 @@ def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
             blind = np.mean([entry["verdict"] == "not identifiable" for entry in mine])
             rows.append((
                 world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), _lucky(mine), str(len(told)),
-                _share(told, "0.9"), _share(told, "0.95"), _lucky(told), f"{blind:.2f}",
+                _share(told, "0.9") + _error(told, "0.9"), _share(told, "0.95") + _error(told, "0.95"), _lucky(told),
+                f"{blind:.2f}",
                 f"{np.median([entry['width'] for entry in mine]):.2f}", _wider(mine),
                 f"{np.mean([entry['control'] for entry in told]):.2f}" if told and world == "random" else "-",
             ))  # fmt: skip
@@ -351,6 +353,14 @@ def _wider(entries: list[dict[str, Any]]) -> str:
     """Median of the widths by those of the posterior whose noise is known."""
     ratio = [entry["width"] / entry["known"]["width"] for entry in entries if entry.get("known")]
     return f"{np.median(ratio):.2f}" if ratio else "-"
+
+
+def _error(entries: list[dict[str, Any]], level: str) -> str:
+    """Standard error of a share, as of so many independent draws: at least that of one more that fell otherwise."""
+    if not entries:
+        return ""
+    share = (sum(entry["held"][level] for entry in entries) + 1) / (len(entries) + 2)
+    return f" ± {np.sqrt(share * (1 - share) / len(entries)):.2f}"
 
 
 def _share(entries: list[dict[str, Any]], level: str) -> str:
