@@ -24,10 +24,8 @@ from calibray.study.model import Study
 from calibray.tracing import cache
 from calibray.tracing.enclosed import Enclosed
 from calibray.tracing.factory import SIONNA
+from calibray.tracing.launches import LONG
 from calibray.tracing.protocol import Tracer, TracerFactory
-
-LONG: Final = 30.0
-"""A trace that takes longer is announced before it starts [s]."""
 
 _LOG: Final = logging.getLogger(__name__)
 

@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from calibray.spelling import duration
 from calibray.tracing.settings import TraceSettings
 
+LONG: Final = 30.0
+"""A trace that takes longer is announced before it starts [s]."""
+
 LANE_BYTES: Final = 40
 """Bytes of a lane at the peak of tracing, measured by benchmarks/memory.py --lanes."""
 PATH_BYTES: Final = (650, 260)

@@ -70,7 +70,7 @@ class ReplaySection(EngineSection):
             from calibray.engines.blocks import Blocks
             from calibray.engines.crew import Here
             from calibray.engines.parts import block_size, cut, seconds_to_trace
-            from calibray.study.setup import LONG
+            from calibray.tracing.launches import LONG
 
             crew = Here() if executor is None else cast("Crew", executor)
             blocks = cut(setup.links, block_size(self.block_links, len(setup.links)))
