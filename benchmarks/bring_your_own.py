@@ -109,15 +109,12 @@ def town_walk(folder: Path, biased: bool) -> Walk:
     )
     setup = Setup.open(study, links=links)
     whole = Problem.of(setup, engines.make(setup))
-    cell_m = study.links.average.cell if study.links.average is not None else 0.0
+    if study.links.average is None:
+        raise RuntimeError("the drafted study averages nothing")
     materials = {"walls": town.WALLS, "ground": town.GROUND}
     planted = {name: value for name, value in constants(materials).items() if "permittivity" in name}
-    return Walk(
-        planted,
-        lambda seed: _heard_in_town(
-            whole, gains, recorded, seed, Averaging("cell", cell_m, unbiased=not biased)
-        ),
-    )
+    averaging = Averaging("cell", study.links.average.size, unbiased=not biased)
+    return Walk(planted, lambda seed: _heard_in_town(whole, gains, recorded, seed, averaging))
 
 
 def _heard_in_town(

@@ -18,6 +18,7 @@ from calibray.cli.app import app
 from calibray.coordinates import transformer
 from calibray.errors import InputError
 from calibray.inference import shared_out
+from calibray.reporting.coverage import geotiff
 from calibray.reporting.plan import footprints
 from calibray.scenes.ground import ground_heights
 from calibray.scenes.triangles import Triangles
@@ -97,6 +98,15 @@ def test_the_geotiff_lies_where_the_scene_does(result, found, tmp_path):
                 loss if np.isfinite(loss) else np.nan, rel=1e-5, nan_ok=True
             )
     assert (tmp_path / "map.png").stat().st_size > 20_000
+
+
+def test_a_map_is_written_into_a_folder_of_any_name(found, tmp_path):
+    """Names that are no UTF-8 are names of files as well, though GDAL knows none."""
+    folder = tmp_path / "\udcff"
+    folder.mkdir()
+    geotiff(found, folder / "map.tif")
+    with rasterio.MemoryFile((folder / "map.tif").read_bytes()) as memory, memory.open() as file:
+        assert file.count == len(found.layers)
 
 
 def test_the_place_of_the_transmitter_has_no_path_loss(result, monkeypatch):

@@ -88,17 +88,21 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    with replacing(path) as partial, rasterio.open(partial, "w", **compressed, **layout, **place) as file:
-        for number, (name, values) in enumerate(bands.items(), start=1):
-            known = np.where(np.isfinite(values), values, np.nan)
-            file.write(known[::-1].astype("float32"), number)
-            file.set_band_description(number, name)
-            file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
-        file.update_tags(
-            tx_m=" ".join(f"{each:g}" for each in coverage.tx),
-            receiver_height_m=f"{coverage.height:g}",
-            **({} if coverage.level is None else {"interval_level": f"{coverage.level:g}"}),
-        )
+    # By way of memory: GDAL takes no names but those in UTF-8.
+    with rasterio.MemoryFile() as memory:
+        with memory.open(**compressed, **layout, **place) as file:
+            for number, (name, values) in enumerate(bands.items(), start=1):
+                known = np.where(np.isfinite(values), values, np.nan)
+                file.write(known[::-1].astype("float32"), number)
+                file.set_band_description(number, name)
+                file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
+            file.update_tags(
+                tx_m=" ".join(f"{each:g}" for each in coverage.tx),
+                receiver_height_m=f"{coverage.height:g}",
+                **({} if coverage.level is None else {"interval_level": f"{coverage.level:g}"}),
+            )
+        with replacing(path) as partial:
+            partial.write_bytes(memory.read())
 
 
 @styled()
