@@ -3,7 +3,7 @@
     python benchmarks/blocks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
     python benchmarks/blocks.py validate            # the same of a validation by two blocks held out
     python benchmarks/blocks.py bytes               # what a candidate moves, by number of links
-    python benchmarks/blocks.py links               # memory and time of a search, blocks repeated up to a million links
+    python benchmarks/blocks.py links               # memory and time of a step, blocks repeated up to a million links
     python benchmarks/blocks.py city --links 100000 # a campaign in Munich end to end, in one process
 
 Each has processes and a cache of its own. Measured values are a law of the distance with noise of 6 dB: how well they
@@ -39,6 +39,7 @@ from calibray.study import Setup, Study
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
 COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
+STEPS, CANDIDATES = 3, 32  # of a search over repeated blocks
 PARAMETERS = ("concrete", "marble", "brick")
 
 Work = Callable[[Setup, "Crew | None"], tuple[float, float]]
@@ -164,8 +165,8 @@ def moved(links: int) -> None:
 
 
 def repeated(blocks: int, links: int) -> None:
-    """One block's links again and again, two blocks of them open at once; a search over all."""
-    one = campaign(links, {"block_links": links}, starts=4)
+    """One block's links again and again, two blocks of them open at once; steps of a search over all."""
+    one = campaign(links, {"block_links": links})
     tx, rx = (np.tile(end, (blocks, 1)) for end in (one.links.tx, one.links.rx))
     loss, mast = (np.tile(each, blocks) for each in (one.links.path_loss_db, one.links.group_index))
     setup = one.at(cb.Measurements(tx=tx, rx=rx, path_loss_db=loss, group=mast))
@@ -174,12 +175,16 @@ def repeated(blocks: int, links: int) -> None:
     engine = Blocks(Here(at_most=2), setup, parts, partial(replay._traced, None))
     problem = Problem.of(setup, engine)
     opened = time.perf_counter() - started
-    trail = search(problem, choose(problem))
+    lower, upper = problem.parameters.search_bounds
+    points = lower + np.random.default_rng(0).random((CANDIDATES, len(lower))) * (upper - lower)
+    for _ in range(STEPS):
+        problem.squares(points, derivatives=True)
     seconds = time.perf_counter() - started - opened
+    each = 1e6 * seconds / STEPS / CANDIDATES / blocks / links
     print(
-        f"{blocks * links:>9,} links in {blocks:>4} blocks: {opened:.1f} s to open, {seconds:.1f} s for "
-        f"{trail.rt_calls} candidates, {1e6 * seconds / trail.rt_calls / blocks / links:.3f} us a link and candidate, "
-        f"peak memory {resident():.2f} GiB",
+        f"{blocks * links:>9,} links in {blocks:>4} blocks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} times "
+        f"{CANDIDATES} candidates with derivatives, {each:.3f} us a link and candidate, peak memory "
+        f"{resident():.2f} GiB",
         flush=True,
     )
 
