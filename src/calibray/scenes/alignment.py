@@ -215,7 +215,7 @@ def _fitted(
     ends, number = segments[some], np.repeat(line[some], 2)
     length = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
     weight, flat = np.repeat(length, 2), ends.reshape(-1, 2)
-    total = np.bincount(number, weight)
+    total = np.bincount(number, weight).astype(np.float64)
     middle = np.column_stack([np.bincount(number, weight * axis) for axis in flat.T]) / total[:, None]
     x, y = (flat - middle[number]).T
     xx, xy, yy = (np.bincount(number, weight * product) for product in (x * x, x * y, y * y))

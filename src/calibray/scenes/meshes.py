@@ -65,7 +65,7 @@ def joined(meshes: Iterable[Mesh]) -> Mesh:
     return Mesh(vertices[used], inverse.reshape(faces.shape))
 
 
-def welded(triangles: NDArray[np.integer], scale: float, place: Place | None = None) -> Mesh:
+def welded(triangles: NDArray[np.int64], scale: float, place: Place | None = None) -> Mesh:
     """A mesh of triangles whose corners are whole multiples of a length: equal corners become one vertex.
 
     Args:
