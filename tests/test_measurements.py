@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements, links_from_frame, read_links, read_measurements
+from calibray.measurements import Measurements, links_from_frame, links_from_table, read_measurements
+from calibray.measurements.tables import read_table
 
 TABLE = """\
 x,y,z,loss,set,spread
@@ -299,7 +300,7 @@ def test_links_to_predict_at_have_no_values(tmp_path):
     assert links.group.tolist() == ["b", "a"]
     np.testing.assert_array_equal(links.rx, [[5, 1, 1.5], [6, 1, 1.5]])
     frame.to_csv(tmp_path / "links.csv", index=False)
-    np.testing.assert_array_equal(read_links(tmp_path / "links.csv").rx, links.rx)
+    np.testing.assert_array_equal(links_from_table(read_table(tmp_path / "links.csv")).rx, links.rx)
     with pytest.raises(InputError, match="no column 'rx_z'"):
         links_from_frame(frame.drop(columns="rx_z"))
     with pytest.raises(InputError, match="holds no rows"):

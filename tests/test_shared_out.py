@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
 import pandas as pd
+import pyarrow
 import pytest
 from typer.testing import CliRunner
 
@@ -19,8 +21,11 @@ from calibray.cli.app import app
 from calibray.engines.crew import Here
 from calibray.engines.parts import cut
 from calibray.engines.traced import traced_in_blocks
-from calibray.inference.shared_out import predicted
-from calibray.measurements import links_from_frame
+from calibray.errors import InputError
+from calibray.files import growing_table
+from calibray.inference import shared_out
+from calibray.inference.shared_out import predicted, predicted_in_pieces
+from calibray.measurements import Measurements, PiecedTable, links_from_frame
 from calibray.result import Result
 from calibray.study import Setup
 
@@ -36,6 +41,11 @@ def found(tmp_path_factory) -> Result:
         patch.setenv("CALIBRAY_CACHE", "")
         folder = tmp_path_factory.mktemp("found")
         return calibrate(Setup.open(two_ray.study(folder, noise_db=1.0, **PARTED), two_ray.TwoRay))
+
+
+def opened(result: Result, links: Measurements) -> Setup:
+    """A calibration's study, opened in the tracer of two rays."""
+    return Setup.open(result.study, two_ray.TwoRay, links)
 
 
 def new_links(count: int = 40) -> pd.DataFrame:
@@ -127,3 +137,88 @@ parameters = {{ "concrete.relative_permittivity" = {{ bounds = [1.5, 12.0] }} }}
     assert paths.rx_position[:, 0] == pytest.approx(planted.links().rx_x.to_numpy())
     assert "Change from 5,000 to 10,000 samples" in outcome.stdout
     assert re.search(rf"^links +{planted.LINKS}$", outcome.stdout, re.MULTILINE)
+
+
+def mixed(count: int) -> pd.DataFrame:
+    """Links with columns that are passed on: words, whole numbers of which one is missing, and truth values."""
+    hole = pd.array(range(count), dtype="Int64")
+    hole[count // 2] = pd.NA
+    words = np.where(np.arange(count) < count // 2, None, "far")
+    return new_links(count).assign(
+        number=np.arange(count), hole=hole, words=words, odd=np.arange(count) % 2 == 1
+    )
+
+
+@pytest.mark.parametrize("kind", [".csv", ".parquet"])
+@pytest.mark.parametrize("given", [".csv", ".parquet"])
+def test_what_is_written_in_pieces_is_what_is_written_at_once(found, tmp_path, monkeypatch, given, kind):
+    source = tmp_path / f"links{given}"
+    (mixed(40).to_csv if given == ".csv" else mixed(40).to_parquet)(source, index=False)
+    found.save(tmp_path / "out")
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    written = []
+    for size in (40, 9):
+        monkeypatch.setattr(shared_out, "PIECE", size)
+        out = tmp_path / f"told{size}{kind}"
+        words = ["predict", str(tmp_path / "out"), str(source), "-o", str(out), "--level", "0.9"]
+        outcome = CliRunner().invoke(app, words)
+        assert outcome.exit_code == 0, outcome.output
+        assert "receiver under the ground: 1 of 40 links, row" in outcome.stderr
+        written.append((pd.read_csv if kind == ".csv" else pd.read_parquet)(out))
+    pd.testing.assert_frame_equal(written[1], written[0], rtol=1e-9)
+    assert len(written[0]) == 40
+    assert sorted(each.name for each in tmp_path.glob("told*")) == [f"told40{kind}", f"told9{kind}"]
+
+
+def test_a_row_that_cannot_be_used_is_refused_before_any_is_traced(found, tmp_path, monkeypatch):
+    table = new_links()
+    table.loc[37, "rx_x"] = np.nan
+    table.to_parquet(tmp_path / "links.parquet")
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    monkeypatch.setattr(shared_out, "PIECE", 9)
+    monkeypatch.setattr(Setup, "trace", None)
+    rows = predicted_in_pieces(found, PiecedTable.open(tmp_path / "links.parquet"), None)
+    with pytest.raises(InputError, match="'rx_x' is missing or not finite in 1 of 4 rows"):
+        next(rows)
+
+
+@pytest.mark.parametrize("kind", [".csv", ".parquet"])
+def test_a_failure_in_the_midst_leaves_no_table(tmp_path, kind):
+    def full() -> None:
+        with growing_table(tmp_path / f"told{kind}") as append:
+            append(new_links())
+            assert list(tmp_path.iterdir())
+            raise OSError(28, "the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        full()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", [".csv", ".parquet"])
+def test_memory_does_not_grow_with_the_rows(found, tmp_path, monkeypatch, kind):
+    def cheap(result, setup, *_, **__):
+        return pd.DataFrame({"path_loss_db": setup.links.distance, "remark": ""})
+
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    monkeypatch.setattr(shared_out, "predicted", cheap)
+    monkeypatch.setattr(shared_out, "PIECE", 500)
+    peaks = []
+    for count in (500, 2_000, 16_000):
+        source = tmp_path / f"links{count}.parquet"
+        new_links(count).to_parquet(source, row_group_size=1000)
+        before = pyarrow.total_allocated_bytes()
+        tracemalloc.start()
+        arrow = 0
+        with growing_table(tmp_path / f"told{count}{kind}") as append:
+            for links, told in predicted_in_pieces(found, PiecedTable.open(source), None):
+                append(links.frame.assign(path_loss_db=told["path_loss_db"]))
+                arrow = max(arrow, pyarrow.total_allocated_bytes() - before)
+        peaks.append(tracemalloc.get_traced_memory()[1] + arrow)
+        tracemalloc.stop()
+    assert peaks[2] < 1.3 * peaks[1]
+    assert peaks[2] < 16_000 * 7 * 8
+    told = (pd.read_csv if kind == ".csv" else pd.read_parquet)(tmp_path / f"told16000{kind}")
+    rows = told[list(two_ray.COLUMNS)].to_numpy()
+    assert told.path_loss_db.to_numpy() == pytest.approx(np.linalg.norm(rows[:, 3:] - rows[:, :3], axis=1))
+    assert len(told) == 16_000

@@ -13,8 +13,8 @@ import os
 import stat
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -314,14 +314,57 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
     Raises:
         InputError: What `check_table` refuses, or it is Parquet and pyarrow is not installed.
     """
+    with growing_table(path) as append:
+        append(table)
+
+
+@contextmanager
+def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
+    """Write a CSV or Parquet file in pieces beside its place, and move it there once it is complete.
+
+    Args:
+        path: The file; its ending says how it is written.
+
+    Yields:
+        What appends rows, with the columns of those before; their index is left out. Columns have the types of the
+        first rows.
+
+    Raises:
+        InputError: What `check_table` refuses, it is Parquet and pyarrow is not installed, or a column cannot have the
+            type that it had before.
+    """
     target = check_table(path, overwrite=True)  # whether it may be replaced was asked before the work
-    if target.suffix.lower() == ".csv":
-        write_text(target, table.to_csv(index=False))
-        return
-    with replacing(target) as partial:
-        try:
-            table.to_parquet(partial, index=False)
-        except ImportError:
-            raise InputError(
-                f"{target}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
-            ) from None
+    write = _csv if target.suffix.lower() == ".csv" else _parquet
+    with replacing(target) as partial, write(partial, target) as append:
+        yield append
+
+
+@contextmanager
+def _csv(partial: Path, _: Path) -> Iterator[Callable[[pd.DataFrame], None]]:
+    with partial.open("w", encoding="utf-8") as stream:
+        yield lambda table: table.to_csv(stream, index=False, header=stream.tell() == 0, lineterminator="\n")
+
+
+@contextmanager
+def _parquet(partial: Path, target: Path) -> Iterator[Callable[[pd.DataFrame], None]]:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        raise InputError(
+            f"{target}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
+        ) from None
+    with ExitStack() as stack:
+        writers: list[parquet.ParquetWriter] = []
+
+        def append(table: pd.DataFrame) -> None:
+            schema = writers[0].schema if writers else None
+            try:
+                rows = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
+            except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError) as error:
+                raise InputError(f"{target}: cannot be Parquet ({error}); write CSV") from None
+            if not writers:
+                writers.append(stack.enter_context(parquet.ParquetWriter(partial, rows.schema)))
+            writers[0].write_table(rows)
+
+        yield append

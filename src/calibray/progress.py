@@ -26,3 +26,24 @@ def staged(progress: Progress | None, stage: str) -> Progress | None:
     if progress is None:
         return None
     return lambda _, done, total: progress(stage, done, total)
+
+
+def part(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Tell progress of one of several pieces of work as that of all.
+
+    Args:
+        progress: Whom to tell; None for nobody.
+        before: How much was done before this piece.
+        total: How much there is in all.
+
+    Returns:
+        What the work calls.
+
+    Example:
+        >>> told = part(lambda *parts: print(*parts), 100, 250)
+        >>> told("tracing", 3, 40)
+        tracing 103 250
+    """
+    if progress is None:
+        return None
+    return lambda stage, done, _: progress(stage, before + done, total)

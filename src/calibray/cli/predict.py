@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -11,10 +14,15 @@ from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
+    from numpy.typing import NDArray
 
 PREDICTED: Final = ("path_loss_db", "lower_db", "upper_db")
 """The columns that `predict` adds, all but the first with --level alone; others tell what was measured."""
+
+UNREACHED: Final = "no path leads to"
+"""What is to be said of links without a path."""
 
 SAID: Final = ("basis", "remark")
 """Columns of words, with --level."""
@@ -60,39 +68,63 @@ def predict(
         import pandas as pd
 
         from calibray.engines import open_crew
-        from calibray.files import check_table, write_table
-        from calibray.inference.prediction import as_links, opened
+        from calibray.files import check_table, growing_table
+        from calibray.inference.prediction import as_links
         from calibray.inference.quantity import as_measured
-        from calibray.inference.shared_out import predicted
+        from calibray.inference.shared_out import predicted_in_pieces
+        from calibray.measurements import PiecedTable
         from calibray.result import Result
 
         result = Result.load(folder, anyway=anyway)
-        study = result.study
-        links = as_links(result, links_file)
+        study, table = result.study, PiecedTable.open(links_file)
+        first = as_links(result, next(table.pieces(1)))
         names = PREDICTED[: 1 if level is None else None]
-        own = as_measured(study, links, pd.DataFrame(np.nan, index=links.frame.index, columns=list(names)))
-        _refuse_columns(links_file, links.frame, (*names, *own, *(() if level is None else SAID)))
+        own = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
+        _refuse_columns(links_file, first.frame, (*names, *own, *(() if level is None else SAID)))
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)
-        setup = opened(result, links, anyway=anyway)
-        with open_crew(workers, scheduler) as crew:
-            told = predicted(result, setup, level, progress, crew, remarked=True)
-        odd = told.remark.to_numpy()
-    columns = {name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))}
-    columns |= as_measured(study, links, told) | ({} if level is None else {"remark": odd})
-    table = links.frame.assign(**columns)
-    if out is None:
-        typer.echo(table.to_csv(index=False), nl=False)
-    else:
-        write_table(out, table)
-    _warn("no path leads to", links.row[np.isinf(told["path_loss_db"].to_numpy())].tolist(), len(links))
-    parts = [set(filter(None, each.split(", "))) for each in odd.tolist()]
-    for part in sorted(set().union(*parts)):
-        rows = [row for row, each in zip(links.row.tolist(), parts, strict=True) if part in each]
-        _warn(f"{part}:", rows, len(links))
+        odd: dict[str, array[int]] = {}
+        with (
+            open_crew(workers, scheduler) as crew,
+            _printed() if out is None else growing_table(out) as append,
+        ):
+            for links, told in predicted_in_pieces(result, table, level, progress, crew, anyway=anyway):
+                own = as_measured(study, links, told)
+                columns = {
+                    name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))
+                }
+                columns |= own | ({} if level is None else {"remark": told["remark"].to_numpy()})
+                append(links.frame.assign(**columns))
+                _note(odd, links.row, told)
+    for what in sorted(odd, key=lambda each: (each != UNREACHED, each)):
+        _warn(what if what == UNREACHED else f"{what}:", odd[what], table.rows)
 
 
-def _warn(what: str, rows: list[int], count: int) -> None:
+@contextmanager
+def _printed() -> Iterator[Callable[[pd.DataFrame], None]]:
+    """What prints rows as CSV, the header before the first."""
+    header = True
+
+    def append(table: pd.DataFrame) -> None:
+        nonlocal header
+        typer.echo(table.to_csv(index=False, header=header), nl=False)
+        header = False
+
+    yield append
+
+
+def _note(odd: dict[str, array[int]], row: NDArray[np.int64], told: pd.DataFrame) -> None:
+    """Add the rows of which something is to be said, by what is to be said."""
+    said: dict[str, list[int]] = {UNREACHED: row[~(told["path_loss_db"].to_numpy() < float("inf"))].tolist()}
+    for number, remark in zip(row.tolist(), told["remark"].tolist(), strict=True):
+        for part in filter(None, remark.split(", ")):
+            said.setdefault(part, []).append(number)
+    for what, rows in said.items():
+        # Eight bytes a row, of a million rows as many megabytes.
+        odd.setdefault(what, array("q")).extend(rows)
+
+
+def _warn(what: str, rows: Sequence[int], count: int) -> None:
     """Say of which rows something is to be said, if of any."""
     from calibray.tables.text import rows_text
 

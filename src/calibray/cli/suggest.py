@@ -39,12 +39,13 @@ def suggest(
         from calibray.calibration.suggest import suggest as find
         from calibray.files import check_table, write_table
         from calibray.inference.prediction import as_links
+        from calibray.measurements.tables import read_table
         from calibray.result import Result
         from calibray.tables.text import render
 
         result = Result.load(folder, anyway=anyway)
         study = result.study
-        links = as_links(result, candidates_file)
+        links = as_links(result, read_table(candidates_file))
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
         found = find(result, links, count, progress, anyway=anyway)

@@ -22,7 +22,7 @@ from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.inference.prediction import as_links, opened
 from calibray.inference.shared_out import piece_size, predicted
 from calibray.measurements.links import COINCIDENCE
-from calibray.progress import Progress
+from calibray.progress import Progress, part
 from calibray.scenes.ground import ground_heights
 from calibray.scenes.triangles import Triangles, read_triangles
 from calibray.study import Study
@@ -155,7 +155,7 @@ def coverage_map(
         block = wanted[start : start + size]
         rows = pd.DataFrame({**_ends(place, rx[block]), **held})
         setup = setup.at(as_links(result, rows))
-        told = predicted(result, setup, level, _part(progress, int(block[0]), len(rx)), crew)
+        told = predicted(result, setup, level, part(progress, int(block[0]), len(rx)), crew)
         for row, name in enumerate(("path_loss_db", "lower_db", "upper_db")[: 1 if level is None else 3]):
             found[row, block] = told[name]
     loss, lower, upper = found.reshape(3, *z.shape)
@@ -245,10 +245,3 @@ def _ends(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> dict[str, object]
     """Columns of links from one transmitter to receivers [n, 3], [m]."""
     receivers = {f"rx_{axis}": rx[:, k] for k, axis in enumerate("xyz")}
     return {**{f"tx_{axis}": tx[k] for k, axis in enumerate("xyz")}, **receivers}
-
-
-def _part(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Progress of one of several traces as that of all."""
-    if progress is None:
-        return None
-    return lambda stage, done, _: progress(stage, before + done, total)

@@ -19,7 +19,7 @@ from calibray.inference.quantity import as_measured
 from calibray.inference.reach import FEW, reach
 from calibray.inference.remarks import PLACES, remarks
 from calibray.inference.residual_field import carried, measured_errors
-from calibray.measurements import Measurements, links_from_frame, read_links
+from calibray.measurements import Measurements, SourceTable, links_from_frame, links_from_table
 from calibray.progress import Progress
 from calibray.study import Setup
 
@@ -207,26 +207,40 @@ def _beside(result: Result, links: Measurements) -> tuple[NDArray[np.float64], N
     return carried(field, measured, errors, np.hstack([links.tx, links.rx]))
 
 
-def as_links(result: Result, links: Measurements | pd.DataFrame | Path) -> Measurements:
-    """Links to predict at, of a table or a file of one.
+def as_links(result: Result, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
+    """Links to predict at, of a table or rows of a file.
 
     Args:
         result: The calibration.
-        links: The links, a table as `predict` takes it, or a CSV or Parquet file that holds one.
+        links: The links, a table as `predict` takes it, or rows of a file that holds one.
 
     Returns:
         The links, grouped as the study's offset is, with carriers if it has a column of them.
 
     Raises:
-        InputError: The file cannot be read, a column is missing, or a position is not finite.
+        InputError: A column is missing, or a position is not finite.
     """
     if isinstance(links, Measurements):
         return links
     study = result.study
     group, frequency = study.offset.per if study.offset else None, study.links.frequency
-    if isinstance(links, Path):
-        return read_links(links, group, frequency)
+    if isinstance(links, SourceTable):
+        return links_from_table(links, group, frequency)
     return links_from_frame(links, group, frequency)
+
+
+def check_groups(result: Result, links: Measurements) -> None:
+    """Refuse links of which a nuisance is not known, before anything is traced.
+
+    Args:
+        result: The calibration.
+        links: The links.
+
+    Raises:
+        InputError: A group has no calibrated offset, or a column is missing.
+    """
+    terms = _terms(result, links) if result.chosen is None else _chosen_terms(result.chosen, links)
+    _shift(terms, links, {})
 
 
 def _residual(result: Result) -> tuple[float, str, NDArray[np.float64]]:

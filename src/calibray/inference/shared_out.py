@@ -1,20 +1,21 @@
-"""Predictions in blocks of links, each on a worker of a cluster; path losses come back, paths do not."""
+"""Predictions in pieces of links, and in blocks on the workers of a cluster; path losses come back, paths do not."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pandas as pd
 
-from calibray.engines.crew import Crew
+from calibray.engines.crew import Crew, Here
 from calibray.engines.parts import BLOCK_LINKS, chosen, of_blocks
 from calibray.engines.traced import given_size
-from calibray.inference.prediction import interval
+from calibray.inference.prediction import as_links, check_groups, interval, opened
 from calibray.inference.remarks import remarks
-from calibray.measurements import Measurements
-from calibray.progress import Progress
+from calibray.measurements import Measurements, PiecedTable
+from calibray.progress import Progress, part
 from calibray.study import Setup
 
 if TYPE_CHECKING:
@@ -82,6 +83,8 @@ def predicted(
         EngineError: There are more paths than fit into memory, or workers die again and again.
     """
     links = setup.links
+    if crew is None and len(links) > piece_size(setup, None):
+        crew = Here(at_most=0)
     if crew is None:
         return _predicted(_Shared(result, setup, level, remarked), links, progress)
     # Neither the steps of the search nor the paths have a say in predictions.
@@ -91,6 +94,55 @@ def predicted(
     place = np.concatenate([block for block, _ in parts])
     joined = pd.concat([told for _, told in parts], ignore_index=True)
     return joined.iloc[np.argsort(place)].reset_index(drop=True)
+
+
+def predicted_in_pieces(
+    result: Result,
+    table: PiecedTable,
+    level: float | None,
+    progress: Progress | None = None,
+    crew: Crew | None = None,
+    *,
+    anyway: bool = False,
+) -> Iterator[tuple[Measurements, pd.DataFrame]]:
+    """Predict at the links of a table, some at a time, so that memory does not grow with their number.
+
+    All rows are checked before any is traced.
+
+    Args:
+        result: The calibration.
+        table: The table, with the columns that `predict` takes.
+        level: Probability that a measurement lies within the interval; None for path loss alone.
+        progress: Called with the stages "checking" and "tracing", the links done and all of them.
+        crew: Where blocks live; None for this process.
+        anyway: Predict although a file of the scene or an antenna changed since the calibration.
+
+    Yields:
+        Links, and what `predicted` tells of them, in the order of the table.
+
+    Raises:
+        InputError: What `predict` and `predict_interval` refuse.
+        EngineError: There are more paths than fit into memory, or workers die again and again.
+    """
+    setup, done = None, 0
+    for rows in table.pieces(PIECE):
+        links = as_links(result, rows)
+        if setup is None:
+            setup = opened(result, links, anyway=anyway)
+        setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
+        if level is None:
+            check_groups(result, links)
+        done += len(links)
+        if progress is not None:
+            progress("checking", done, table.rows)
+    if setup is None:
+        return
+    done, size = 0, PIECE if crew is None else piece_size(setup, crew)
+    for rows in table.pieces(size):
+        setup = setup.at(as_links(result, rows))
+        told = predicted(result, setup, level, part(progress, done, table.rows), crew, remarked=True)
+        done += len(rows)
+        yield setup.links, told
 
 
 def _block_size(setup: Setup) -> int:

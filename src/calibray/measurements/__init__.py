@@ -4,15 +4,17 @@ Positions are metres in the scene's frame once rows are links; `preparation` mak
 """
 
 from calibray.measurements.links import FREQUENCIES, Measurements
+from calibray.measurements.pieces import PiecedTable
 from calibray.measurements.preparation import Averaging, Coordinates, Preparation, Track
 from calibray.measurements.reading import (
     LINK_COLUMNS,
     Quantity,
     links_from_frame,
+    links_from_table,
     measured_links,
-    read_links,
     read_measurements,
 )
+from calibray.measurements.tables import SourceTable
 
 __all__ = [
     "FREQUENCIES",
@@ -20,11 +22,13 @@ __all__ = [
     "Averaging",
     "Coordinates",
     "Measurements",
+    "PiecedTable",
     "Preparation",
     "Quantity",
+    "SourceTable",
     "Track",
     "links_from_frame",
+    "links_from_table",
     "measured_links",
-    "read_links",
     "read_measurements",
 ]

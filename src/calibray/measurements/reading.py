@@ -167,29 +167,25 @@ def links_from_frame(
     Raises:
         InputError: A column is missing, or a position is not finite.
     """
-    return _unmeasured(SourceTable(frame.reset_index(drop=True), source="links"), group, frequency)
+    return links_from_table(SourceTable(frame.reset_index(drop=True), source="links"), group, frequency)
 
 
-def read_links(
-    path: str | Path, group: str | Sequence[str] | None = None, frequency: str | None = None
+def links_from_table(
+    table: SourceTable, group: str | Sequence[str] | None = None, frequency: str | None = None
 ) -> Measurements:
-    """Links without measured values from a CSV or Parquet file with the columns of `links_from_frame`.
+    """Links without measured values from rows of a file with the columns of `links_from_frame`.
 
     Args:
-        path: The table, .csv or .parquet.
-        group: Column of group labels.
+        table: The rows.
+        group: Column of group labels, or several whose labels are joined.
         frequency: Column of carrier frequencies [Hz]; without that column all links have the study's carrier.
 
     Returns:
         The links, their path losses NaN.
 
     Raises:
-        InputError: The file or a column is missing or malformed, or a position is not finite.
+        InputError: There are no rows, a column is missing or malformed, or a position is not finite.
     """
-    return _unmeasured(read_table(path), group, frequency)
-
-
-def _unmeasured(table: SourceTable, group: str | Sequence[str] | None, frequency: str | None) -> Measurements:
     if len(table) == 0:
         raise InputError(f"{table.source}: holds no rows; give at least one link")
     return Measurements(

@@ -215,6 +215,19 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
     return header, lines
 
 
+def damaged(path: Path, error: Exception) -> InputError:
+    """What is to be raised where a Parquet file cannot be read.
+
+    Args:
+        path: The file.
+        error: What the library says of it.
+
+    Returns:
+        The error.
+    """
+    return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")
+
+
 def _read_parquet(path: Path) -> SourceTable:
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
@@ -223,7 +236,7 @@ def _read_parquet(path: Path) -> SourceTable:
             f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
         ) from None
     except Exception as error:
-        raise InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again") from None
+        raise damaged(path, error) from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import parse_crs
 from calibray.errors import InputError
 from calibray.extras import library
-from calibray.files import check_outputs, replacing, write_text
+from calibray.files import check_outputs, replacing
 from calibray.reporting.plan import footprints
 from calibray.reporting.style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write
 
@@ -55,7 +55,8 @@ def save_map(
     names = FILES if find_spec("rasterio") else FILES[1:]
     try:
         target.mkdir(parents=True, exist_ok=True)
-        write_text(target / TABLE, coverage.table().to_csv(index=False, float_format="%.8g"))
+        with replacing(target / TABLE) as partial:
+            coverage.table().to_csv(partial, index=False, float_format="%.8g")
         write(figure(coverage), target / PICTURE)
         if GEOTIFF in names:
             geotiff(coverage, target / GEOTIFF)
