@@ -76,8 +76,9 @@ class PiecedTable:
             gaps, start = _with_gaps(file), 0
             batches = file.iter_batches(batch_size=size)
             while (frame := self._next(batches)) is not None:
-                # Whole numbers of which one is missing are floats in pandas, in whatever piece it is.
-                frame = frame.astype(dict.fromkeys(gaps, np.float64))
+                # Of NumPy's types whole numbers of which one is missing are floats, in whatever piece it is.
+                plain = [name for name in gaps if name in frame and isinstance(frame.dtypes[name], np.dtype)]
+                frame = frame.astype(dict.fromkeys(plain, np.float64))
                 yield SourceTable(frame, np.arange(start + 1, start + len(frame) + 1), self.source)
                 start += len(frame)
 
