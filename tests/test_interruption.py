@@ -39,6 +39,14 @@ COMMAND, IN_TERMINAL = ([sys.executable, "-c", code] for code in (MAIN, TERMINAL
 PATIENCE = 120.0  # [s]
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """Ctrl-C is heard here, too, where the tests run in the background and inherited that it is not."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def paid(folder: Path) -> int:
     """RT calls in the ledger of a folder."""
     if not (folder / "ledger.sqlite").is_file():

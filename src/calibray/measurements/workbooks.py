@@ -10,6 +10,7 @@ import io
 import re
 import zipfile
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
@@ -94,8 +95,11 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, tuple[Any, ...]]]:
     """Number and cells of every row that is not blank, up to its last value; formulas or what they gave."""
     import openpyxl
 
-    book = openpyxl.load_workbook(path, read_only=True, data_only=computed)
-    try:
+    # Opened here, for openpyxl leaves open what it cannot read.
+    with (
+        path.open("rb") as file,
+        closing(openpyxl.load_workbook(file, read_only=True, data_only=computed)) as book,
+    ):
         if not book.worksheets:
             raise InputError(f"{path}: has no sheet of cells; put the table into the first sheet")
         sheet = book.worksheets[0]
@@ -109,8 +113,6 @@ def _rows(path: Path, computed: bool) -> Iterator[tuple[int, tuple[Any, ...]]]:
                 raise InputError(f"{path}: more than {CELLS:,} cells; save the sheet as CSV or Parquet")
             if last:
                 yield number, cells[:last]
-    finally:
-        book.close()
 
 
 def _filled(cells: tuple[Any, ...], written: tuple[Any, ...]) -> tuple[Any, ...]:
