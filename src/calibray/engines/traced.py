@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
@@ -47,7 +47,9 @@ def traced_in_blocks(
     found = of_blocks(crew, partial(_traced, check), few, links, size, progress)
     paths = join_links([(block, part) for block, (part, _) in found])
     worst = {
-        name: max(part.settings[name] for _, (part, _) in found) for name in WORST if name in paths.settings
+        name: max(cast(float, part.settings[name]) for _, (part, _) in found)
+        for name in WORST
+        if name in paths.settings
     }
     changes = [(block, change) for block, (_, change) in found if change is not None]
     return replace(paths, settings={**paths.settings, **worst}), convergence.join(
