@@ -36,6 +36,19 @@ def study_path(name: str) -> Path:
     return demo_study_path()
 
 
+def at_hand(name: str) -> bool:
+    """Whether the study's scene is there: measured campaigns are no part of the repository."""
+    from calibray.errors import InputError
+    from calibray.study import Setup, Study
+
+    try:
+        Setup.open(Study.load(study_path(name)))
+    except InputError as error:
+        print(f"{name} is left out: {error}")
+        return False
+    return True
+
+
 class Clock:
     """Wall and processor time of one part after the other."""
 
@@ -131,10 +144,11 @@ def main() -> None:
     if given.inside:
         print(json.dumps(globals()[given.inside](given.studies[0])))
         return
+    studies = [name for name in given.studies if at_hand(name)]
     print(
         f"{'study':15} {'':5}" + "".join(f"{part:>17}" for part in PARTS) + f"{'ratio':>7}  evaluations, RMSE"
     )
-    for name in given.studies:
+    for name in studies:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("cold", "warm"):
                 told = in_a_process(once, name, Path(folder))
@@ -144,7 +158,7 @@ def main() -> None:
                 calls = " + ".join(f"{count:,}" for count in told["evaluations"])
                 print(f"{name:15} {kind:5}{parts}{ratio:7.2f}  {calls}, {told['rmse_db']:.4f} dB", flush=True)
     print(f"\n{'study':15} {'all starts':>24} {'until it comes back':>34} {'found within 0.001 dB':>22}")
-    for name in given.studies:
+    for name in studies:
         with tempfile.TemporaryDirectory() as folder:
             told = in_a_process(seeds, name, Path(folder))
         best, evaluations = told["all"]
