@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -163,7 +164,7 @@ def moved(links: int) -> None:
     for count in (links // 4, links):
         setup = campaign(count, {"block_links": -(-count // 4)})
         problem = Problem.of(setup, engines.make(setup))
-        engine = problem.engine
+        engine = cast(Blocks, problem.engine)
         shares = problem.objective.shares(engine.blocks)
         parts = engine.reducing(shares)(np.repeat(problem.parameters.start[None], 64, axis=0), True)
         size = sum(len(pickle.dumps(part)) for part in parts)
@@ -202,7 +203,7 @@ def repeated(blocks: int, links: int) -> None:
 def city(links: int, samples: int | str) -> None:
     """Calibrate end to end in one process."""
     setup = campaign(links, {"block_links": block_size(None, links)}, samples=samples)
-    blocks = cut(setup.links, setup.study.engine.block_links)
+    blocks = cut(setup.links, block_size(None, links))
     print(f"{links:,} links in {len(blocks)} blocks; told {seconds_to_trace(setup, blocks):.0f} s of tracing")
     started = time.perf_counter()
     result = cb.calibrate(setup)

@@ -98,8 +98,8 @@ class WithDerivatives(Engine):
 @cache
 def _opened(name: str, folder: Path) -> tuple[Problem, Replay]:
     """A district's problem, and its paths over the parameters and the constants."""
-    problem = districts.make(name, folder).problem
-    paths = problem.engine.paths
+    district = districts.make(name, folder)
+    problem, paths = district.problem, district.paths
     setup = problem.setup
     stored = Replay(
         paths, with_constants(problem.parameters, paths.materials), setup.study.objective.combining,

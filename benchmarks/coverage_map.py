@@ -14,11 +14,13 @@ import argparse
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 import calibray as cb
+from calibray.inference.coverage import CoverageMap
 from calibray.inference.prediction import as_links
 
 TX = (-381.5, 140.0, 4.0)
@@ -43,7 +45,7 @@ def main() -> None:
     half = CELL * round(np.sqrt(given.cells)) / 2
     bounds = None if given.whole else (TX[0] - half, TX[1] - half, TX[0] + half, TX[1] + half)
 
-    def mapped() -> object:
+    def mapped() -> CoverageMap:
         return cb.coverage_map(result, TX, cell=CELL, bounds=bounds)
 
     coverage = mapped()
@@ -72,13 +74,13 @@ def _result(samples: int | str) -> cb.Result:
     return cb.calibrate(cb.Study.from_content(content, demo_study_path()))
 
 
-def _seconds(call: object) -> float:
+def _seconds(call: Callable[[], object]) -> float:
     start = time.process_time()
     call()
     return time.process_time() - start
 
 
-def _solver(result: cb.Result, coverage: object) -> None:
+def _solver(result: cb.Result, coverage: CoverageMap) -> None:
     """Sionna's radio map over the same cells, with the exported scene."""
     import mitsuba as mi
     import sionna.rt as rt

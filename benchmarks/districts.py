@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -47,6 +48,11 @@ class District:
     problem: Problem
     footprints: tuple[np.ndarray, ...]
 
+    @property
+    def paths(self) -> Paths:
+        """Its paths."""
+        return cast(engines.Replay, self.problem.engine).paths
+
     def path_loss(self, truth: np.ndarray) -> np.ndarray:
         """Path loss of every link with one candidate everywhere [L], [dB]."""
         return self.problem.engine.path_loss(truth[None])[0]
@@ -59,7 +65,7 @@ class District:
             spread: Standard deviation of a building's factor.
             random: Random numbers.
         """
-        paths = self.problem.engine.paths
+        paths = self.paths
         buildings, parameters = len(self.footprints), self.problem.parameters
         own = np.clip(
             truth * np.exp(spread * random.standard_normal((buildings, len(truth)))),

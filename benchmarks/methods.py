@@ -23,17 +23,16 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from calibray.figures import write
-
 from calibray.cli.console import log
 from calibray.cli.progress import progress_bars
 from calibray.comparison.arena import Arena, landscape_arena, study_arena
 from calibray.comparison.comparison import compare
 from calibray.comparison.tables import table
 from calibray.files import write_table, write_text
-from calibray.reporting import markdown
 from calibray.reporting.excess import figure
+from calibray.reporting.style import write
 from calibray.scenarios import demo_study_path
+from calibray.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -36,8 +37,14 @@ def seconds(folder: Path, workers: int | None, scheduler: str | None) -> float:
 
 def main() -> None:
     """Time one batch all three ways."""
-    options = {"n_workers": 4, "threads_per_worker": 1, "dashboard_address": None, "processes": True}
-    with tempfile.TemporaryDirectory() as place, distributed.LocalCluster(**options) as cluster:
+    options: dict[str, Any] = {
+        "n_workers": 4,
+        "threads_per_worker": 1,
+        "dashboard_address": None,
+        "processes": True,
+    }
+    cluster: Any = distributed.LocalCluster(**options)
+    with tempfile.TemporaryDirectory() as place, cluster:
         alone = seconds(Path(place), None, None)
         ways = {"four threads": (4, None), "four Dask workers": (None, cluster.scheduler_address)}
         print(f"{CALLS} calls one by one: {alone:.1f} s")

@@ -11,6 +11,7 @@ on stored paths (what it would pay if its paths were kept).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 
@@ -41,7 +42,8 @@ def field_stage(trace: Trace, engine: engines.Replay, points: np.ndarray) -> Cal
 def main() -> None:
     """Measure and print the table."""
     study = Study.load(demo_study_path())
-    replay, retrace = engines.make(study, "replay"), engines.make(study, "retrace")
+    replay = cast(engines.Replay, engines.make(study, "replay"))
+    retrace = engines.make(study, "retrace")
     points = candidates(replay, 30)
     print(f"demo district: {replay.paths.num_links} links, {replay.paths.num_paths} paths, "
           f"{replay.paths.num_interactions} interactions")  # fmt: skip

@@ -14,12 +14,16 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from calibray.reporting import figures
 from calibray.reporting.page import page
 from made_up_report import made_up
+
+if TYPE_CHECKING:
+    from playwright.sync_api import CDPSession
 
 LIMIT_MB, LIMIT_S = 15.0, 5.0
 
@@ -49,7 +53,7 @@ def opened(file: Path) -> tuple[float, float]:
     return taken, spent
 
 
-def _processor(counters: object) -> float:
+def _processor(counters: CDPSession) -> float:
     """Processor time [s] that all processes of the browser took so far, the one that draws in software included."""
     return sum(each["cpuTime"] for each in counters.send("SystemInfo.getProcessInfo")["processInfo"])
 

@@ -13,12 +13,17 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TypeVar
 
 import numpy as np
 import osmium
 import shapely
+from osmium.filter import KeyFilter
+from osmium.geom import WKBFactory
+from osmium.osm import Area
 
 from calibray.coordinates import Frame
 from calibray.scenes.extrusion import Windows
@@ -66,9 +71,11 @@ def plant(path: Path, buildings: int) -> None:
 
 def read_alone(path: Path) -> int:
     """Assemble the areas with pyosmium and their geometry with shapely, and do nothing with them."""
-    wanted, geometry = osmium.filter.KeyFilter("building"), osmium.geom.WKBFactory()
+    wanted, geometry = KeyFilter("building"), WKBFactory()
     areas = osmium.FileProcessor(path).with_areas(wanted).with_filter(wanted)
-    return len([shapely.from_wkb(geometry.create_multipolygon(area)) for area in areas if area.is_area()])
+    return len(
+        [shapely.from_wkb(geometry.create_multipolygon(area)) for area in areas if isinstance(area, Area)]
+    )
 
 
 def resident() -> float:
@@ -76,7 +83,10 @@ def resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def timed(function, *arguments) -> tuple[float, object]:
+R = TypeVar("R")
+
+
+def timed(function: Callable[..., R], *arguments: object) -> tuple[float, R]:
     """Processor time that a call takes [s], so that other work on the machine hardly counts, and what it returns."""
     start = time.process_time()
     returned = function(*arguments)

@@ -20,6 +20,7 @@ import argparse
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -97,7 +98,7 @@ class Exact:
     def __init__(self, study: Study) -> None:
         setup = study.opened()
         problem = Problem.of(setup, engines.make(setup, "replay"))
-        self.engine, self.parameters = problem.engine, problem.parameters
+        self.engine, self.parameters = cast(engines.Replay, problem.engine), problem.parameters
         self.reached = np.flatnonzero(np.isfinite(problem.before))
         self.place = setup.links.rx[self.reached]
         axes = [np.linspace(0.0, 1.0, count) for count in GRID]

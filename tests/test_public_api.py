@@ -1,6 +1,8 @@
 """The public surface, frozen: a change here is a breaking change and belongs into the changelog."""
 
+import ast
 import inspect
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +31,13 @@ NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Setup", "Study", "engi
 def test_names_are_frozen():
     assert set(cb.__all__) == NAMES
     assert {name for name in NAMES if not hasattr(cb, name)} == set()
+
+
+def test_type_checkers_see_every_name():
+    module = ast.parse(Path(cb.__file__).read_text(encoding="utf-8"))
+    guarded = next(each for each in module.body if isinstance(each, ast.If))
+    seen = {alias.asname for each in guarded.body if isinstance(each, ast.ImportFrom) for alias in each.names}
+    assert seen == NAMES
 
 
 @pytest.mark.parametrize("name", SIGNATURES)

@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import typer
 
@@ -94,7 +95,7 @@ def missing_options(text: str, known: dict[str, dict[str, set[str]]]) -> Iterato
                     yield f"calibray {command} {name}"
 
 
-def options_of(command: object) -> set[str]:
+def options_of(command: Any) -> set[str]:
     """The options of a command, as they are written.
 
     Args:
@@ -108,7 +109,7 @@ def options_of(command: object) -> set[str]:
 
 if __name__ == "__main__":
     targets = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    group = typer.main.get_command(app).commands
+    group = cast(Any, typer.main.get_command(app)).commands
     commands = {"make": set(targets[1].split()) if targets else set(), "calibray": set(group)}
     options = {
         name: {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -32,7 +33,7 @@ def page() -> str:
     return "\n".join(parts).rstrip() + "\n"
 
 
-def commands(group: object, before: str = "") -> Iterator[tuple[str, object]]:
+def commands(group: Any, before: str = "") -> Iterator[tuple[str, Any]]:
     """Every command by name, those of a group of commands after it."""
     for name, command in sorted(group.commands.items()):
         yield before + name, command
@@ -40,7 +41,7 @@ def commands(group: object, before: str = "") -> Iterator[tuple[str, object]]:
             yield from commands(command, f"{before}{name} ")
 
 
-def row(parameter: object) -> str:
+def row(parameter: Any) -> str:
     """The table row of one argument or option."""
     metavar = parameter.metavar or ""
     name = (

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 import osmium
 import pandas as pd
-import pyogrio
 import rasterio
 import shapely
+from pyogrio import raw as pyogrio_raw
 from rasterio.transform import from_bounds
 
 import calibray as cb
@@ -102,7 +102,7 @@ def maps(folder: Path) -> None:
     houses = json.loads((TOWN / "hill" / "houses.geojson").read_text())["features"]
     shapes = np.array([shapely.from_geojson(json.dumps(house["geometry"])) for house in houses])
     heights = np.array([float(house["properties"]["height_m"]) for house in houses])
-    pyogrio.raw.write(
+    pyogrio_raw.write(
         folder / "blocks.gpkg", shapely.to_wkb(shapes), [heights], ["height_m"], geometry_type="Polygon",
         crs="EPSG:4326",
     )  # fmt: skip

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from calibray import optimizers as optimizers
     from calibray.calibration.calibrate import calibrate as calibrate
     from calibray.calibration.suggest import suggest as suggest
+    from calibray.calibration.validate import validate as validate
     from calibray.fields import path_gains as path_gains
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
