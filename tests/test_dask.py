@@ -17,7 +17,7 @@ import pytest
 import planted
 import programs
 import two_ray
-from calibray import calibrate, engines
+from calibray import calibrate, coverage_map, engines
 from calibray.engines.parts import of_blocks
 from calibray.errors import InputError
 from calibray.measurements import Measurements, links_from_frame
@@ -83,6 +83,18 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
     assert found.rmse_db == pytest.approx(whole.rmse_db, rel=1e-9)
     assert found.offsets_db == pytest.approx(whole.offsets_db, rel=1e-9)
     assert found.links["after_db"].to_numpy() == pytest.approx(whole.links["after_db"].to_numpy(), rel=1e-9)
+
+
+def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster):
+    result = calibrate(two_ray.study(tmp_path, engine={"name": "replay", "block_links": 10}))
+    where = {"tx": (0.0, 0.0, 10.0), "bounds": (20.0, -10.0, 80.0, 10.0), "cell": 5.0}
+    alone = coverage_map(result, **where)
+    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
+        together = coverage_map(result, **where, crew=crew)
+    assert alone.path_loss_db.shape == (4, 12)
+    assert np.isfinite(alone.path_loss_db).all()
+    for name, values in alone.layers.items():
+        assert together.layers[name] == pytest.approx(values, rel=1e-9)
 
 
 def doubled(folder: Path, links: Measurements) -> tuple[int, list[float]]:
