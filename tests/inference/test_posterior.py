@@ -57,9 +57,28 @@ def test_a_basin_that_no_minimum_was_known_of_gets_its_share():
     assert "2 separate ranges" in verdict.reason
 
 
-def test_many_narrow_places_of_each_parameter_are_all_found():
+def test_rounds_go_on_while_draws_are_few_and_more_are_allowed():
+    """A place so narrow that one round does not tell it."""
+    asked: list[int] = []
+
+    def density(points):
+        asked.append(len(points))
+        return -0.5 * np.sum(((points - 0.3) / 0.001) ** 2, axis=1)
+
+    where = np.zeros(4), np.ones(4), np.full((1, 4), 0.8), np.diag(np.full(4, 0.01))[None]
+    few = sample(density, *where, batch=64, rounds=1)
+    assert len(asked) == 2
+    asked.clear()
+    enough = sample(density, *where, batch=64, rounds=1, more=lambda: len(asked) < 60)
+    assert few.flattened
+    assert enough.effective >= 500
+    assert 2 < len(asked) < 60
+
+
+@pytest.mark.parametrize("size", [0.006, 0.003])
+def test_many_narrow_places_of_each_parameter_are_all_found(size):
     """Reflections inside walls: six places for each of four parameters, 1296 together, and one minimum known."""
-    places, size, count = np.linspace(0.1, 0.9, 6), 0.006, 4
+    places, count = np.array([0.1, 0.263, 0.419, 0.58, 0.741, 0.9]), 4
     share = np.arange(1.0, 7.0) / 21.0
 
     def density(points):

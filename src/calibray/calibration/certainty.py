@@ -34,10 +34,13 @@ INTERACTIONS: Final = 100_000_000
 """Interactions times replays that draws may take in any case: some seconds."""
 
 SIZES: Final = ((512, 20), (512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
-"""Points of a round and rounds at most, the first that the cost allows; most posteriors take two to four rounds."""
+"""Points of a round and rounds, the first that the cost allows; most posteriors take two to four rounds."""
 
 SHARED: Final = ((128, 4), (64, 3))
 """The same where several engines share them."""
+
+ROUNDS: Final = 20
+"""Rounds at most, where those before cost less than they might have: noise that explains little asks no replays."""
 
 ALIKE: Final = 0.1
 """Differences of functions that stand in for an engine, by the links' errors, below which their mean does as well."""
@@ -223,21 +226,25 @@ def _from_draws(
     starts = known[order[:BASINS]]
     explaining = explaining.without_negligible(explained)
     wide = _covariances(problem, starts, freedom)
-    (batch, turns), done = size, 0
+    (batch, turns, allowed), done = size, 0
 
     def drawn(engine: Problem) -> Draws:
-        own = replace(explaining, problem=engine)
+        own, before, first = replace(explaining, problem=engine), engine.engine.calls, done
+
+        def more() -> bool:
+            spent = engine.engine.calls - before
+            return done - first <= ROUNDS and spent + batch * explaining.replays <= allowed
 
         def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
             nonlocal done
             done += 1
             if progress is not None:
-                progress("drawing", done, (turns + 1) * len(engines))
+                progress("drawing", done, max(done, (turns + 1) * len(engines)))
             return np.logaddexp.reduce(own(points), axis=1)
 
         return sample(
-            density, lower, upper, starts, wide, batch=batch, rounds=turns, enough=ENOUGH / len(engines),
-            seed=problem.setup.study.method.seed,
+            density, lower, upper, starts, wide, batch=batch, rounds=turns, more=more,
+            enough=ENOUGH / len(engines), seed=problem.setup.study.method.seed,
         )  # fmt: skip
 
     posterior = pooled([drawn(engine) for engine in engines])
@@ -336,15 +343,16 @@ def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: i
     return minima[order]
 
 
-def _size(problem: Problem, spent: int, engines: int, replays: int) -> tuple[int, int] | None:
-    """Points of a round and rounds, as the cost of so many replays each allows; None where not even the fewest do.
+def _size(problem: Problem, spent: int, engines: int, replays: int) -> tuple[int, int, int] | None:
+    """Points of a round, rounds that their cost of so many replays each allows, and replays that may be spent in all.
 
-    Where several engines share the draws, each needs the fewest that do.
+    None where not even the fewest are. Where several engines share the draws, each needs the fewest that do.
     """
     interactions = getattr(problem.engine, "interactions", 1)
     allowed = max(COST * spent, INTERACTIONS // max(interactions, 1)) // engines
     sizes = SIZES if engines == 1 else SHARED
-    return next(((batch, turns) for batch, turns in sizes if batch * (turns + 2) * replays <= allowed), None)
+    fitting = ((batch, turns) for batch, turns in sizes if batch * (turns + 2) * replays <= allowed)
+    return next(((batch, turns, allowed) for batch, turns in fitting), None)
 
 
 def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:

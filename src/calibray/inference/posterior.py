@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 from scipy.special import gammaln
 
 from calibray.optimizers.sampling import design
@@ -39,8 +40,11 @@ TOO_FEW: Final = 20.0
 BLOCK: Final = 256
 """Points that kernels are evaluated at together, so that what is between stays within a core's cache."""
 
-BINS: Final = 200
+BINS: Final = 1600
 """Places of a parameter's range that are told apart where it is taken by itself."""
+
+WIDTHS: Final = (1, 3, 8)
+"""Places that what was learned is spread over, triangles of these half widths taken alike: what fits may be narrow."""
 
 EVEN: Final = 0.1
 """Share of these draws that is spread over the whole range."""
@@ -92,6 +96,7 @@ def sample(
     *,
     batch: int = 512,
     rounds: int = 8,
+    more: Callable[[], bool] = lambda: False,
     enough: float = ENOUGH,
     seed: int = 0,
 ) -> Draws:
@@ -104,7 +109,8 @@ def sample(
         minima: Points that explain the data, from every basin known [k, d].
         covariance: Covariance of the parameters there by curvature [k, d, d].
         batch: Points of a round.
-        rounds: Rounds at most, the first not counted.
+        rounds: Rounds, the first not counted, that are made unless the draws are enough before.
+        more: Whether there may be another round where those were not enough.
         enough: Effective draws after which no further round is made.
         seed: Seed of the random numbers.
 
@@ -133,10 +139,11 @@ def sample(
         weight = np.exp(raw - raw.max())
         weight /= weight.sum()
         draws, turn = Draws(lower + unit * width, found, weight), len(share) - 2
-        if turn == rounds and draws.effective < TOO_FEW:
-            return replace(draws, weight=_flattened(raw), flattened=True)
-        if turn == rounds or (turn and draws.effective >= enough):
+        if turn and draws.effective >= enough:
             return draws
+        if turn >= rounds and not more():
+            few = draws.effective < TOO_FEW
+            return replace(draws, weight=_flattened(raw), flattened=True) if few else draws
         learned = _Learned(_kernels(unit, raw, random), _Apart.of(unit, _flattened(raw)))
         new = inside(learned.draw(batch, random))
         log_parts = [
@@ -227,9 +234,11 @@ class _Apart:
 
     @classmethod
     def of(cls, unit: NDArray[np.float64], weight: NDArray[np.float64]) -> _Apart:
-        share = np.stack([np.histogram(each, BINS, (0.0, 1.0), weights=weight)[0] for each in unit.T])
-        padded = np.pad(share, ((0, 0), (1, 1)), mode="edge")
-        share = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
+        found = np.stack([np.histogram(each, BINS, (0.0, 1.0), weights=weight)[0] for each in unit.T])
+        share = np.zeros_like(found)
+        for width in WIDTHS:
+            triangle = width + 1.0 - np.abs(np.arange(-width, width + 1))
+            share += convolve1d(found, triangle / triangle.sum(), mode="reflect")
         return cls((1.0 - EVEN) * share / share.sum(axis=1, keepdims=True) + EVEN / BINS)
 
     def draw(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
