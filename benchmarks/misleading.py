@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from calibray.cli.console import log
 from calibray.cli.progress import progress_bars
 from calibray.comparison.arena import Arena, family_arena
-from calibray.comparison.comparison import Contender, code, quantile, run_contender
+from calibray.comparison.comparison import quantile
+from calibray.comparison.contender import Contender, code, run_contender
 from calibray.comparison.family import seed_range
 from calibray.comparison.runs import MethodRun, Runs
 from calibray.optimizers.cheap_model import CheapAnswer, CheapModel, Constants

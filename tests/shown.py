@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 
 import synthetic
-from calibray.comparison.comparison import Comparison, Contender
+from calibray.comparison.comparison import Comparison
+from calibray.comparison.contender import Contender
 from calibray.comparison.experiment import Demo
 from calibray.comparison.runs import MethodRun
 from calibray.diagnosis import Check, Diagnosis

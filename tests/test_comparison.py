@@ -14,7 +14,8 @@ from calibray.calibration import calibrate
 from calibray.cli.app import app
 from calibray.comparison import comparison as module
 from calibray.comparison.arena import landscape_arena, study_arena
-from calibray.comparison.comparison import Contender, compare
+from calibray.comparison.comparison import compare
+from calibray.comparison.contender import Contender
 from calibray.comparison.runs import MethodRun, Runs
 from calibray.comparison.tables import table as shown
 from calibray.errors import InputError

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from calibray.cli.app import app
 from calibray.comparison import family as module
 from calibray.comparison.arena import landscape_arena
-from calibray.comparison.comparison import Contender, code
+from calibray.comparison.contender import Contender, code
 from calibray.comparison.family import FamilyComparison, compare_family, seed_range
 from calibray.comparison.family_tables import tables
 from calibray.comparison.runs import MethodRun

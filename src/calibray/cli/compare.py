@@ -80,8 +80,8 @@ def _on_study(
 
     from calibray.cli.progress import progress_bars
     from calibray.comparison.arena import study_arena
-    from calibray.comparison.comparison import Contender
     from calibray.comparison.comparison import compare as run_all
+    from calibray.comparison.contender import Contender
     from calibray.comparison.tables import optimum, table
     from calibray.files import check_outputs
     from calibray.reporting.excess import FILES, write

@@ -6,14 +6,9 @@ least squares from very many starts, or of any run that found a lower one.
 
 from __future__ import annotations
 
-import hashlib
-import re
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
@@ -23,8 +18,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray import optimizers
-from calibray.calibration.search import rounds
 from calibray.comparison.arena import Arena
+from calibray.comparison.contender import MOST, Contender, code, recorded, run_contender
 from calibray.comparison.runs import MethodRun, Runs
 from calibray.comparison.tables import summary
 from calibray.errors import InputError
@@ -40,85 +35,8 @@ ROUNDING_DB: Final = 1e-7  # below which objectives are taken for equal
 OPTIMUM: Final = "optimum"  # the run that finds it, among the runs kept
 REFERENCE: Final = "least-squares"  # which finds it
 OPTIMUM_STARTS: Final = {False: 2048, True: 64}  # its local searches on small and on large path programs
-MOST: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}  # beyond which no comparison ends
 
 Open = Callable[[], Arena]
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A method in a comparison.
-
-    Attributes:
-        name: Its name in tables, as it was asked for.
-        method: Its name in `METHODS`.
-        budget: RT calls that it may use.
-    """
-
-    name: str
-    method: str
-    budget: int
-
-    @property
-    def endless(self) -> bool:
-        """Whether the method has no budget to keep to, but stops by itself."""
-        return METHODS[self.method].schedule is None
-
-    @staticmethod
-    def parse(name: str, budget: int) -> Contender:
-        """Read a method as it is asked for.
-
-        Args:
-            name: A method, or `METHOD@CALLS` for a budget of its own.
-            budget: RT calls of those without one.
-
-        Returns:
-            The contender.
-
-        Raises:
-            InputError: There is no such method, or the budget is no whole number, or too small.
-
-        Example:
-            >>> Contender.parse("gwo@600", 225)
-            Contender(name='gwo@600', method='gwo', budget=600)
-        """
-        method, _, own = name.partition("@")
-        schedule = optimizers.method(method).schedule
-        if own:
-            with suppress(ValueError):
-                budget = int(own)
-        least = 1 if schedule is None else schedule.least
-        if (own and own != str(budget)) or not least <= budget <= MOST["budget"]:
-            raise InputError(
-                f"method {name!r}: a budget of {own or budget} RT calls; it must be a whole number of {least} to "
-                f"{MOST['budget']:,}"
-            )
-        return Contender(name, method, budget)
-
-    def optimizer(self, arena: Arena, seed: int) -> Optimizer:
-        """The optimizer of a run.
-
-        Args:
-            arena: The problem.
-            seed: The run's seed.
-
-        Returns:
-            An optimizer that asks for no more than the budget; least squares stops by itself.
-
-        Raises:
-            InputError: The method does not fit the problem, or its library is not installed.
-        """
-        return optimizers.make(
-            self.method,
-            arena.lower,
-            arena.upper,
-            seed,
-            budget=self.budget,
-            start=arena.start,
-            starts=arena.starts,
-            screen=arena.screen,
-            model=None if arena.model is None else arena.model(),
-        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -283,7 +201,7 @@ def compare(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Comparison:
-    """MethodRun methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
+    """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
 
     Every finished run is appended to `runs.jsonl` in `out` at once; what is found there of the same problem, code of
     the optimizers, method, budget and seed is not run again.
@@ -315,7 +233,7 @@ def compare(
         contender.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
     store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{code()}")
     tasks = [(contender, seed) for seed in range(seeds) for contender in contenders]
-    missing = [task for task in tasks if store.find(*_key(*task)) is None]
+    missing = [(each, seed) for each, seed in tasks if store.find(*each.key(seed)) is None]
     done = len(tasks) - len(missing)
     for run in _finished(open_arena, arena, missing, workers):
         store.add(run)
@@ -326,47 +244,11 @@ def compare(
     if best is None:
         best = store.add(_optimum(arena))
     found = {
-        contender.name: [store.find(*_key(contender, seed)) for seed in range(seeds)]
+        contender.name: [store.find(*contender.key(seed)) for seed in range(seeds)]
         for contender in contenders
     }
     runs = {name: tuple(run for run in each if run is not None) for name, each in found.items()}
     return Comparison(arena.name, contenders, runs, *_lowest(arena.minimum, best, runs))
-
-
-def run_contender(arena: Arena, contender: Contender, seed: int) -> MethodRun:
-    """One run of a method.
-
-    Args:
-        arena: The problem.
-        contender: The method.
-        seed: Its seed.
-
-    Returns:
-        The run; a method or an engine that raised ends it there, with the message kept.
-    """
-    return _recorded(arena, _key(contender, seed), lambda: contender.optimizer(arena, seed))
-
-
-def _recorded(arena: Arena, key: tuple[str, int, int], make: Callable[[], Optimizer]) -> MethodRun:
-    calls: list[int] = []
-    best: list[float] = []
-    evaluations, failure, started = 0, "", time.perf_counter()
-    try:
-        optimizer = make()
-        for _, told in rounds(optimizer, arena.evaluate):
-            for value in told.value.tolist():
-                evaluations += 1
-                if value < (best[-1] if best else np.inf):
-                    calls.append(evaluations)
-                    best.append(value)
-    except Exception as error:  # a run that fails is a finding about its method
-        failure = f"{type(error).__name__}: {error}"
-    seconds = time.perf_counter() - started
-    return MethodRun(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
-
-
-def _key(contender: Contender, seed: int) -> tuple[str, int, int]:
-    return contender.method, contender.budget, seed
 
 
 def _optimum(arena: Arena) -> MethodRun:
@@ -376,7 +258,7 @@ def _optimum(arena: Arena) -> MethodRun:
     def make() -> Optimizer:
         return optimizers.make(REFERENCE, arena.lower, arena.upper, 2**31, start=arena.start, starts=starts)
 
-    return _recorded(arena, (OPTIMUM, 0, 0), make)
+    return recorded(arena, (OPTIMUM, 0, 0), make)
 
 
 def _lowest(known: float, best: MethodRun, runs: dict[str, tuple[MethodRun, ...]]) -> tuple[float, str]:
@@ -414,32 +296,3 @@ def _start(open_arena: Open) -> None:
 
 def _work(contender: Contender, seed: int) -> MethodRun:
     return run_contender(_opened, contender, seed)
-
-
-@cache
-def code(method: str | None = None) -> str:
-    """Fingerprint of the optimizers' code: a run of other code says nothing about this one.
-
-    Args:
-        method: The method whose code alone matters, with all that it imports; None for all methods.
-
-    Returns:
-        The first digits of a SHA-256 in hexadecimal.
-    """
-    folder = Path(optimizers.__file__).parent
-    found = set(folder.glob("*.py")) if method is None else set()
-    waiting = [] if method is None else [METHODS[method].__module__.rpartition(".")[2]]
-    while waiting:
-        file = folder / f"{waiting.pop()}.py"
-        if file.is_file() and file not in found:
-            found.add(file)
-            waiting += re.findall(
-                r"^from calibray\.optimizers\.(\w+) import", file.read_text("utf-8"), re.MULTILINE
-            )
-            waiting += re.findall(
-                r"^from calibray\.optimizers import (\w+)$", file.read_text("utf-8"), re.MULTILINE
-            )
-    digest = hashlib.sha256()
-    for path in sorted(found):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]

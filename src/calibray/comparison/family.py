@@ -20,7 +20,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.comparison.arena import Arena, family_arena
-from calibray.comparison.comparison import MOST, Contender, code, quantile, run_contender
+from calibray.comparison.comparison import quantile
+from calibray.comparison.contender import MOST, Contender, code, run_contender
 from calibray.comparison.runs import MethodRun, Runs
 from calibray.errors import InputError
 from calibray.files import check_folder
