@@ -14,6 +14,7 @@ from calibray.optimizers.cheap_model import Constants, Differenced
 from calibray.optimizers.corrected import constants_fit, correct
 from calibray.optimizers.discrepancy import Seen
 from calibray.optimizers.sampling import design
+from calibray.optimizers.space_mapping import HELPFUL, misleading
 
 LOWER, UPPER = np.array([1.5, 1.5]), np.array([12.0, 9.0])
 RNG = np.random.default_rng(5)
@@ -166,6 +167,18 @@ def test_errors_beyond_what_was_expected_stretch_what_is_expected_next():
     assert track.stretch == pytest.approx(0.5 * (1.0 + 8.0))
     track.note(np.zeros(4), 1e-30, np.full(4, 4.0))
     assert track.stretch == pytest.approx((1.0 + 8.0 + CAPPED) / 3.0)
+
+
+def test_a_cheap_model_is_judged_by_its_middling_link():
+    box, cloud = Box.between(LOWER, UPPER), design("sobol", 64, 2, np.random.default_rng(2))
+    unit = design("sobol", 4, 2, np.random.default_rng(0))
+    residuals = answered(box.from_unit(unit))
+    helps = correct(cheap(1.1), box, unit, residuals, cloud, np.zeros((0, 1)))
+    assert misleading(helps) < HELPFUL
+    assert misleading(correct(noise(), box, unit, residuals, cloud, np.zeros((1, 0)))) > HELPFUL
+    wild = residuals.copy()
+    wild[:, :5] = 30.0 * np.random.default_rng(7).standard_normal((4, 5))  # five links that nothing foretells
+    assert misleading(correct(cheap(1.1), box, unit, wild, cloud, np.zeros((0, 1)))) < HELPFUL
 
 
 def test_a_cheap_model_of_pure_noise_costs_three_calls_at_most():

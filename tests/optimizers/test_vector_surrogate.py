@@ -94,6 +94,10 @@ def test_points_told_before_count_as_initial_design():
     partly = VectorSurrogate(STREET.lower, STREET.upper)
     partly.tell(x[:3], *STREET.evaluate(x[:3])[:2])
     assert len(partly.ask()) == 5
+    clumped = VectorSurrogate(STREET.lower, STREET.upper)
+    near = x[0] + 0.01 * (x[:3] - x[0])
+    clumped.tell(near, *STREET.evaluate(near)[:2])
+    assert len(clumped.ask()) == 7  # they say no more than one point does
     flat = VectorSurrogate(STREET.lower, STREET.upper, budget=12)
     x[:, 1] = 4.0  # these points say nothing about the second parameter
     flat.tell(x, *STREET.evaluate(x)[:2])

@@ -222,6 +222,7 @@ def descended(
     evaluate: Callable[[NDArray[np.float64]], Residuals],
     steps: int,
     tolerance: float,
+    catch_up: float = 1e30,
 ) -> Starts:
     """Descend from many points of the unit cube.
 
@@ -230,11 +231,12 @@ def descended(
         evaluate: Residuals and their Jacobian.
         steps: Largest number of steps.
         tolerance: Relative decrease of the cost at which a search has converged.
+        catch_up: Predicted decreases that a search may lie behind the lowest one; farther behind it is given up.
 
     Returns:
         Where the searches ended.
     """
-    descent = descend(unit, steps, tolerance)
+    descent = descend(unit, steps, tolerance, catch_up)
     point = next(descent)
     while True:
         try:

@@ -41,7 +41,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import cdist, pdist
 from scipy.stats import spearmanr
 
 from calibray.errors import InputError
@@ -93,7 +93,7 @@ class VectorSurrogate(Optimizer):
         seed: Seed of the one random generator.
         budget: Number of evaluations, 20 d if None.
         initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None; points told before the first
-            `ask` count.
+            `ask` count, those less than half of the design's spacing apart as one.
         batch: Candidates asked for at once after the initial design, for engines that run in parallel.
         logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
@@ -168,10 +168,10 @@ class VectorSurrogate(Optimizer):
 
     def _search(self, archive: Archive) -> Search:
         d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
-        missing = min(left, max(self.initial - len(archive), 0))
-        if missing:
-            yield self._from_unit(maximin_design(missing, d, self._rng))
-            left -= missing
+        missing = self._design(self._to_unit(archive.all().x) if len(archive) else np.empty((0, d)))[:left]
+        if len(missing):
+            yield self._from_unit(missing)
+            left -= len(missing)
         while left > 0 and quiet < PATIENCE:
             count = min(self.batch, left)
             told = archive.all()
@@ -188,6 +188,16 @@ class VectorSurrogate(Optimizer):
                 quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
             yield self._from_unit(chosen)
             left, turn = left - count, turn + count
+
+    def _design(self, told: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The initial design [k, d], in which points told [n, d] that are not clumped stand for those next to them."""
+        points = maximin_design(self.initial, self.box.dimension, self._rng)
+        apart, counted = 0.5 * float(pdist(points).min()), told[:0]
+        for point in told:
+            if len(points) and (_separation(point[None], counted) >= apart if len(counted) else True):
+                counted = np.vstack([counted, point])
+                points = np.delete(points, np.argmin(cdist(point[None], points)), axis=0)
+        return points
 
     def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
         """A model of all points, on new scales if they have grown enough in number to tell better."""
