@@ -222,7 +222,6 @@ def descended(
     evaluate: Callable[[NDArray[np.float64]], Residuals],
     steps: int,
     tolerance: float,
-    catch_up: float = 1e30,
 ) -> Starts:
     """Descend from many points of the unit cube.
 
@@ -231,12 +230,11 @@ def descended(
         evaluate: Residuals and their Jacobian.
         steps: Largest number of steps.
         tolerance: Relative decrease of the cost at which a search has converged.
-        catch_up: Predicted decreases that a search may lie behind the lowest one; farther behind it is given up.
 
     Returns:
         Where the searches ended.
     """
-    descent = descend(unit, steps, tolerance, catch_up)
+    descent = descend(unit, steps, tolerance)
     point = next(descent)
     while True:
         try:
