@@ -177,16 +177,15 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     problem = replace(problem, objective=objective)
     trail = search(problem, LeastSquares(lower, upper, starts=starts, seed=turn))
     told = certainty(problem, trail)
-    draws, found = told.posterior, []
-    if draws is None:
+    draws, means, found = told.posterior, told.means, []
+    if draws is None or means is None:
         raise RuntimeError(f"{name}, {world}, {turn}: no draws; {told.remarks}")
     known_weight = _known(district, world, problem, draws) if known.all() and not draws.flattened else None
     narrow = draws.weight * np.exp((UNDERSTATED - 1) * (draws.density - draws.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
         value = draws.point[:, k]
-        sets = dict(
-            zip(map(str, LEVELS), credible_sets(value, draws.weight, lower[k], upper[k], LEVELS), strict=True)
-        )
+        told_sets = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], LEVELS)
+        sets = dict(zip(map(str, LEVELS), told_sets, strict=True))
         control = credible(value, narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
         luck = None
         if known_weight is not None:

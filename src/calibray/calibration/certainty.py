@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from calibray.calibration.buildings import over_buildings
 from calibray.calibration.cheap import ReplayedModel
 from calibray.calibration.explaining import Explaining, has_offset
+from calibray.calibration.noting import contradicted, departures, missed
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Trail, rounds
 from calibray.calibration.stand_in import ensemble
 from calibray.engines.observable import PATH_LOSS
 from calibray.inference.intervals import CONFIDENCE, Interval, intervals
-from calibray.inference.marginal import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 from calibray.inference.nuisance import Nuisance, make_term
 from calibray.inference.posterior import ENOUGH, Draws, pooled, sample
 from calibray.inference.verdicts import verdicts
@@ -57,6 +58,9 @@ BASINS: Final = 24
 LIKELY: Final = 20.0
 """Excess of the sum of squares, in variances of the noise, up to which a minimum may matter."""
 
+WEIGHED: Final = 250
+"""Draws that models of the noise are weighed at."""
+
 KEPT: Final = 128
 """Draws that are kept with the result."""
 
@@ -72,20 +76,11 @@ NOTED_DB: Final = 0.1
 EXACT_DB: Final = 1e-6
 """RMSE of data without noise, which tell everything [dB]."""
 
-SURE: Final = 0.5
-"""Weight from which on a departure from independent Gaussian errors is said aloud."""
-
 ROUGH: Final = (
     "Draws that explain the data are too few among so many parameters: intervals are rough, and wider than the data "
     "tell. Calibrate fewer parameters, or give them priors."
 )
 """Said where the posterior was flattened."""
-
-DEPARTURES: Final = {
-    CORRELATED: "Errors of neighbouring links are alike",
-    HEAVY: "Errors have heavy tails, as outliers make them",
-    DIFFERING: "Errors grow where materials matter more, as where walls of one material differ",
-}
 
 
 @dataclass(frozen=True)
@@ -95,7 +90,8 @@ class Certainty:
     Attributes:
         intervals: Interval and verdict by parameter.
         draws: Values of the parameters, by name, that explain the data about as well as those found.
-        posterior: All draws, in the search space; None where none were made.
+        posterior: All draws, in the search space, of what explains the links; None where none were made.
+        means: The same of what buildings have on the mean, where those that were seen may differ from it.
         noise: Weights of the kinds of noise, and of a forgotten offset.
         free_offset_db: The offset that fits best beside the study's model, where that has none [dB].
         free_offset_error_db: Its standard error [dB].
@@ -107,6 +103,7 @@ class Certainty:
     intervals: dict[str, Interval] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
     posterior: Draws | None = None
+    means: Draws | None = None
     noise: dict[str, float] = field(default_factory=dict)
     free_offset_db: float | None = None
     free_offset_error_db: float | None = None
@@ -215,6 +212,7 @@ def _from_draws(
         crowd = f"for more than {LINKS:,} links, errors that neighbours share are not looked at"
         return replace(offset, intervals=_by_curvature(local, crowd))
     explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
+    tried = explaining.marginal.models
     size = _size(problem, spent, len(engines), explaining.replays)
     if size is None:
         dear = "draws would cost more than five calibrations"
@@ -248,6 +246,10 @@ def _from_draws(
         )  # fmt: skip
 
     posterior = pooled([drawn(engine) for engine in engines])
+    point = posterior.resampled(WEIGHED)
+    each = explaining(point)
+    noise = explaining.kinds(np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)))
+    means = over_buildings(explaining, posterior, point, each, tried)
 
     def shown(index: int, value: float) -> float:
         point = lower.copy()
@@ -260,7 +262,7 @@ def _from_draws(
         return float(parameters.to_unit(point)[index])
 
     told = verdicts(
-        posterior, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
+        means, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
         level=CONFIDENCE, shown=shown,
     )  # fmt: skip
     found = {}
@@ -271,15 +273,20 @@ def _from_draws(
         )
         if posterior.flattened:
             found[name] = widened(found[name], local[name], lambda value, k=index: in_unit(k, value))
-    noise = explaining.weights(posterior.resampled(200))
-    missed = _missed(problem, posterior, trail) if problem in engines else ()
+    behind = float(posterior.density.max() - np.logaddexp.reduce(explained[0]))
+    best = parameters.named(trail.best)
+    said = (
+        *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
+        *contradicted(problem, best, found, behind, noise), *(ROUGH,) * posterior.flattened,
+    )  # fmt: skip
     return replace(
         offset,
         intervals=found,
         draws=_draws(problem, posterior),
         posterior=posterior,
+        means=means,
         noise=noise,
-        remarks=(*offset.remarks, *_departures(noise), *missed, *(ROUGH,) * posterior.flattened),
+        remarks=said,
     )
 
 
@@ -365,28 +372,6 @@ def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
         return named
     coefficients = problem.objective.coefficients(problem.modelled(found))
     return named | dict(zip(columns, coefficients.T.tolist(), strict=True))
-
-
-def _departures(noise: dict[str, float]) -> tuple[str, ...]:
-    """Said where errors are likely not independent and Gaussian."""
-    return tuple(
-        f"{said} (weight {noise[kind]:.2f}, independent Gaussian errors {noise.get(GAUSSIAN, 0.0):.2f}); intervals "
-        "allow for it."
-        for kind, said in DEPARTURES.items()
-        if noise.get(kind, 0.0) > SURE
-    )
-
-
-def _missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[str, ...]:
-    """Said where draws lie below what the method found."""
-    top = posterior.point[np.argsort(-posterior.density)[:16]]
-    lowest = float(problem.squares(top).value.min())
-    if lowest > trail.best_value - 0.01:
-        return ()
-    return (
-        f"The method missed the optimum: draws reach {lowest:.2f} dB, it found {trail.best_value:.2f} dB; intervals "
-        "are those around the optimum.",
-    )
 
 
 def _free_offset(

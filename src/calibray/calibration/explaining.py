@@ -107,19 +107,17 @@ class Explaining:
         """Replays that one point takes."""
         return 1 + (len(corners(len(self.problem.parameters))) if self.marginal.spread else 0)
 
-    def weights(self, points: NDArray[np.float64]) -> dict[str, float]:
+    def kinds(self, share: NDArray[np.float64]) -> dict[str, float]:
         """What speaks for each kind of noise, and for a forgotten offset.
 
         Args:
-            points: Draws of equal weight [n, d].
+            share: Weights of the models at draws of equal weight [n, models].
 
         Returns:
             Weights by kind, adding up to one, and that of "offset" where one may have been forgotten.
         """
-        each = self(points)
-        share = np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)).mean(axis=0)
         found: dict[str, float] = {}
-        for model, weight in zip(self.marginal.models, share.tolist(), strict=True):
+        for model, weight in zip(self.marginal.models, share.mean(axis=0).tolist(), strict=True):
             found[model.kind] = found.get(model.kind, 0.0) + weight
             if not has_offset(self.problem):
                 found["offset"] = found.get("offset", 0.0) + weight * model.offset
