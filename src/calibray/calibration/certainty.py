@@ -274,10 +274,11 @@ def _from_draws(
         if posterior.flattened:
             found[name] = widened(found[name], local[name], lambda value, k=index: in_unit(k, value))
     behind = float(posterior.density.max() - np.logaddexp.reduce(explained[0]))
-    best = parameters.named(trail.best)
+    top = posterior.point[np.argmax(posterior.density)]
+    best, likeliest = parameters.named(trail.best), parameters.named(parameters.from_search(top))
     said = (
         *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
-        *contradicted(problem, best, found, behind, noise), *(ROUGH,) * posterior.flattened,
+        *contradicted(problem, best, found, likeliest, behind, noise), *(ROUGH,) * posterior.flattened,
     )  # fmt: skip
     return replace(
         offset,

@@ -79,6 +79,7 @@ def contradicted(
     problem: Problem,
     found: Mapping[str, float],
     told: Mapping[str, Interval],
+    likeliest: Mapping[str, float],
     behind: float,
     noise: Mapping[str, float],
 ) -> tuple[str, ...]:
@@ -88,7 +89,8 @@ def contradicted(
         problem: The problem.
         found: The values of the least RMSE, by parameter.
         told: The intervals.
-        behind: Logarithm of the density of the best draw over that of these values.
+        likeliest: The values of the best draw, by parameter.
+        behind: Logarithm of the density of the best draw over that of the least RMSE.
         noise: Weights of the kinds of noise.
 
     Returns:
@@ -100,16 +102,18 @@ def contradicted(
         slack = SLACK * (parameter.upper - parameter.lower)
         if pieces and not any(low - slack <= value <= high + slack for low, high in pieces):
             ranges = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
-            outside.append(f"{parameter.name} {value:.4g} (interval {ranges})")
+            outside.append(
+                f"{parameter.name} {value:.4g}, interval {ranges}, likeliest {likeliest[parameter.name]:.4g}"
+            )
     if not outside:
         return ()
     kinds = {kind: noise.get(kind, 0.0) for kind in CAUSES}
     cause = CAUSES[max(kinds, key=kinds.__getitem__)]
-    ratio = float(np.exp(min(behind, np.log(MOST))))
+    ratio = float(np.exp(np.clip(behind, 0.0, np.log(MOST))))
     times = f"more than {MOST:,.0f}" if ratio >= 0.999 * MOST else f"{ratio:.2g}"
     return (
-        f"The values of the least RMSE lie outside their own intervals: {'; '.join(outside)}. The RMSE takes the errors "
-        f"of all links as independent; intervals do not, for {cause}, and other values are {times} times as likely. "
-        "Predictions go by the values of the least RMSE unless blocks held out speak for another model: say [holdout] "
-        "blocks = 4, and do not take these values for the material's.",
+        f"The least RMSE is not where the links are explained best: {'; '.join(outside)}. The RMSE takes the errors of "
+        f"all links as independent; intervals do not, for {cause}, and the likeliest values are {times} times as "
+        "likely. Predictions go by the least RMSE unless blocks held out speak for another model: say [holdout] "
+        "blocks = 4, and do not take its values for the materials'.",
     )

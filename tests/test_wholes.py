@@ -1,0 +1,72 @@
+"""Which building a place belongs to, told by what touches in plan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import planted
+from calibray.calibration.buildings import buildings
+from calibray.calibration.problem import Problem
+from calibray.measurements import links_from_frame
+from calibray.scenes.triangles import Triangles
+from calibray.scenes.wholes import wholes
+from calibray.study import Setup, Study
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+CORNERS = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def upright(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+    """The four walls of a box, 10 m high [8, 3, 3]."""
+    plan = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    walls = []
+    for start, end in zip(plan, np.roll(plan, -1, axis=0), strict=True):
+        foot, top = np.array([*start, 0.0]), np.array([*end, 10.0])
+        walls += [[foot, [*end, 0.0], top], [foot, top, [*start, 10.0]]]
+    return np.array(walls)
+
+
+def scene(*boxes: np.ndarray) -> Triangles:
+    """The boxes as one mesh over a ground that reaches under all of them."""
+    ground = (SQUARE * [400, 400, 0] - [200, 200, 0])[CORNERS]
+    corners = np.concatenate([ground, *boxes])
+    flat = np.arange(len(corners)) < len(ground)
+    face = np.arange(3 * len(corners)).reshape(-1, 3)
+    return Triangles(corners.reshape(-1, 3), face, np.zeros(len(corners), dtype=int), flat)
+
+
+def test_streets_part_buildings_and_what_touches_is_one():
+    found = scene(upright((0, 0), (20, 10)), upright((20.0, 0), (40, 10)), upright((45, 0), (60, 10)))
+    first, second, beside, inside = wholes(
+        found, np.array([[0.0, 5.0, 3.0], [40.0, 5.0, 3.0], [45.0, 5.0, 3.0], [52.0, 5.0, 10.0]])
+    )
+    assert first == second
+    assert beside == inside  # on the roof, away from every edge
+    assert first != beside
+
+
+def test_a_scene_of_ground_alone_has_none():
+    assert wholes(scene(), np.zeros((2, 3))).tolist() == [-1, -1]
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    study = Study.from_content(planted.content("links.csv"))
+    links = planted.links().assign(path_loss_db=planted.path_loss())
+    return Problem.of(Setup.open(study, links=links_from_frame(links)), planted.engine())
+
+
+def test_derivatives_by_single_buildings_add_up(problem):
+    """Over all buildings, and what is none, they are those by the material's constant."""
+    apart = buildings(problem)
+    assert apart is not None
+    candidates = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
+    found = apart.slopes(candidates)
+    _, whole = problem.engine.path_loss_and_jacobian(candidates)
+    for index in range(3):
+        together = found[:, :, apart.owner == index].sum(axis=2)
+        assert together == pytest.approx(whole[:, :, index] * candidates[:, None, index], abs=1e-9)
+    # Concrete is the ground here, which is one and does not differ from itself.
+    assert set(apart.building[apart.owner == 0]) == {-1}
+    assert (apart.building[apart.owner > 0] >= 0).all()
