@@ -9,6 +9,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from calibray.inference import tails
 from calibray.inference.marginal import OFFSET_DB, Differing, Marginal, NoiseModel, corners, noise_models
 from calibray.inference.neighbours import whitener
 
@@ -68,12 +69,55 @@ def test_a_forgotten_offset_has_its_prior():
     assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
 
 
-def test_student_is_near_its_integral():
-    def log_density(offset, size):
-        return (student.logpdf((GAP - offset) / size, 4) - np.log(size)).sum(axis=-1)
+def _mixed(error):
+    return np.logaddexp(np.log(0.9) + norm.logpdf(error), np.log(0.1) + norm.logpdf(error, scale=7.0))
 
-    found = marginal((NoiseModel("student-t", 1.0, freedom=4.0),), np.ones((COUNT, 1))).densities(GAP[None])
-    assert found[0, 0] == pytest.approx(integral(log_density), abs=0.15)
+
+@pytest.mark.parametrize(
+    ("model", "tail", "within"),
+    [
+        (NoiseModel("student-t", 1.0, freedom=4.0), lambda error: student.logpdf(error, 4), 0.25),
+        (NoiseModel("student-t", 1.0, gross=True), _mixed, 0.25),
+    ],
+)
+def test_heavy_tails_are_near_their_integral(model, tail, within):
+    """Over 40 links, four of them far off; with few, Laplace's approximation is rough."""
+    random = np.random.default_rng(3)
+    gap = 2.0 * random.standard_normal(40) + 20.0 * (np.arange(40) < 4)
+
+    def log_density(offset, size):
+        return (tail((gap - offset) / size) - np.log(size)).sum(axis=-1)
+
+    many = random.uniform(0, 100, (40, 3))
+    found = marginal((model,), np.ones((40, 1)), position=many).densities(gap[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=within)
+
+
+@pytest.mark.parametrize("tail", [tails.student(4.0), tails.gross()])
+def test_tails_are_densities_with_their_information(tail):
+    """By quadrature; the weight is the derivative of the logarithm."""
+    error = np.linspace(-200, 200, 400_001)
+    density = np.exp(tail.log_density(error**2))
+    assert np.trapezoid(density, error) == pytest.approx(1.0, abs=1e-3)
+    slope = np.gradient(np.log(density), error)
+    near = np.abs(error) < 30
+    assert (-error * tail.weight(error**2))[near] == pytest.approx(slope[near], abs=1e-3)
+    assert np.trapezoid(density * slope**2, error) == pytest.approx(tail.location, rel=1e-3)
+    assert np.trapezoid(density * (1 + error * slope) ** 2, error) == pytest.approx(tail.size, rel=2e-3)
+
+
+def test_gross_errors_speak_for_themselves():
+    """One link of ten 20 dB off: neither Student's t nor Gaussian errors explain it as well."""
+    random = np.random.default_rng(5)
+    position = random.uniform(0, 600, (60, 2))
+    gap = 3 * random.standard_normal(60) + 20.0 * (np.arange(60) % 10 == 0)
+    models = noise_models(position, offset=False)
+    found = marginal(models, position=position, noise_db=3.0).densities(
+        gap[None], Differing(np.zeros((1, 60)), np.ones((1, 60)))
+    )[0]
+    assert models[int(np.argmax(found))].gross
+    assert not any(model.gross for model in noise_models(position, unheard=True))
+    assert not any(model.gross for model in noise_models(position, kind="student-t"))
 
 
 def test_neighbours_stand_for_all_where_links_are_many():

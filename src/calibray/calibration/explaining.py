@@ -71,6 +71,7 @@ class Explaining:
             range_m=0.0 if unheard.any() else None if section.range_m == "auto" else float(section.range_m),
             spread=None if section.heterogeneity == "auto" else float(section.heterogeneity),
             offset=not has_offset(problem),
+            unheard=bool(unheard.any()),
         )
         if len(counted) < FEWEST:
             models = noise_models(

@@ -16,7 +16,7 @@ derivative.
 
 Whether buildings differ is no alternative to errors that neighbours share or that have heavy tails: draws of every kind
 of noise are moved. How likely each spread is, is told by those two kinds of noise that differ in nothing else, as far
-as these explain the data; as far as others do, it is as likely as it was before.
+as these explain the data; as far as others do, it is as likely as before: that buildings differ, as that they do not.
 """
 
 from __future__ import annotations
@@ -96,8 +96,9 @@ def spreads(
             list(zip(models, told.tolist(), strict=True)),
         )
     )
-    evidence = np.where(before > 0, np.maximum(after, 1e-6) / np.maximum(before, 1e-300), 1.0)
-    odds = before * evidence ** min(1.0, float(after.sum()))
+    evidence = np.maximum(after, 1e-6) / np.where(before > 0, before, 1.0)
+    prior = before * np.where(choices > 0, before[0] / before[1:].sum(), 1.0) if before[0] else before
+    odds = prior * evidence ** min(1.0, float(after.sum()))
     place = (random.random((len(share), 1)) > np.cumsum(share, axis=1)[:, :-1]).sum(axis=1)
     other = random.choice(choices, len(share), p=odds / odds.sum())
     own = np.array([model.spread for model in models])[place]

@@ -11,8 +11,8 @@ errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
-f being the number of links less that of columns with a flat prior. With Student's t both are taken by Laplace's
-approximation at the mode, with Fisher's information.
+f being the number of links less that of columns with a flat prior. With heavy tails both are taken by Laplace's
+approximation (`tails.py`).
 
 Heterogeneity: where a material's constant differs from building to building by a factor exp(tau z), a link's path loss
 is another one on average, and varies about it. Both are taken from the corners of a two-level factorial design,
@@ -34,6 +34,7 @@ from scipy.special import gammaln
 
 from calibray.inference.censored import log_evidence
 from calibray.inference.neighbours import Whitener, pairwise, whitener
+from calibray.inference.tails import evidence, gross, products, regular, student
 
 OFFSET_DB: Final = 10.0
 """Standard deviation of an offset that was forgotten, as of cables and gains [dB]."""
@@ -50,15 +51,13 @@ FREEDOMS: Final = (2.0, 4.0)
 SPREADS: Final = (0.07, 0.15, 0.3)
 """Spreads of a material between buildings."""
 
-STEPS: Final = 25
-"""Steps to the mode of Student's t."""
-
 DEPARTURE: Final = 2.0
 """Weight of each departure from independent Gaussian errors, beside theirs of one: measured errors rarely are."""
 
 NEGLIGIBLE: Final = 1e-3
 """Weight of a model below which it is left out."""
 
+# Of errors with heavy tails, whichever they have.
 GAUSSIAN, CORRELATED, HEAVY, DIFFERING = "gaussian", "correlated", "student-t", "heterogeneous"
 
 
@@ -102,6 +101,7 @@ class NoiseModel:
         range_m: Range of correlation [m], if "correlated".
         share: Share of the variance that neighbours have in common, if "correlated".
         freedom: Degrees of freedom, if "student-t".
+        gross: Whether errors are Gaussian but for some gross ones in place of Student's, if "student-t".
         spread: Spread of a material between buildings, if "heterogeneous".
     """
 
@@ -111,6 +111,7 @@ class NoiseModel:
     range_m: float = 0.0
     share: float = 0.0
     freedom: float = np.inf
+    gross: bool = False
     spread: float = 0.0
 
 
@@ -121,6 +122,7 @@ def noise_models(
     range_m: float | None = None,
     spread: float | None = None,
     offset: bool = True,
+    unheard: bool = False,
 ) -> tuple[NoiseModel, ...]:
     """The models of noise that are tried, each departure from independent Gaussian errors weighed alike.
 
@@ -130,6 +132,7 @@ def noise_models(
         range_m: Range of correlation [m], 0 for none; several are tried if None.
         spread: Spread of materials between buildings, 0 for none; several are tried if None.
         offset: Whether an offset may have been forgotten.
+        unheard: Whether some links were not heard: how likely that is, is not told where some errors are gross.
 
     Returns:
         The models; their weights add up to one.
@@ -141,7 +144,8 @@ def noise_models(
     if kind != HEAVY and ranges and not spread:
         found.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
     if kind != GAUSSIAN and not range_m and not spread:
-        found.append([NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS])
+        tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
+        found.append(tails if kind == HEAVY or unheard else [*tails, NoiseModel(HEAVY, 1.0, gross=True)])
     if kind != HEAVY and spread != 0 and not range_m:
         found.append(
             [NoiseModel(DIFFERING, 1.0, spread=s) for s in (SPREADS if spread is None else (spread,))]
@@ -249,7 +253,8 @@ class Marginal:
             if self.unheard.any():
                 value = self._censored(gap, model, design, ridge, differing, good)
             elif model.kind == HEAVY:
-                value = _student(gap, design, ridge / self.noise_db, model.freedom)
+                tail = gross() if model.gross else student(model.freedom)
+                value = evidence(gap, design, ridge / self.noise_db, tail)
             elif model.kind == DIFFERING:
                 shift, weight = self._spread_out(model, differing, good)
                 value = _weighted(gap - shift, design, ridge, weight)
@@ -325,7 +330,7 @@ def _plain(
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:
-        factor = np.linalg.cholesky(_regular(design.T @ design + np.diag(ridge**2)))
+        factor = np.linalg.cholesky(regular(design.T @ design + np.diag(ridge**2)))
         square = square - np.sum(np.linalg.solve(factor, design.T @ gap.T) ** 2, axis=0)
         log_root = float(np.log(np.diag(factor)).sum())
     return _constant(freedom, ridge) - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
@@ -341,7 +346,7 @@ def _weighted(
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(weight * gap**2, axis=1), 0.0
     if design.shape[1]:
-        matrix = _regular(_products(design, weight) + np.diag(ridge**2))
+        matrix = regular(products(design, weight) + np.diag(ridge**2))
         side = (weight * gap) @ design
         square = square - np.einsum("nq,nq->n", side, np.linalg.solve(matrix, side[..., None])[..., 0])
         log_root = 0.5 * np.linalg.slogdet(matrix)[1]
@@ -349,50 +354,3 @@ def _weighted(
     return (
         _constant(freedom, ridge) + log_weight - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
     )
-
-
-def _student(
-    gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64], freedom: float
-) -> NDArray[np.float64]:
-    """Log density of errors of Student's t, by Laplace's approximation; the ridge is one over priors' spreads [n]."""
-    links, columns = gap.shape[1], design.shape[1]
-    scale = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
-    scale = np.maximum(scale, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
-    left, found = gap, np.zeros((len(gap), columns))
-    for _ in range(STEPS):
-        # K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881.
-        weight = (freedom + 1.0) / (freedom + (left / scale[:, None]) ** 2)
-        if columns:
-            matrix = _regular(_products(design, weight) + scale[:, None, None] ** 2 * np.diag(ridge**2))
-            found = np.linalg.solve(matrix, ((weight * gap) @ design)[..., None])[..., 0]
-            left = gap - found @ design.T
-        scale = np.sqrt(
-            np.sum(weight * left**2, axis=1) / np.sum(weight, axis=1)
-        )  # X.-L. Meng, D. van Dyk 1997
-        scale = np.maximum(scale, 1e-12)
-    each = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
-    value = links * (each - np.log(scale)) - 0.5 * (freedom + 1) * np.log1p(
-        (left / scale[:, None]) ** 2 / freedom
-    ).sum(axis=1)
-    value += np.sum(np.log(ridge[ridge > 0])) - 0.5 * np.sum((found * ridge) ** 2, axis=1)
-    value -= 0.5 * np.log(2 * np.pi) * int((ridge > 0).sum())
-    value += 0.5 * np.log(2 * np.pi) - 0.5 * np.log(2 * links * freedom / (freedom + 3))
-    if columns:
-        share = (freedom + 1) / (freedom + 3)
-        matrix = share * design.T @ design / scale[:, None, None] ** 2 + np.diag(ridge**2)
-        value += 0.5 * columns * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(_regular(matrix))[1]
-    return value
-
-
-def _products(design: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Design^T diag(weight) design for every row of weights [n, q, q]."""
-    links, columns = design.shape
-    outer = (design[:, :, None] * design[:, None, :]).reshape(links, -1)
-    return (weight @ outer).reshape(-1, columns, columns)
-
-
-def _regular(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A little on the diagonal, for columns that others make up."""
-    size = matrix.shape[-1]
-    trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
-    return matrix + (1e-10 * trace / size + 1e-300) * np.eye(size)

@@ -6,6 +6,7 @@ make a whole. Streets part buildings; a wall and the panes in it, or a row of ho
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -13,13 +14,13 @@ from numpy.typing import NDArray
 
 from calibray.scenes.triangles import Triangles
 
-CELL: Final = 0.5
+CELL: Final = 1.0
 """Width of a cell [m]: what is less than one or two of them apart touches."""
 
 CELLS: Final = 8_000_000
 """Cells of the raster, at most; over larger scenes they are wider."""
 
-PIECES: Final = 2_000_000
+PLACES: Final = 2_000_000
 """Places on edges that are drawn at once."""
 
 
@@ -33,8 +34,9 @@ def wholes(triangles: Triangles, place: NDArray[np.float64]) -> NDArray[np.int64
     Returns:
         Number of the whole, from 0 [n]; -1 everywhere if there is none but the ground.
     """
-    # Images are looked at where it is asked which building is which, and nowhere else.
+    # Both are for who asks which building is which, and nobody else.
     from scipy import ndimage
+    from scipy.spatial import KDTree
 
     corners = triangles.corners[~triangles.ground][:, :, :2]
     if not len(corners) or not len(place):
@@ -42,21 +44,28 @@ def wholes(triangles: Triangles, place: NDArray[np.float64]) -> NDArray[np.int64
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL, float(np.sqrt(np.prod(np.maximum(high - low, CELL)) / CELLS)))
     drawn = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
-    start = corners.reshape(-1, 2)
-    along = np.roll(corners, -1, axis=1).reshape(-1, 2) - start
-    steps = np.ceil(np.linalg.norm(along, axis=1) / (0.5 * cell)).astype(np.int64) + 1
-    ends = np.cumsum(steps)
-    first = 0
-    while first < len(steps):
-        last = max(first + 1, int(np.searchsorted(ends, ends[first] - steps[first] + PIECES)))
-        count = steps[first:last]
-        edge = np.repeat(np.arange(first, last), count)
-        within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
-        share = within / np.maximum(steps[edge] - 1, 1)
-        at = ((start[edge] + share[:, None] * along[edge] - low) / cell).astype(np.int64)
-        drawn[tuple(at.T)] = True
-        first = last
+    for at in _along((corners - low) / cell):
+        drawn[at[:, 0], at[:, 1]] = True
     label, _ = ndimage.label(drawn, structure=np.ones((3, 3)))
-    nearest = ndimage.distance_transform_edt(~drawn, return_distances=False, return_indices=True)
-    at = np.clip((place[:, :2] - low) / cell, 0, np.array(drawn.shape) - 1).astype(np.int64)
-    return np.asarray(label[tuple(nearest[:, at[:, 0], at[:, 1]])] - 1, dtype=np.int64)
+    there = np.argwhere(drawn)
+    _, nearest = KDTree(there, compact_nodes=False, balanced_tree=False).query(
+        (place[:, :2] - low) / cell - 0.5
+    )
+    return np.asarray(label[drawn][nearest] - 1, dtype=np.int64)
+
+
+def _along(corners: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
+    """Cells along the edges of triangles [F, 3, 2], no two of an edge further apart than neighbours."""
+    start = corners.reshape(-1, 2)
+    way = np.roll(corners, -1, axis=1).reshape(-1, 2) - start
+    count = np.ceil(np.abs(way).max(axis=1)).astype(np.int64) + 1
+    ends = np.cumsum(count)
+    first = 0
+    while first < len(count):
+        last = max(first + 1, int(np.searchsorted(ends, ends[first] - count[first] + PLACES)))
+        number = count[first:last]
+        edge = np.repeat(np.arange(first, last), number)
+        within = np.arange(len(edge)) - np.repeat(np.cumsum(number) - number, number)
+        share = within / np.maximum(count[edge] - 1, 1)
+        yield (start[edge] + share[:, None] * way[edge]).astype(np.int64)
+        first = last
