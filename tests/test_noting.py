@@ -31,10 +31,10 @@ def test_values_within_their_intervals_are_not_spoken_of():
 
 
 def test_values_outside_their_intervals_are_named_with_the_reason():
-    (sentence,) = said(dict.fromkeys(NAMES, 2.5) | {NAMES[1]: 4.4})
+    sentence, advice = said(dict.fromkeys(NAMES, 2.5) | {NAMES[1]: 4.4})
     assert f"{NAMES[1]} 4.4, interval 2 to 3, 6 to 9, likeliest 7" in sentence
     assert NAMES[0] not in sentence
     assert "errors that neighbours share" in sentence
     assert f"{np.exp(3.0):.2g} times as likely" in sentence
-    assert "blocks = 4" in sentence
+    assert "blocks = 4" in advice
     assert "more than 1,000 times" in said({**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}, 50.0)[0]

@@ -94,7 +94,7 @@ def contradicted(
         noise: Weights of the kinds of noise.
 
     Returns:
-        A sentence, or none.
+        What disagrees and why, and what to do; nothing where none does.
     """
     outside = []
     for parameter in problem.parameters:
@@ -114,6 +114,7 @@ def contradicted(
     return (
         f"The least RMSE is not where the links are explained best: {'; '.join(outside)}. The RMSE takes the errors of "
         f"all links as independent; intervals do not, for {cause}, and the likeliest values are {times} times as "
-        "likely. Predictions go by the least RMSE unless blocks held out speak for another model: say [holdout] "
-        "blocks = 4, and do not take its values for the materials'.",
+        "likely.",
+        "Predictions go by the values of the least RMSE unless blocks held out speak for another model: say [holdout] "
+        "blocks = 4, and do not take these values for the materials'.",
     )
