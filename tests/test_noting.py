@@ -17,8 +17,7 @@ NAMES = tuple(planted.TRUTH)
 
 def said(found: dict[str, float], behind: float = 3.0) -> tuple[str, ...]:
     study = Study.from_content(planted.content("links.csv"))
-    links = planted.links().assign(path_loss_db=planted.path_loss())
-    problem = Problem.of(Setup.open(study, links=links_from_frame(links)), planted.engine())
+    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     pieces = ((2.0, 3.0), (6.0, 9.0))
     told = {name: Interval(0.1, 2.0, 9.0, "ambiguous", pieces) for name in NAMES}
     likeliest = dict.fromkeys(NAMES, 7.0)

@@ -1,14 +1,19 @@
-"""Which building a place belongs to, told by what touches in plan."""
+"""Which building a place belongs to, told by what touches in plan, and what single buildings mean for intervals."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import planted
 from calibray.calibration.buildings import buildings
+from calibray.calibration.certainty import certainty
 from calibray.calibration.problem import Problem
+from calibray.calibration.search import search
 from calibray.measurements import links_from_frame
+from calibray.optimizers import LeastSquares
 from calibray.scenes.triangles import Triangles
 from calibray.scenes.wholes import wholes
 from calibray.study import Setup, Study
@@ -53,8 +58,7 @@ def test_a_scene_of_ground_alone_has_none():
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     study = Study.from_content(planted.content("links.csv"))
-    links = planted.links().assign(path_loss_db=planted.path_loss())
-    return Problem.of(Setup.open(study, links=links_from_frame(links)), planted.engine())
+    return Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
 
 
 def test_derivatives_by_single_buildings_add_up(problem):
@@ -70,3 +74,27 @@ def test_derivatives_by_single_buildings_add_up(problem):
     # Concrete is the ground here, which is one and does not differ from itself.
     assert set(apart.building[apart.owner == 0]) == {-1}
     assert (apart.building[apart.owner > 0] >= 0).all()
+
+
+def test_intervals_are_those_of_the_mean_over_buildings():
+    """Marble and wood are each on one building, which may differ from others; the ground is one and does not."""
+    measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
+
+    def told(spread: float):
+        study = Study.from_content(planted.content("links.csv", noise={"heterogeneity": spread}))
+        here = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
+        here = replace(here, objective=replace(here.objective, measured=measured))
+        return certainty(here, search(here, LeastSquares(*here.parameters.search_bounds, starts=16)))
+
+    alike = told(0.0)
+    assert alike.means is alike.posterior
+    apart = told(0.15)
+    found = {}
+    for name, draws in (("seen", apart.posterior), ("mean", apart.means)):
+        assert draws is not None
+        mean = draws.weight @ np.log(draws.point)
+        found[name] = np.sqrt(draws.weight @ (np.log(draws.point) - mean) ** 2)
+    marble = np.hypot(found["seen"][1], 0.15)
+    assert found["mean"][1] == pytest.approx(marble, rel=0.1)
+    assert marble > 1.3 * found["seen"][1]
+    assert found["mean"][0] == pytest.approx(found["seen"][0], rel=0.1)

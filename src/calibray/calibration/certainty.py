@@ -14,7 +14,7 @@ from scipy.special import fdtri
 from calibray.calibration.buildings import over_buildings
 from calibray.calibration.cheap import ReplayedModel
 from calibray.calibration.explaining import Explaining, has_offset
-from calibray.calibration.noting import contradicted, departures, missed
+from calibray.calibration.noting import ROUGH, contradicted, departures, missed
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.calibration.search import Trail, rounds
 from calibray.calibration.stand_in import ensemble
@@ -75,12 +75,6 @@ NOTED_DB: Final = 0.1
 
 EXACT_DB: Final = 1e-6
 """RMSE of data without noise, which tell everything [dB]."""
-
-ROUGH: Final = (
-    "Draws that explain the data are too few among so many parameters: intervals are rough, and wider than the data "
-    "tell. Calibrate fewer parameters, or give them priors."
-)
-"""Said where the posterior was flattened."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,12 @@ SLACK: Final = 0.02
 MOST: Final = 1000.0
 """Ratio beyond which how much more likely something is is not told."""
 
+ROUGH: Final = (
+    "Draws that explain the data are too few among so many parameters: intervals are rough, and wider than the data "
+    "tell. Calibrate fewer parameters, or give them priors."
+)
+"""Said where the posterior was flattened."""
+
 DEPARTURES: Final = {
     CORRELATED: "Errors of neighbouring links are alike",
     HEAVY: "Errors have heavy tails, as outliers make them",
