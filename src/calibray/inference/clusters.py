@@ -16,7 +16,8 @@ derivative.
 
 Whether buildings differ is no alternative to errors that neighbours share or that have heavy tails: draws of every kind
 of noise are moved. How likely each spread is, is told by those two kinds of noise that differ in nothing else, as far
-as these explain the data; as far as others do, it is as likely as before: that buildings differ, as that they do not.
+as these explain the data; as far as others do, it is as before: that buildings differ is as likely as that they do not,
+and the rarer the more they do.
 """
 
 from __future__ import annotations
@@ -97,7 +98,8 @@ def spreads(
         )
     )
     evidence = np.maximum(after, 1e-6) / np.where(before > 0, before, 1.0)
-    prior = before * np.where(choices > 0, before[0] / before[1:].sum(), 1.0) if before[0] else before
+    rare = np.array([1.0 / spread for spread in known])
+    prior = np.concatenate([[float(before[0] > 0)], rare / rare.sum()])
     odds = prior * evidence ** min(1.0, float(after.sum()))
     place = (random.random((len(share), 1)) > np.cumsum(share, axis=1)[:, :-1]).sum(axis=1)
     other = random.choice(choices, len(share), p=odds / odds.sum())
