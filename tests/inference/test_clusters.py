@@ -9,6 +9,8 @@ import pytest
 
 from calibray.inference.clusters import moved, shared_covariance, spreads
 from calibray.inference.marginal import DIFFERING, NoiseModel, noise_models
+from calibray.inference.posterior import Draws
+from calibray.inference.verdicts import verdicts
 
 COUNTS = np.array([30, 6, 3, 1])
 """Links that lean on each of four buildings."""
@@ -106,3 +108,23 @@ def test_models_left_out_count_as_unlikely(models):
     """Those that explain little are not evaluated; what is left tells of the others."""
     left = tuple(replace(model) for model in models if model.kind == "gaussian")
     assert np.mean(spreads(left, np.ones((2000, len(left))) / len(left), models) > 0) < 0.01
+
+
+def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():
+    """Links tell those seen to a tenth of the range; that others may differ widens the interval and says so."""
+    random = np.random.default_rng(2)
+    seen, means = (
+        Draws(point, np.zeros(4000), np.full(4000, 1 / 4000))
+        for point in (random.normal(0.5, 0.02, (4000, 1)), random.uniform(0.1, 0.9, (4000, 1)))
+    )
+
+    def told(draws: Draws, lean: Draws | None):
+        ends = np.zeros(1), np.ones(1)
+        return verdicts(draws, lambda points: points * 50.0, ["walls"], *ends, 3.0, seen=lean)[0]
+
+    assert told(means, seen).name == "weakly identified"
+    assert "buildings that were seen" in told(means, seen).reason
+    assert told(means, seen).pieces == told(means, None).pieces
+    assert told(means, None).name == "not identifiable"
+    assert told(means, means).name == "not identifiable"
+    assert told(seen, seen).name == "identified"

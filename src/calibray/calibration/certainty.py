@@ -257,7 +257,7 @@ def _from_draws(
 
     told = verdicts(
         means, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
-        level=CONFIDENCE, shown=shown,
+        level=CONFIDENCE, shown=shown, seen=posterior,
     )  # fmt: skip
     found = {}
     for index, (name, verdict) in enumerate(zip(parameters.names, told, strict=True)):

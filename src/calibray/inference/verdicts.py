@@ -81,6 +81,7 @@ def verdicts(
     *,
     level: float = 0.95,
     shown: Shown = as_it_is,
+    seen: Draws | None = None,
 ) -> list[Verdict]:
     """What the data tell of every parameter.
 
@@ -93,6 +94,7 @@ def verdicts(
         noise_db: Size of the links' errors [dB].
         level: Share of the posterior that intervals hold.
         shown: What reasons give for a value.
+        seen: The posterior of what the links lean on, where that may differ from what is asked for.
 
     Returns:
         One verdict for every parameter.
@@ -106,7 +108,14 @@ def verdicts(
         low, high = pieces[0][0], pieces[-1][1]
         share = sum(end - start for start, end in pieces) / (upper[index] - lower[index])
         ends = _touched(pieces, lower[index], upper[index])
-        if share > WEAKLY:
+        own = share if seen is None or share <= WEAKLY else _share(seen, index, lower[index], upper[index])
+        if share > WEAKLY >= own:
+            name = "weakly identified"
+            reason = (
+                f"the buildings that were seen are told to within {own:.0%} of the range; how far they stand for others "
+                "is not known, for walls of one material may differ"
+            )
+        elif share > WEAKLY:
             name = "not identifiable"
             reason = _blindness(index, draws, modelled, names, best, lower, upper, noise_db)
         elif len(pieces) > 1:
@@ -122,6 +131,12 @@ def verdicts(
             reason = f"nine tenths of the posterior take up {share:.0%} of the range"
         found.append(Verdict(told, float(best[index]), name, reason))
     return found
+
+
+def _share(draws: Draws, index: int, lower: float, upper: float) -> float:
+    """Share of the range that a parameter's credible set takes up."""
+    (pieces,) = credible_sets(draws.point[:, index], draws.weight, float(lower), float(upper), (JUDGED,))
+    return sum(high - low for low, high in pieces) / (upper - lower)
 
 
 def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> list[str]:
