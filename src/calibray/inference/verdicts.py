@@ -112,8 +112,8 @@ def verdicts(
         if share > WEAKLY >= own:
             name = "weakly identified"
             reason = (
-                f"the buildings that were seen are told to within {own:.0%} of the range; how far they stand for others "
-                "is not known, for walls of one material may differ"
+                f"the buildings that were seen are told to within {own:.0%} of the range; how far they stand for "
+                "others is not known, for walls of one material may differ"
             )
         elif share > WEAKLY:
             name = "not identifiable"
