@@ -46,7 +46,8 @@ def wholes(triangles: Triangles, place: NDArray[np.float64]) -> NDArray[np.int64
     drawn = np.zeros(tuple(((high - low) / cell).astype(np.int64) + 1), dtype=bool)
     for at in _along((corners - low) / cell):
         drawn[at[:, 0], at[:, 1]] = True
-    label, _ = ndimage.label(drawn, structure=np.ones((3, 3)))
+    label = np.zeros(drawn.shape, dtype=np.int32)
+    ndimage.label(drawn, structure=np.ones((3, 3)), output=label)
     there = np.argwhere(drawn)
     _, nearest = KDTree(there, compact_nodes=False, balanced_tree=False).query(
         (place[:, :2] - low) / cell - 0.5
