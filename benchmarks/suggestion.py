@@ -2,16 +2,23 @@
 
     python benchmarks/suggestion.py --repetitions 60
     python benchmarks/suggestion.py --districts demo,11 --repetitions 20
+    python benchmarks/suggestion.py --districts 11,12 --repetitions 200 --separate --oracle
 
 In every repetition a truth is drawn evenly from the ranges of the materials, path losses are made of it with noise of
 3 dB, and 20 links are measured. Five more are taken of the others: those that `calibray.inference.design` suggests, or
 random ones. The profile of every parameter is taken exactly, on a grid over the whole range, and so are the draws from
 the posterior. The demo has its 40 links. A district with a number is that of the demo built with that seed, with a
-carrier, thicknesses and 160 places in the streets of its own; 11 and 12 were developed on, others were not.
+carrier, thicknesses and 160 places in the streets of its own; the demo and 11 to 19 were developed on, others not.
+
+With `--separate` a repetition counts only where a material's interval has separate ranges, and random points are drawn
+ten times. With `--oracle` five points are taken as well by who knows the truth, though not the noise: one by one,
+and each once more beside the others, so that a fit in the best range and one in the next, with all other parameters
+free, are expected to lie as far apart as they can.
 
 A row tells, for concrete and for glass: the median width of the 95 % interval after suggested points by that after
-random ones; how often it is narrower, ties as half; how often ranges that were separate are one afterwards; and
-what width was expected, of that before, beside what came about.
+random ones; how often it is narrower, ties as half; how often ranges were separate, how often they are one afterwards,
+and how often that is because the others were ruled out, not because what lies between them fits as well now; and what
+width was expected, of that before, beside what came about.
 """
 
 from __future__ import annotations
@@ -24,6 +31,7 @@ from typing import cast
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from calibray import engines
@@ -38,10 +46,15 @@ from calibray.tables.text import render
 
 NOISE_DB = 3.0
 MEASURED, MORE = 20, 5
-DRAWS = 96
+DRAWS, RIVALS = 96, 24
 GRID = (150, 120, 3)
 """Values of concrete, glass and soil; soil hardly matters to any link."""
 JUDGED = ("concrete", "glass")
+KINDS = ("suggested", "random", "oracle")
+AGAIN = 10
+"""Draws of random points where repetitions with separate ranges are looked at alone."""
+LIKELY = 2.2
+"""Sum of squares, by the least, up to which a value may matter to the oracle."""
 PLACES = 160
 
 
@@ -140,58 +153,117 @@ class Exact:
         """Five of the other links, and the widths to be expected then, of those before."""
         log_density = -0.5 * len(known) * np.log(square)
         share = np.exp(log_density - log_density.max())
-        drawn = random.choice(len(square), DRAWS, p=share / share.sum())
         noise = float(np.sqrt(square.min() / (len(known) - len(GRID))))
-        values = self.parameters.from_search(self.lower + self.unit[drawn] * self.width)
-        loss, slope = self.engine.path_loss_and_jacobian(values)
-        loss, slope = loss[:, self.reached], slope[:, self.reached] * self.width
+        piece = self._piece(self.pieces(square, len(known)))
+        drawn = [random.choice(len(square), DRAWS, p=share / share.sum())]
+        for column in piece.T:
+            for which in range(column.max() + 1) if column.max() else ():
+                inside = share * (column == which)
+                drawn.append(random.choice(len(square), RIVALS, p=inside / inside.sum()))
+        rows, draws = np.concatenate(drawn), drawn[0]
+        values = self.parameters.from_search(self.lower + self.unit[draws] * self.width)
+        slope = self.engine.path_loss_and_jacobian(values)[1][:, self.reached] * self.width
         scaled = slope[:, known] / noise
         beliefs = Beliefs(
-            self.unit[drawn],
+            self.unit[draws],
             np.einsum("nmi,nmj->nij", scaled, scaled),
-            np.zeros((DRAWS, len(GRID)), dtype=np.int64),
+            piece[rows],
+            (square[rows] - square.min()) / noise**2,
         )
         errors = Errors(noise, np.zeros((len(others), 0)), self.place[others])
-        found = choose(beliefs, loss[:, others], slope[:, others], errors, MORE)
+        found = choose(beliefs, self.loss[np.ix_(rows, others)], slope[:, others], errors, MORE)
         return others[[each.index for each in found]], found[-1].narrowed
 
+    def best(
+        self, square: np.ndarray, links: int, truth: np.ndarray, others: np.ndarray, axis: int
+    ) -> np.ndarray:
+        """Five of the other links by who knows the truth: those that hold the ranges of a parameter apart the most."""
+        piece = self._piece(self.pieces(square, links))[:, axis]
+        likely = square < LIKELY * square.min()
+        piece, left = piece[likely], square[likely]
+        more = (self.loss[np.ix_(likely, others)] - truth[others]) ** 2
+        chosen: list[int] = []
+        for turn in range(2 * MORE):
+            kept = chosen if turn < MORE else chosen[1:]
+            sums = (left + more[:, kept].sum(axis=1))[:, None] + more
+            least = np.sort([sums[piece == which].min(axis=0) for which in range(piece.max() + 1)], axis=0)
+            apart = least[1] - least[0]
+            apart[kept] = -np.inf
+            chosen = [*kept, int(np.argmax(apart))]
+        return others[chosen]
 
-def judged(exact: Exact, repetitions: int, seed: int, name: str) -> list[tuple[str, ...]]:
-    """Rows of the table for one district."""
-    before, after, expected = [], {"suggested": [], "random": []}, []
-    for turn in range(repetitions):
-        random = np.random.default_rng([seed, turn])
-        order = random.permutation(len(exact.reached))
-        known, others = order[:MEASURED], order[MEASURED:]
-        truth = exact.loss[random.integers(len(exact.loss))]
-        measured = truth + NOISE_DB * random.standard_normal(len(truth))
-        square = exact.squares(measured, known)
-        before.append(exact.pieces(square, MEASURED))
-        chosen, narrowed = exact.suggested(square, known, others, random)
-        expected.append(narrowed)
-        for kind, more in (("suggested", chosen), ("random", random.permutation(others)[:MORE])):
-            links = np.concatenate([known, more])
-            after[kind].append(exact.pieces(exact.squares(measured, links), len(links)))
-        print(f"{name}: {turn + 1} of {repetitions}", end="\r", file=sys.stderr)
-    print(file=sys.stderr)
-    wide = {kind: np.array([[_hull(each) for each in run] for run in runs]) for kind, runs in after.items()}
-    first = np.array([[_hull(each) for each in run] for run in before])
-    rows = []
+    def _piece(self, pieces: list[list[tuple[float, float]]]) -> np.ndarray:
+        """Which piece of every parameter's interval each place of the grid lies in, or nearest to."""
+        found = np.zeros(self.unit.shape, dtype=np.int64)
+        for k, ends in enumerate(np.array(each) for each in pieces):
+            apart = np.maximum(ends[:, 0, None] - self.unit[:, k], self.unit[:, k] - ends[:, 1, None])
+            found[:, k] = np.argmin(apart, axis=0)
+        return found
+
+
+def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, list] | None:
+    """One planted truth: pieces of intervals before and after, and what was expected; None where it does not count.
+
+    After points of a kind there is a list of draws of them for each parameter that is judged.
+    """
+    random = np.random.default_rng([given.seed, turn])
+    order = random.permutation(len(exact.reached))
+    known, others = order[:MEASURED], order[MEASURED:]
+    truth = exact.loss[random.integers(len(exact.loss))]
+    measured = truth + NOISE_DB * random.standard_normal(len(truth))
+    drawn = [random.permutation(others)[:MORE] for _ in range(AGAIN if given.separate else 1)]
+    square = exact.squares(measured, known)
+    before = exact.pieces(square, MEASURED)
+    if given.separate and all(len(before[k]) == 1 for k in range(len(JUDGED))):
+        return None
+
+    def after(*draws: np.ndarray) -> list[list]:
+        links = [np.concatenate([known, more]) for more in draws]
+        found = [exact.pieces(exact.squares(measured, each), len(each)) for each in links]
+        return [[each[k] for each in found] for k in range(len(JUDGED))]
+
+    chosen, expected = exact.suggested(square, known, others, random)
+    run = {"before": before, "expected": expected, "suggested": after(chosen), "random": after(*drawn)}
+    if given.oracle:
+        run["oracle"] = [
+            after(exact.best(square, MEASURED, truth, others, k))[k] if len(before[k]) > 1 else []
+            for k in range(len(JUDGED))
+        ]
+    return run
+
+
+def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
+    """Rows of the table for a district, or for all."""
+    rows, both = [], []
     for k, material in enumerate(JUDGED):
-        ours, theirs = wide["suggested"][:, k], wide["random"][:, k]
+        first = np.array([_hull(run["before"][k]) for run in runs])
+        ours, theirs = (
+            np.array([_hull(run[kind][k][0]) for run in runs]) for kind in ("suggested", "random")
+        )
+        both.append(np.log(ours / theirs))
         better = np.mean(ours < theirs - 1e-9) + 0.5 * np.mean(np.abs(ours - theirs) <= 1e-9)
-        apart = [turn for turn, run in enumerate(before) if len(run[k]) > 1]
-        one = {kind: sum(len(after[kind][turn][k]) == 1 for turn in apart) for kind in after}
+        apart = [run for run in runs if len(run["before"][k]) > 1]
+        counted = [_counted(k, kind, apart) for kind in KINDS if kind in runs[0]]
+        expected = np.mean([run["expected"][k] for run in runs] * first)
         rows.append((
-            name, material, f"{np.median(ours / theirs):.2f}", f"{better:.0%}",
-            f"{one['suggested']} and {one['random']} of {len(apart)}",
-            f"{np.mean(np.array(expected)[:, k] * first[:, k]) / np.mean(first[:, k]):.2f}",
-            f"{np.mean(ours) / np.mean(first[:, k]):.2f}", f"{np.mean(theirs) / np.mean(first[:, k]):.2f}",
+            name, material, f"{np.median(ours / theirs):.2f}", f"{better:.0%}", str(len(apart)),
+            *(", ".join(f"{each[which]:.3g}" for each in counted) for which in (0, 1)),
+            *(f"{each / np.mean(first):.2f}" for each in (expected, np.mean(ours), np.mean(theirs))),
         ))  # fmt: skip
-    both = [np.log(wide[kind][:, : len(JUDGED)]).mean(axis=1) for kind in ("suggested", "random")]
-    ratio, better = np.exp(np.median(both[0] - both[1])), np.mean(both[0] < both[1])
-    rows.append((name, "both", f"{ratio:.2f}", f"{better:.0%}", "", "", "", ""))
-    return rows
+    gain = np.mean(both, axis=0)
+    narrower = f"{np.mean(gain < 0):.0%} of {len(runs)}"
+    return [*rows, (name, "both", f"{np.exp(np.median(gain)):.2f}", narrower, *[""] * 6)]
+
+
+def _counted(k: int, kind: str, apart: list[dict[str, list]]) -> NDArray[np.float64]:
+    """How often separate ranges are one after points of a kind, and how often because the others are ruled out."""
+    found = np.zeros(2)
+    for run in apart:
+        for after in run[kind][k]:
+            (low, high), one = after[0], len(after) == 1
+            met = sum(end >= low and start <= high for start, end in run["before"][k])
+            found += np.array([one, one and met == 1]) / len(run[kind][k])
+    return found
 
 
 def _hull(pieces: list[tuple[float, float]]) -> float:
@@ -204,21 +276,28 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=60)
     parser.add_argument("--districts", default="demo,11,12,21,22")
     parser.add_argument("--seed", type=int, default=1)
-    given, rows = parser.parse_args(), []
+    parser.add_argument("--separate", action="store_true", help="only where an interval has separate ranges")
+    parser.add_argument("--oracle", action="store_true", help="beside them the choice of who knows the truth")
+    given, runs = parser.parse_args(), {}
     for name in given.districts.split(","):
         with TemporaryDirectory() as folder:
             study = Study.load(demo_study_path()) if name == "demo" else made(int(name), Path(folder))
-            rows += judged(Exact(study), given.repetitions, given.seed, name)
+            exact, runs[name] = Exact(study), []
+        for turn in range(given.repetitions):
+            run = repetition(exact, given, turn)
+            runs[name] += [] if run is None else [run]
+            print(f"{name}: {turn + 1} of {given.repetitions}", end="\r", file=sys.stderr)
+        print(file=sys.stderr)
+    rows = [row for name, found in runs.items() if found for row in judged(name, found)]
+    rows += judged("all", [run for found in runs.values() for run in found])
+    kinds = ", ".join(KINDS if given.oracle else KINDS[:2])
     columns = (
         Column("district"), Column("material"), numbers("width by random's"), numbers("narrower"),
-        Column("ranges made one, suggested and random"), numbers("expected"), numbers("came about"),
-        numbers("random's"),
+        numbers("separate ranges"), Column(f"made one: {kinds}"), Column("others ruled out"), numbers("expected"),
+        numbers("came about"), numbers("random's"),
     )  # fmt: skip
-    print(
-        render(
-            Table(f"{MEASURED} links and {MORE} more, {given.repetitions} repetitions", columns, tuple(rows))
-        )
-    )
+    title = f"{MEASURED} links and {MORE} more, {given.repetitions} repetitions, seed {given.seed}"
+    print(render(Table(title, columns, tuple(rows))))
 
 
 if __name__ == "__main__":

@@ -94,11 +94,14 @@ def test_the_first_point_is_the_one_that_a_measurement_there_tells_most(result, 
 
 def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
     """Change of path loss by the permittivity, from predictions of results that differ in it."""
-    loss = []
-    for value in (result.parameters[NAME] * 0.99, result.parameters[NAME] * 1.01):
-        ground = replace(result.materials["ground"], relative_permittivity=value)
-        loss.append(replace(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]]))
+    loss = [_predicted(result, links, result.parameters[NAME] * factor) for factor in (0.99, 1.01)]
     return (loss[1] - loss[0]) / (0.02 * result.parameters[NAME])
+
+
+def _predicted(result: Result, links: pd.DataFrame, value: float) -> np.ndarray:
+    """Path loss of links for another permittivity, with the result's offset."""
+    ground = replace(result.materials["ground"], relative_permittivity=value)
+    return replace(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]])
 
 
 def test_intervals_are_expected_to_narrow_with_every_point(result, table):
@@ -158,3 +161,22 @@ def test_what_cannot_be_suggested_is_refused(result, table):
         cb.suggest(result, table.drop(columns="tx_x"))
     with pytest.raises(InputError, match="changed since the calibration"):
         cb.suggest(replace(result, files={name: "0" * 64 for name in result.files}), table)
+
+
+def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
+    """Of 128 draws three lie in the second range; to narrow the first, another place would come before."""
+    values = np.where(np.arange(128) % 50 == 1, 14.0, np.linspace(3.0, 9.0, 128))
+    interval = replace(result.intervals[NAME], lower=3.0, upper=14.1, pieces=((3.0, 9.0), (13.9, 14.1)))
+    two = replace(result, rmse_db=1.0, draws={NAME: values.tolist()}, intervals={NAME: interval})
+    one = replace(two, intervals={NAME: replace(interval, pieces=((3.0, 14.1),))})
+    loss = [
+        _predicted(result, links, value)
+        for links in (table, result.links.assign(site="a"))
+        for value in (6.0, 14.0)
+    ]
+    apart = np.abs(loss[1] - loss[0] - (loss[3] - loss[2]).mean())
+    told, alone = cb.suggest(two, table, 1), cb.suggest(one, table, 1)
+    assert apart[table.rx_x == told.rx_x[0]] == apart.max()
+    assert apart[table.rx_x == alone.rx_x[0]] < apart.max()
+    assert told[f"{NAME}_sure"][0] < 1
+    assert f"{NAME}_sure" not in alone

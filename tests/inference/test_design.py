@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -15,7 +17,7 @@ def beliefs(point: np.ndarray, piece: np.ndarray | None = None) -> Beliefs:
     """Draws in the unit cube that curvature knows nothing of."""
     count, dimension = point.shape
     piece = np.zeros((count, dimension), dtype=int) if piece is None else piece
-    return Beliefs(point, np.zeros((count, dimension, dimension)), piece)
+    return Beliefs(point, np.zeros((count, dimension, dimension)), piece, np.zeros(count))
 
 
 def gaussian(spread: float) -> np.ndarray:
@@ -50,7 +52,7 @@ def test_what_tells_minima_apart_comes_before_what_sharpens_each():
     within = 100.0 * (point - np.where(piece == 0, 0.2, 0.8))
     predicted, slope = np.hstack([within, apart]), np.zeros((DRAWS, 2, 1))
     slope[:, 0] = 100.0
-    start = Beliefs(point, np.full((DRAWS, 1, 1), 0.03**-2.0), piece)
+    start = Beliefs(point, np.full((DRAWS, 1, 1), 0.03**-2.0), piece, np.zeros(DRAWS))
     assert certain(piece) == pytest.approx(0.5)
     first, second = choose(start, predicted, slope, independent(2.0, 2), 2)
     assert (first.index, second.index) == (1, 0)
@@ -109,3 +111,15 @@ def test_where_draws_agree_alike_the_steeper_candidate_comes_first():
     slope[:, 1] = 30.0
     found = choose(beliefs(point), predicted, slope, independent(3.0, 2), 1)
     assert found[0].index == 1
+
+
+def test_a_range_that_no_draw_lies_in_is_told_apart_by_values_in_it():
+    """All draws agree about both candidates that matter to it; only one of them speaks against the other range."""
+    point = gaussian(0.01)
+    excess = np.concatenate([np.zeros(DRAWS), [3.0]])
+    predicted, slope = linear(point, np.array([[100.0], [0.0], [0.0]]))
+    predicted = np.vstack([predicted, predicted.mean(axis=0) + np.array([0.0, 9.0, 2.0])])
+    one = Beliefs(point, np.full((DRAWS, 1, 1), 1e4), np.zeros((DRAWS + 1, 1), dtype=int), excess)
+    two = replace(one, piece=np.append(np.zeros(DRAWS, dtype=int), 1)[:, None])
+    errors = independent(3.0, 3)
+    assert [choose(each, predicted, slope, errors, 1)[0].index for each in (one, two)] == [0, 1]

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.calibration.problem import Problem
+from calibray.calibration.problem import Evaluation, Problem
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
-from calibray.inference.design import Beliefs, Errors, Outlook, certain, choose
+from calibray.inference.design import FLAT, Beliefs, Errors, Outlook, certain, choose
 from calibray.inference.diagnostics import shared_errors
 from calibray.inference.noise import Correlation
 from calibray.inference.nuisance import OFFSET, UNKNOWN_DB, Term
@@ -26,6 +26,9 @@ from calibray.tables import Column, Table, numbers
 
 DRAWS: Final = 96
 """Draws from the posterior that candidates are judged by."""
+
+RIVALS: Final = 24
+"""Further values in every separate range of a parameter: few draws lie in some."""
 
 SPOKEN: Final = 0.02
 """Narrowing of an interval, of its width, that words are worth."""
@@ -91,7 +94,8 @@ def suggest(
     beliefs = model.beliefs()
     chosen = choose(beliefs, predicted[:, reached], slope[:, reached], errors, count)
     chosen = [replace(each, index=int(reached[each.index])) for each in chosen]
-    return _table(result, candidates, predicted, chosen, certain(beliefs.piece))
+    draws = len(beliefs.point)
+    return _table(result, candidates, predicted[:draws], chosen, certain(beliefs.piece[:draws]))
 
 
 def shown(found: pd.DataFrame) -> tuple[Table, ...]:
@@ -149,17 +153,19 @@ class _Model:
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
         drawn = np.stack([result.draws[name] for name in parameters.names], axis=1)
-        self.values = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), DRAWS)).round().astype(int)]
+        draws = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), DRAWS)).round().astype(int)]
+        self.draws, self.values = len(draws), np.vstack([draws, self._rivals(drawn)])
         self.told = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)
 
     def beliefs(self) -> Beliefs:
         """What the calibration says so far."""
-        parameters, slopes = self.problem.parameters, self.told.slopes * self.width / self.noise_db
-        unit = (parameters.to_search(self.values) - self.lower) / self.width
-        return Beliefs(unit, np.einsum("nmi,nmj->nij", slopes, slopes), self._pieces())
+        told, draws = self.told, slice(self.draws)
+        square = told.value**2 * told.num_rows / self.noise_db**2
+        unit = (self.problem.parameters.to_search(self.values[draws]) - self.lower) / self.width
+        return Beliefs(unit, self._information(told)[draws], self._pieces(self.values), square - square.min())
 
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
-        """Path loss of candidates by every draw [n, c], derivatives in the unit cube [n, c, d], and their errors."""
+        """Path loss of candidates by every value [m, c], derivatives in the unit cube by draws [n, c, d], errors."""
         objective, links = self.problem.objective, setup.links
         loss, slope = self._replayed(self._engine(setup))
         if objective.ceiling_db is not None:
@@ -174,7 +180,7 @@ class _Model:
         if shared is not None:
             errors = Errors(shared.own_db, common, place, shared.shared_db, shared.range_m)
         following = objective.following(*self._replayed(self.engine))
-        return loss + coefficients @ design.T, slope + design @ following, errors
+        return loss + coefficients @ design.T, (slope + design @ following)[: self.draws], errors
 
     def _engine(self, setup: Setup) -> Differentiable:
         section = setup.study.engine
@@ -184,18 +190,41 @@ class _Model:
         return replay(setup, setup.trace(materials, self.progress), compress)
 
     def _replayed(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of an engine's links by every draw, and its derivatives by the unit cube's coordinates."""
+        """Path loss of an engine's links by every value, and its derivatives by the unit cube's coordinates."""
         loss, slope = engine.path_loss_and_jacobian(self.values)
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
-    def _pieces(self) -> NDArray[np.int64]:
-        """Which of its separate ranges every draw of a parameter lies in, or nearest to."""
-        found = np.zeros(self.values.shape, dtype=np.int64)
+    def _information(self, told: Evaluation) -> NDArray[np.float64]:
+        """Information of the links in the unit cube [m, d, d]."""
+        slopes = told.slopes * self.width / self.noise_db
+        return np.einsum("nmi,nmj->nij", slopes, slopes)
+
+    def _rivals(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values around the draws in every separate range, as far from them as curvature leaves open."""
+        parameters, piece = self.problem.parameters, self._pieces(drawn)
+        around = [
+            np.flatnonzero(piece[:, k] == which)
+            for k in np.flatnonzero(np.ptp(piece, axis=0))
+            for which in np.unique(piece[:, k])
+        ]
+        if not around:
+            return np.empty((0, drawn.shape[1]))
+        random = np.random.default_rng(self.result.study.method.seed)
+        chosen = np.concatenate([random.choice(each, RIVALS) for each in around])
+        points = parameters.to_search(drawn[chosen])
+        information = self._information(self.problem.evaluate(points, derivatives=True))
+        root = np.linalg.cholesky(np.linalg.inv(information + FLAT * np.eye(drawn.shape[1])))
+        moved = np.einsum("nij,nj->ni", root, random.standard_normal(points.shape)) * self.width
+        return parameters.from_search(np.clip(points + moved, self.lower, self.lower + self.width))
+
+    def _pieces(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Which of its separate ranges every value of a parameter lies in, or nearest to."""
+        found = np.zeros(values.shape, dtype=np.int64)
         for k, name in enumerate(self.problem.parameters.names):
             interval = self.result.intervals.get(name)
             if interval is not None and len(interval.pieces) > 1:
                 ends = np.array(interval.pieces)
-                apart = np.maximum(ends[:, 0, None] - self.values[:, k], self.values[:, k] - ends[:, 1, None])
+                apart = np.maximum(ends[:, 0, None] - values[:, k], values[:, k] - ends[:, 1, None])
                 found[:, k] = np.argmin(apart, axis=0)
         return found
 

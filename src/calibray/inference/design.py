@@ -5,14 +5,16 @@ how well they would agree with what is measured then: what remains of their scat
 sees minima apart from one another, which disagree about some candidates and not about others, but it sees a parameter
 only against its whole range. Curvature sees how much closer each draw would be held where it lies, and nothing else.
 A candidate is ranked by the sum of both: the mean logarithm of the standard deviations, over draws and parameters, by
-scatter and by curvature (an A-optimal design in relative units, averaged over the posterior).
+scatter and by curvature (an A-optimal design in relative units, averaged over the posterior). Where separate ranges of
+a parameter fit, the probability of ruling out all but one counts beside it (`ranges.py`): scatter hardly sees a range
+that few draws lie in.
 
 Candidates are chosen one after another. What their errors share, an offset that is hardly known or neighbours' common
 clutter, is taken off by the conditional distribution after each choice, so that one point is not worth as much as a
 second time beside it.
 
-Tried and not kept: the probability of taking the wrong one of separate ranges for the right one as a further term, and
-more draws of rarer ranges. On three districts of `benchmarks/suggestion.py` that told apart as many, not more.
+Tried and not kept: the probability, among draws, of taking the wrong one of separate ranges for the right one. It told
+apart as many as scatter does, not more.
 
 K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995.
 """
@@ -26,14 +28,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from calibray.inference.ranges import BATCH, told_apart
+
 FLAT: Final = 12.0
 """Inverse variance of a value that lies anywhere in the unit interval: what is known without any link."""
 
 LEAST: Final = 1e-5
 """Variance in the unit cube below which a narrower scatter of so few draws tells nothing."""
 
-BATCH: Final = 4_000_000
-"""Pairs of draws times candidates that are weighed at once, which bounds the memory."""
+APART: Final = 8.0
+"""What it is worth to rule out all ranges of a parameter but one, by narrowing it e times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +95,16 @@ class Beliefs:
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
         information: Information of the links measured so far, at every draw [n, d, d].
-        piece: Which of its separate ranges each parameter lies in [n, d].
+        piece: Which of its separate ranges each parameter lies in [m, d]: of the draws, and after them of further
+            values that explain the links so far, for ranges that few draws lie in.
+        excess: Sum of squares by which each of these explains the links worse than the best, in variances of the
+            noise [m].
     """
 
     point: NDArray[np.float64]
     information: NDArray[np.float64]
     piece: NDArray[np.int64]
+    excess: NDArray[np.float64]
 
 
 def choose(
@@ -110,8 +118,8 @@ def choose(
 
     Args:
         beliefs: What is believed so far.
-        predicted: Path loss of the candidates by every draw [n, c], [dB].
-        slope: Its derivatives by the coordinates of the unit cube [n, c, d], [dB].
+        predicted: Path loss of the candidates by every draw, and the further values [m, c], [dB].
+        slope: Its derivatives by the coordinates of the unit cube, for the draws [n, c, d], [dB].
         errors: Errors to be expected of their measurements.
         count: How many to choose.
 
@@ -120,18 +128,20 @@ def choose(
     """
     beliefs = replace(beliefs, information=beliefs.information + FLAT * np.eye(beliefs.point.shape[1]))
     predicted, slope, variance = predicted.copy(), slope.copy(), errors.variance.copy()
-    known, taken = np.zeros((len(predicted), len(predicted))), np.zeros(len(variance), dtype=bool)
+    draws = len(beliefs.point)
+    known, taken = np.zeros((draws, len(predicted))), np.zeros(len(variance), dtype=bool)
     passed, found = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST))
     for _ in range(min(count, len(variance))):
         size = np.sqrt(variance)
-        value = _by_scatter(beliefs.point, known, predicted / size)
+        value = _by_scatter(beliefs.point, known[:, :draws], predicted[:draws] / size)
         value += _by_curvature(beliefs.information, slope / size[:, None])
+        value -= APART * told_apart(beliefs.excess, beliefs.piece, known, predicted / size)
         value[taken] = np.inf
         best = int(np.argmin(value))
         taken[best] = True
         told = predicted[:, best] / size[best]
-        known = known + (told[:, None] - told) ** 2
+        known = known + (told[:draws, None] - told) ** 2
         row = slope[:, best] / size[best]
         beliefs = replace(beliefs, information=beliefs.information + row[:, :, None] * row[:, None, :])
         # What is shared with the one chosen is known by then: the rest is taken conditional on it.
@@ -141,8 +151,8 @@ def choose(
         slope -= row[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
         passed = np.vstack([passed, share])
-        narrowed = np.minimum(_scatter(beliefs.point, known) / before, 1.0)
-        found.append(Outlook(best, narrowed, _sure(beliefs.piece, known)))
+        narrowed = np.minimum(_scatter(beliefs.point, known[:, :draws]) / before, 1.0)
+        found.append(Outlook(best, narrowed, _sure(beliefs.piece[:draws], known[:, :draws])))
     return found
 
 
