@@ -11,9 +11,8 @@ the posterior. The demo has its 40 links. A district with a number is that of th
 carrier, thicknesses and 160 places in the streets of its own; the demo and 11 to 19 were developed on, others not.
 
 With `--separate` a repetition counts only where a material's interval has separate ranges, and random points are drawn
-ten times. With `--oracle` five points are taken as well by who knows the truth, though not the noise: one by one,
-and each once more beside the others, so that a fit in the best range and one in the next, with all other parameters
-free, are expected to lie as far apart as they can.
+ten times. With `--oracle` who knows the truth, though not the noise, takes five points as well: of those suggested
+and of random ones, each in turn is exchanged for whichever leaves one range the most often in simulated noise.
 
 A row tells, for concrete and for glass: the median width of the 95 % interval after suggested points by that after
 random ones; how often it is narrower, ties as half; how often ranges were separate, how often they are one afterwards,
@@ -32,7 +31,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import fdtri
+from scipy.special import expit, fdtri
 
 from calibray import engines
 from calibray.calibration.problem import Problem
@@ -53,6 +52,8 @@ JUDGED = ("concrete", "glass")
 KINDS = ("suggested", "random", "oracle")
 AGAIN = 10
 """Draws of random points where repetitions with separate ranges are looked at alone."""
+SIMULATED = 48
+"""Draws of the noise that the oracle goes by."""
 LIKELY = 2.2
 """Sum of squares, by the least, up to which a value may matter to the oracle."""
 PLACES = 160
@@ -175,21 +176,50 @@ class Exact:
         return others[[each.index for each in found]], found[-1].narrowed
 
     def best(
-        self, square: np.ndarray, links: int, truth: np.ndarray, others: np.ndarray, axis: int
+        self, square: np.ndarray, truth: np.ndarray, others: np.ndarray, axis: int, first: np.ndarray
     ) -> np.ndarray:
-        """Five of the other links by who knows the truth: those that hold the ranges of a parameter apart the most."""
-        piece = self._piece(self.pieces(square, links))[:, axis]
-        likely = square < LIKELY * square.min()
-        piece, left = piece[likely], square[likely]
-        more = (self.loss[np.ix_(likely, others)] - truth[others]) ** 2
-        chosen: list[int] = []
+        """Five of the other links by who knows the truth: each is exchanged for what makes one range the likeliest."""
+        random = np.random.default_rng(0)
+        piece = self._piece(self.pieces(square, MEASURED))[:, axis]
+        value = np.round(self.unit[:, axis] * (GRID[axis] - 1)).astype(int)
+        rows = np.argsort(value, kind="stable")
+        rows = rows[square[rows] < LIKELY * square.min()]
+        place, starts = np.unique(value[rows], return_index=True)
+        piece, left, apart = (
+            piece[rows[starts]],
+            square[rows],
+            self.loss[np.ix_(rows, others)] - truth[others],
+        )
+        noise = NOISE_DB * random.standard_normal((len(others), SIMULATED))
+        freedom = MEASURED + MORE - len(GRID)
+
+        def likely(chosen: list[int]) -> float:
+            """Share of simulated noise that leaves one range; how far the others are from it decides between equals."""
+            sums = (left + (apart[:, chosen] ** 2).sum(axis=1))[:, None] - 2 * apart[:, chosen] @ noise[
+                chosen
+            ]
+            profile = np.minimum.reduceat(sums + (noise[chosen] ** 2).sum(axis=0), starts, axis=0)
+            threshold = profile.min(axis=0) * (1 + fdtri(1, freedom, 0.95) / freedom)
+            inside = np.zeros((GRID[axis] + 1, SIMULATED), dtype=bool)
+            inside[place + 1] = profile <= threshold
+            one = np.sum(inside[1:] & ~inside[:-1], axis=0) == 1
+            rival = np.where(piece[:, None] == piece[profile.argmin(axis=0)], np.inf, profile).min(axis=0)
+            return float(one.mean() + 0.3 * expit((rival - threshold) / NOISE_DB**2).mean())
+
+        starting = [random.permutation(len(others))[:MORE] for _ in range(60)]
+        tried = [
+            [int(np.flatnonzero(others == each)[0]) for each in first],
+            *(each.tolist() for each in starting),
+        ]
+        chosen = max(tried, key=likely)
         for turn in range(2 * MORE):
-            kept = chosen if turn < MORE else chosen[1:]
-            sums = (left + more[:, kept].sum(axis=1))[:, None] + more
-            least = np.sort([sums[piece == which].min(axis=0) for which in range(piece.max() + 1)], axis=0)
-            apart = least[1] - least[0]
-            apart[kept] = -np.inf
-            chosen = [*kept, int(np.argmax(apart))]
+            kept = [each for k, each in enumerate(chosen) if k != turn % MORE]
+            tried = [
+                [*kept[: turn % MORE], new, *kept[turn % MORE :]]
+                for new in range(len(others))
+                if new not in kept
+            ]
+            chosen = max(tried, key=likely)
         return others[chosen]
 
     def _piece(self, pieces: list[list[tuple[float, float]]]) -> np.ndarray:
@@ -226,7 +256,7 @@ def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, 
     run = {"before": before, "expected": expected, "suggested": after(chosen), "random": after(*drawn)}
     if given.oracle:
         run["oracle"] = [
-            after(exact.best(square, MEASURED, truth, others, k))[k] if len(before[k]) > 1 else []
+            after(exact.best(square, truth, others, k, chosen))[k] if len(before[k]) > 1 else []
             for k in range(len(JUDGED))
         ]
     return run
@@ -234,7 +264,7 @@ def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, 
 
 def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
     """Rows of the table for a district, or for all."""
-    rows, both = [], []
+    rows, both, ranges, made = [], [], 0, 0.0
     for k, material in enumerate(JUDGED):
         first = np.array([_hull(run["before"][k]) for run in runs])
         ours, theirs = (
@@ -243,16 +273,22 @@ def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
         both.append(np.log(ours / theirs))
         better = np.mean(ours < theirs - 1e-9) + 0.5 * np.mean(np.abs(ours - theirs) <= 1e-9)
         apart = [run for run in runs if len(run["before"][k]) > 1]
-        counted = [_counted(k, kind, apart) for kind in KINDS if kind in runs[0]]
+        counted = np.array([_counted(k, kind, apart) for kind in KINDS if kind in runs[0]])
+        ranges, made = ranges + len(apart), made + counted
         expected = np.mean([run["expected"][k] for run in runs] * first)
         rows.append((
-            name, material, f"{np.median(ours / theirs):.2f}", f"{better:.0%}", str(len(apart)),
-            *(", ".join(f"{each[which]:.3g}" for each in counted) for which in (0, 1)),
+            name, material, f"{np.median(ours / theirs):.2f}", f"{better:.0%}", str(len(apart)), *_listed(counted),
             *(f"{each / np.mean(first):.2f}" for each in (expected, np.mean(ours), np.mean(theirs))),
         ))  # fmt: skip
     gain = np.mean(both, axis=0)
     narrower = f"{np.mean(gain < 0):.0%} of {len(runs)}"
-    return [*rows, (name, "both", f"{np.exp(np.median(gain)):.2f}", narrower, *[""] * 6)]
+    ratio = f"{np.exp(np.median(gain)):.2f}"
+    return [*rows, (name, "both", ratio, narrower, str(ranges), *_listed(np.asarray(made)), "", "", "")]
+
+
+def _listed(counted: NDArray[np.float64]) -> list[str]:
+    """How often ranges are one, and the others ruled out, by the kinds of points."""
+    return [", ".join(f"{each:.4g}" for each in column) for column in counted.T]
 
 
 def _counted(k: int, kind: str, apart: list[dict[str, list]]) -> NDArray[np.float64]:
