@@ -10,9 +10,9 @@ random ones. The profile of every parameter is taken exactly, on a grid over the
 the posterior. The demo has its 40 links. A district with a number is that of the demo built with that seed, with a
 carrier, thicknesses and 160 places in the streets of its own; the demo and 11 to 19 were developed on, others not.
 
-With `--separate` a repetition counts only where a material's interval has separate ranges, and random points are drawn
-ten times. With `--oracle` who knows the truth, though not the noise, takes five points as well: of those suggested
-and of random ones, each in turn is exchanged for whichever leaves one range the most often in simulated noise.
+Random points are drawn ten times. With `--oracle` who knows the truth, though not the noise, takes five points as well:
+of those suggested and of random ones, each in turn is exchanged for whichever leaves one range the most often in
+simulated noise. With `--separate` a repetition counts only where a material's interval has separate ranges.
 
 A row tells, for concrete and for glass: the median width of the 95 % interval after suggested points by that after
 random ones; how often it is narrower, ties as half; how often ranges were separate, how often they are one afterwards,
@@ -51,7 +51,7 @@ GRID = (150, 120, 3)
 JUDGED = ("concrete", "glass")
 KINDS = ("suggested", "random", "oracle")
 AGAIN = 10
-"""Draws of random points where repetitions with separate ranges are looked at alone."""
+"""Draws of random points that the suggested are compared with."""
 SIMULATED = 48
 """Draws of the noise that the oracle goes by."""
 LIKELY = 2.2
@@ -241,7 +241,7 @@ def repetition(exact: Exact, given: argparse.Namespace, turn: int) -> dict[str, 
     known, others = order[:MEASURED], order[MEASURED:]
     truth = exact.loss[random.integers(len(exact.loss))]
     measured = truth + NOISE_DB * random.standard_normal(len(truth))
-    drawn = [random.permutation(others)[:MORE] for _ in range(AGAIN if given.separate else 1)]
+    drawn = [random.permutation(others)[:MORE] for _ in range(AGAIN)]
     square = exact.squares(measured, known)
     before = exact.pieces(square, MEASURED)
     if given.separate and all(len(before[k]) == 1 for k in range(len(JUDGED))):
@@ -268,7 +268,7 @@ def judged(name: str, runs: list[dict[str, list]]) -> list[tuple[str, ...]]:
     for k, material in enumerate(JUDGED):
         first = np.array([_hull(run["before"][k]) for run in runs])
         ours, theirs = (
-            np.array([_hull(run[kind][k][0]) for run in runs]) for kind in ("suggested", "random")
+            np.array([[_hull(each) for each in run[kind][k]] for run in runs]) for kind in KINDS[:2]
         )
         both.append(np.log(ours / theirs))
         better = np.mean(ours < theirs - 1e-9) + 0.5 * np.mean(np.abs(ours - theirs) <= 1e-9)
