@@ -180,3 +180,6 @@ def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
     assert apart[table.rx_x == alone.rx_x[0]] < apart.max()
     assert told[f"{NAME}_sure"][0] < 1
     assert f"{NAME}_sure" not in alone
+    even = np.where(np.arange(128) % 2 == 1, 14.0, values)
+    gain = cb.suggest(replace(two, draws={NAME: even.tolist()}), table, 1).gain[0]
+    assert f"{NAME}'s right range known with" in gain

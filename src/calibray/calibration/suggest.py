@@ -31,7 +31,7 @@ RIVALS: Final = 24
 """Further values in every separate range of a parameter: few draws lie in some."""
 
 SPOKEN: Final = 0.02
-"""Narrowing of an interval, of its width, that words are worth."""
+"""Narrowing of an interval, of its width, or probability of a range, that words are worth."""
 
 PLACES: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 
@@ -302,7 +302,8 @@ def _table(
         if sure[k] < 1:
             table[f"{name}_sure"] = [float(each.sure[k]) for each in chosen]
             for said, each in zip(words, chosen, strict=True):
-                said.append(f"its right range known with {each.sure[k]:.0%} (now {sure[k]:.0%})")
+                if each.sure[k] > sure[k] + SPOKEN:
+                    said.append(f"{name}'s right range known with {each.sure[k]:.0%} (now {sure[k]:.0%})")
     nothing = "no interval narrower by more than 2 %"
     table["gain"] = [", ".join(said) or nothing for said in words]
     return pd.DataFrame(table)
