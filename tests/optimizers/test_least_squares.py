@@ -8,9 +8,11 @@ from scipy.optimize import least_squares
 
 from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
+from calibray.optimizers import least_squares as module
 from calibray.optimizers.descent import descend
 from calibray.optimizers.landscapes import blocks, hall, rosenbrock, tones, within
-from calibray.optimizers.least_squares import returns
+from calibray.optimizers.least_squares import RECOMBINED, returns
+from calibray.optimizers.recombination import SPACE, recombined
 from calibray.optimizers.sampling import design
 
 
@@ -135,8 +137,10 @@ def test_starts_are_asked_together_and_drop_out():
             assert x[:3] == pytest.approx(np.array([[5.0, 2.0, 1.0], [6.0, 2.0, 1.0], [5.0, 2.0, 0.5]]))
         optimizer.tell(x, *landscape.evaluate(x))
     assert sizes[0] == 35
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[-1] < 5
+    again = np.flatnonzero(np.diff(sizes) > 0)[0] + 1  # where searches from combinations of minima begin
+    assert sizes[:again] == sorted(sizes[:again], reverse=True)
+    assert sizes[again - 1] < 5
+    assert max(sizes[again:]) <= RECOMBINED
 
 
 def test_duplicate_starts_are_merged():
@@ -202,3 +206,64 @@ def test_searches_are_counted_where_they_end():
             unit = descent.send((r, slope * width))
     assert ended.searches.sum() == 64
     assert 1 < returns(ended) < 64
+
+
+LADDER = np.array([0.37, 0.62, 0.81])
+"""Where each coordinate of `ladder` has its best rung, between others that fit almost as well."""
+
+
+def ladder(x):
+    """Coordinates that act apart, each with a row of nine minima; the best is 0, at `LADDER`."""
+    phase = 9.0 * np.pi * (x - LADDER)
+    r = np.concatenate([np.sin(phase), 0.5 * (x - LADDER)], axis=1)
+    eye = np.eye(3)
+    slope = [9.0 * np.pi * np.cos(phase)[:, :, None] * eye, np.broadcast_to(0.5 * eye, (len(x), 3, 3))]
+    return r, np.concatenate(slope, axis=1)
+
+
+def on_the_ladder(seed, starts=32):
+    optimizer = LeastSquares(np.zeros(3), np.ones(3), seed=seed, starts=starts)
+    while not optimizer.done:
+        x = optimizer.ask()
+        r, slope = ladder(x)
+        optimizer.tell(x, np.sqrt(np.mean(r**2, axis=1)), r, slope)
+    return optimizer
+
+
+def test_combinations_of_minima_lead_to_the_best(monkeypatch):
+    """One of 729 minima; no start comes near it, but each of its coordinates is found by some."""
+    assert sum(on_the_ladder(seed).best.y < 1e-6 for seed in range(8)) >= 6
+    monkeypatch.setattr(module, "RECOMBINED", 0)
+    assert min(on_the_ladder(seed).best.y for seed in range(8)) > 1e-3
+
+
+def test_minima_are_not_combined_where_the_best_keeps_coming_back(monkeypatch):
+    often = searched(5, 0.4)
+    monkeypatch.setattr(module, "RECOMBINED", 0)
+    assert searched(5, 0.4) == often
+
+
+def test_a_single_search_is_followed_by_none(monkeypatch):
+    spent = on_the_ladder(0, starts=1).evaluations
+    monkeypatch.setattr(module, "RECOMBINED", 0)
+    assert on_the_ladder(0, starts=1).evaluations == spent
+
+
+def test_the_next_rung_is_found_by_a_step_that_was_seen_elsewhere():
+    """And where the step would leave the box, or lead to what is known, it is not taken."""
+    minima = np.array([[0.8, 0.6], [0.1, 0.3], [0.1, 0.5]])
+    found = recombined(minima, 99)
+    for there in ([0.8, 0.4], [0.8, 0.8], [0.1, 0.6], [0.8, 0.3], [0.8, 0.5]):
+        assert np.linalg.norm(found - there, axis=1).min() < 1e-12
+    assert len(found) == 5
+    assert len(recombined(minima, 2)) == 2
+    assert ((found >= 0.0) & (found <= 1.0)).all()
+    assert recombined(minima[:1], 99).shape == (0, 2)
+
+
+def test_points_lie_apart_from_minima_and_one_another():
+    minima = design("sobol", 16, 3, np.random.default_rng(1))
+    found = recombined(minima, 99)
+    assert len(found) > 10
+    apart = np.linalg.norm(np.concatenate([found, minima])[None] - found[:, None], axis=2)
+    assert np.sort(apart, axis=1)[:, 1].min() > SPACE

@@ -184,6 +184,7 @@ def descend(
     tolerance: float,
     catch_up: float = 1e30,
     known: Starts | None = None,
+    followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
     """Advance all starts until each has converged, merged with a better one, or been given up.
 
@@ -195,6 +196,7 @@ def descend(
         catch_up: A search is given up when it lies more than this many of its predicted decreases behind
             the best one.
         known: Where earlier searches ended, so that these need not end there again.
+        followed: How many of the starts are followed, those of the lowest cost; all if None.
 
     Yields:
         Points to evaluate [s, d].
@@ -205,6 +207,8 @@ def descend(
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
+    if followed is not None:
+        starts = starts.rows(starts.cost.argsort(kind="stable").argsort() < followed)
     behind = starts.rows(np.zeros(len(starts.cost), dtype=bool))
     settled = behind if known is None else known
     for _ in range(iterations):

@@ -12,7 +12,8 @@ with as wide a basin, would have been missed by all searches with a probability 
 ones are what a problem gets all its starts for. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical
 Programming 37, 1987, counts the different minima, for which every search would have to be followed to its end.
 With all that were given up as one minimum it stopped short of the optimum in two of four seeds of `hall`, one of
-`landscapes.py`; with each as a minimum of its own it never stopped.)
+`landscapes.py`; with each as a minimum of its own it never stopped.) Where the starts are used up and the best has not
+come back that often, searches from combinations of the minima (`recombination.py`) follow until they give no better one.
 """
 
 from __future__ import annotations
@@ -29,12 +30,19 @@ from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import Starts, descend, distinct
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.recombination import SPACE, recombined
 from calibray.optimizers.sampling import design
 from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0
 """Predicted decreases that a search may lie behind the best one before it is given up."""
+RECOMBINED = 32
+"""Combinations of minima that are tried at a time, no more than there were starts."""
+FOLLOWED = 0.2
+"""Share of them that searches start from, those that fit best."""
+NEARER = 10.0
+"""`CATCH_UP` of these searches, which begin near their end."""
 ROUND = 64
 """Starts of a round."""
 RETURNS = 10
@@ -118,13 +126,30 @@ class LeastSquares(Optimizer):
             if returns(ended) >= RETURNS:
                 break
             unit = unit[:0]
-        if ended is not None:
+        if ended is not None and len(ended.cost):
+            if returns(ended) < RETURNS:
+                ended = yield from self._recombined(ended)
             self._session.minima = box.from_unit(distinct(ended, APART).unit)
 
+    def _recombined(self, ended: Starts) -> Generator[NDArray[np.float64], Evaluations, Starts]:
+        number, before = min(RECOMBINED, self.starts), np.inf
+        followed = round(FOLLOWED * number)
+        while followed and ended.cost.min() < before:
+            before = ended.cost.min() - _alike(ended)
+            unit = recombined(distinct(ended, SPACE).unit, number)
+            if not len(unit):
+                break
+            ended = yield from self._descended(unit, ended, NEARER, followed)
+        return ended
+
     def _descended(
-        self, unit: NDArray[np.float64], known: Starts | None
+        self,
+        unit: NDArray[np.float64],
+        known: Starts | None,
+        catch_up: float = CATCH_UP,
+        followed: int | None = None,
     ) -> Generator[NDArray[np.float64], Evaluations, Starts]:
-        descent = descend(unit, self.iterations, self.tolerance, CATCH_UP, known)
+        descent = descend(unit, self.iterations, self.tolerance, catch_up, known, followed)
         try:
             unit = next(descent)
             while True:
@@ -147,8 +172,12 @@ def returns(ended: Starts) -> int:
     """
     if not len(ended.cost):
         return 0
-    equal = LEVEL * ended.cost.min() + NOISELESS * ended.cost.max()
-    return int(ended.searches[ended.cost <= ended.cost.min() + equal].sum())
+    return int(ended.searches[ended.cost <= ended.cost.min() + _alike(ended)].sum())
+
+
+def _alike(ended: Starts) -> float:
+    """Difference of cost below which two minima fit equally well."""
+    return float(LEVEL * ended.cost.min() + NOISELESS * ended.cost.max())
 
 
 def _user_starts(x0: ArrayLike | None, box: Box) -> NDArray[np.float64]:
