@@ -1,6 +1,7 @@
 """New starting points from minima that are known.
 
 The best one is shifted by the difference of two others, or takes one coordinate of another.
+
 Minima of a problem stand in rows where one cause, as a slab that resonates, acts alike everywhere: a step from one to
 the next that was seen at one place leads to a minimum at another. That is the mutation of differential evolution (Storn
 and Price, Journal of Global Optimization 11, 1997). Where coordinates act nearly apart, as materials do that few
