@@ -243,10 +243,11 @@ def test_minima_are_not_combined_where_the_best_keeps_coming_back(monkeypatch):
     assert searched(5, 0.4) == often
 
 
-def test_a_single_search_is_followed_by_none(monkeypatch):
-    spent = on_the_ladder(0, starts=1).evaluations
+def test_two_searches_are_followed_by_none(monkeypatch):
+    """They end a fit that goes on from the minima of another."""
+    spent = on_the_ladder(0, starts=2).evaluations
     monkeypatch.setattr(module, "RECOMBINED", 0)
-    assert on_the_ladder(0, starts=1).evaluations == spent
+    assert on_the_ladder(0, starts=2).evaluations == spent
 
 
 def test_the_next_rung_is_found_by_a_step_that_was_seen_elsewhere():
