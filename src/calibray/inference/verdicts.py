@@ -108,18 +108,26 @@ def verdicts(
         low, high = pieces[0][0], pieces[-1][1]
         share = sum(end - start for start, end in pieces) / (upper[index] - lower[index])
         ends = _touched(pieces, lower[index], upper[index])
-        own = share if seen is None or share <= WEAKLY else _share(seen, index, lower[index], upper[index])
-        if share > WEAKLY >= own:
+        lean, basis = pieces, draws
+        if seen is not None and seen is not draws:
+            basis = seen
+            (lean,) = credible_sets(
+                seen.point[:, index], seen.weight, float(lower[index]), float(upper[index]), (JUDGED,)
+            )
+        own = sum(end - start for start, end in lean) / (upper[index] - lower[index])
+        ends = ends or _touched(lean, lower[index], upper[index])
+        if share > WEAKLY >= own and len(lean) == 1 and not ends:
             name = "weakly identified"
             reason = (
                 f"the buildings that were seen are told to within {own:.0%} of the range; how far they stand for "
                 "others is not known, for walls of one material may differ"
             )
-        elif share > WEAKLY:
+        elif share > WEAKLY and own > WEAKLY:
             name = "not identifiable"
             reason = _blindness(index, draws, modelled, names, best, lower, upper, noise_db)
-        elif len(pieces) > 1:
-            name, reason = "ambiguous", _separate(index, pieces, draws, shown)
+        elif max(len(pieces), len(lean)) > 1:
+            several = (lean, basis) if len(lean) > 1 else (pieces, draws)
+            name, reason = "ambiguous", _separate(index, *several, shown)
         elif ends:
             side = (
                 f"below {shown(index, high):.4g}" if ends == ["lower"] else f"above {shown(index, low):.4g}"
@@ -131,12 +139,6 @@ def verdicts(
             reason = f"nine tenths of the posterior take up {share:.0%} of the range"
         found.append(Verdict(told, float(best[index]), name, reason))
     return found
-
-
-def _share(draws: Draws, index: int, lower: float, upper: float) -> float:
-    """Share of the range that a parameter's credible set takes up."""
-    (pieces,) = credible_sets(draws.point[:, index], draws.weight, float(lower), float(upper), (JUDGED,))
-    return sum(high - low for low, high in pieces) / (upper - lower)
 
 
 def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> list[str]:
