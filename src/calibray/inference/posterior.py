@@ -110,7 +110,7 @@ def sample(
         covariance: Covariance of the parameters there by curvature [k, d, d].
         batch: Points of a round.
         rounds: Rounds, the first not counted, that are made unless the draws are enough before.
-        more: Whether there may be another round where those were not enough.
+        more: Whether there may be another round where fewer draws are effective than a round has points.
         enough: Effective draws after which no further round is made.
         seed: Seed of the random numbers.
 
@@ -141,7 +141,7 @@ def sample(
         draws, turn = Draws(lower + unit * width, found, weight), len(share) - 2
         if turn and draws.effective >= enough:
             return draws
-        if turn >= rounds and not more():
+        if turn >= rounds and (draws.effective >= batch or not more()):
             few = draws.effective < TOO_FEW
             return replace(draws, weight=_flattened(raw), flattened=True) if few else draws
         learned = _Learned(_kernels(unit, raw, random), _Apart.of(unit, _flattened(raw)))
