@@ -43,6 +43,9 @@ SHARED: Final = ((128, 4), (64, 3))
 ROUNDS: Final = 20
 """Rounds at most, where those before cost less than they might have: noise that explains little asks no replays."""
 
+TIMES: Final = 3
+"""How many times as many rounds as the cost was thought to allow there may be then."""
+
 ALIKE: Final = 0.1
 """Differences of functions that stand in for an engine, by the links' errors, below which their mean does as well."""
 
@@ -225,7 +228,7 @@ def _from_draws(
 
         def more() -> bool:
             spent = engine.engine.calls - before
-            return done - first <= ROUNDS and spent + batch * explaining.replays <= allowed
+            return done - first <= min(ROUNDS, TIMES * turns) and spent + batch * explaining.replays <= allowed
 
         def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
             nonlocal done
