@@ -228,7 +228,9 @@ def _from_draws(
 
         def more() -> bool:
             spent = engine.engine.calls - before
-            return done - first <= min(ROUNDS, TIMES * turns) and spent + batch * explaining.replays <= allowed
+            return (
+                done - first <= min(ROUNDS, TIMES * turns) and spent + batch * explaining.replays <= allowed
+            )
 
         def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
             nonlocal done
