@@ -139,12 +139,14 @@ def test_the_scene_turns_by_keyboard_and_by_hand(opened):
         pictures.append(page.evaluate("document.getElementById('scene-canvas').toDataURL()"))
     assert len(set(pictures)) == 5
     assert pictures[4] == pictures[0]
+    canvas.scroll_into_view_if_needed()
     box = canvas.bounding_box()
+    before = page.evaluate("Number(document.documentElement.dataset.drawn)")
     page.mouse.move(box["x"] + 200, box["y"] + 100)
     page.mouse.down()
     page.mouse.move(box["x"] + 260, box["y"] + 140)
     page.mouse.up()
-    page.wait_for_timeout(200)
+    drawn(page, before)
     assert page.evaluate("document.getElementById('scene-canvas').toDataURL()") not in pictures
 
 
