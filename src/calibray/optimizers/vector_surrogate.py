@@ -194,7 +194,8 @@ class VectorSurrogate(Optimizer):
         points = maximin_design(self.initial, self.box.dimension, self._rng)
         apart, counted = 0.5 * float(pdist(points).min()), told[:0]
         for point in told:
-            if len(points) and (_separation(point[None], counted) >= apart if len(counted) else True):
+            clumped = len(counted) and _separation(point[None], counted)[0] < apart
+            if len(points) and not clumped:
                 counted = np.vstack([counted, point])
                 points = np.delete(points, np.argmin(cdist(point[None], points)), axis=0)
         return points
