@@ -16,7 +16,8 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --doctest-modules src tests
 
-lint: $(VENV)/.lint
+# What builds the pages is checked too, against the packages that it calls.
+lint: $(VENV)/.lint $(VENV)/.docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
