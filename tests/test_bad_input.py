@@ -195,5 +195,6 @@ def test_the_installed_program_exits_with_2_and_no_traceback(study):
     )
     assert finished.returncode == 2
     assert finished.stdout == ""
-    assert finished.stderr.startswith("Error: ")
+    # A busy machine tells first that it is still starting.
+    assert finished.stderr.splitlines()[-1].startswith("Error: ")
     assert "Traceback" not in finished.stderr

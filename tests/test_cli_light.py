@@ -60,5 +60,7 @@ def test_what_traces_says_why_it_cannot(calibray, tmp_path):
     write_study(tmp_path, content)
     refused = calibray("trace", tmp_path / "study.toml", "-o", tmp_path / "paths.h5")
     assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr.startswith("Error: ")
-    assert PATH_VARIABLE in refused.stderr
+    # A busy machine tells first that it is still starting.
+    message = refused.stderr.splitlines()[-1]
+    assert message.startswith("Error: ")
+    assert PATH_VARIABLE in message
