@@ -17,6 +17,7 @@ from calibray.fields import (
     FINEST,
     layout,
     material_table,
+    path_gains,
     path_losses,
     program,
     slab,
@@ -27,7 +28,7 @@ from calibray.fields.contributions import contributions
 from calibray.fields.resolution import COARSEST
 from calibray.materials import Material, constants_matrix
 from calibray.parameters import Parameter, Parameters
-from calibray.paths import Kind
+from calibray.paths import Kind, take
 
 WAVELENGTH = jnp.asarray(speed_of_light / 28e9)
 HARD = {
@@ -147,6 +148,19 @@ def test_large_programs_are_tabulated_without_being_filled_up(monkeypatch: pytes
     plan = layout(paths, np.float64, 512).program
     assert all("r" not in group.signature for group in plan.groups)
     np.testing.assert_allclose(path_losses(plan, table)[0], padded, rtol=1e-12)
+
+
+def test_formulas_are_evaluated_where_they_stand_and_rows_filled_up_with_ones() -> None:
+    reflected = [(Kind.SPECULAR,) * depth for depth in (1, 0, 3, 2, 3)]
+    # One of these has nothing before, the other nothing behind the diffuse reflection.
+    scattered = [(Kind.SPECULAR, Kind.DIFFUSE), (Kind.DIFFUSE, Kind.REFRACTION)]
+    paths = synthetic.program(reflected + scattered, seed=3)
+    alone = [path_gains(take(paths, np.array([path])))[0] for path in range(paths.num_paths)]
+    np.testing.assert_allclose(path_gains(paths), alone, rtol=1e-12)
+    few = take(paths, np.arange(len(reflected)))
+    evaluated = layout(few).program.coefficients
+    assert isinstance(evaluated, program.Formula)
+    assert len(evaluated.cosine) == few.num_interactions == 9
 
 
 def test_single_precision_holds_metals_at_low_frequencies():

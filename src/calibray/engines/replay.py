@@ -72,7 +72,7 @@ class Replay:
         self._rows, columns = parameters.indices(list(paths.materials))
         used, self._places = np.unique(columns, return_inverse=True)
         self._columns = columns
-        self._base = jnp.asarray(fields.material_table(paths).astype(dtype))
+        self._base = fields.material_table(paths).astype(dtype)
         self._fields = tuple(int(column) for column in used)
         self._intervals = None if tabulate is False else self._needed(force=tabulate is True)
         self._program = self._laid_out()
@@ -134,9 +134,9 @@ class Replay:
         while start < len(values):
             size = self._size()
             block = values[start : start + size]
-            padded = np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)])
-            tables = _tables(self._base, self._rows, self._columns, jnp.asarray(padded))
-            *found, error = function(tables, len(block))
+            tables = np.repeat(self._base[None], size, axis=0)
+            tables[: len(block), self._rows, self._columns] = block
+            *found, error = function(jnp.asarray(tables), len(block))
             if error > TABLE_TOLERANCE:
                 self._refine()
                 continue
@@ -176,10 +176,3 @@ class Replay:
 @jax.jit
 def _chosen(slope: jax.Array, rows: NDArray[np.int64], places: NDArray[np.int64]) -> jax.Array:
     return slope[:, :, rows, places]
-
-
-@jax.jit
-def _tables(
-    base: jax.Array, rows: NDArray[np.int64], columns: NDArray[np.int64], values: jax.Array
-) -> jax.Array:
-    return jax.vmap(lambda value: base.at[rows, columns].set(value))(values)

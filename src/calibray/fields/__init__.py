@@ -7,6 +7,9 @@ compilers vectorize. Precision follows the program: float64 by default, as `jax_
 import jax
 
 jax.config.update("jax_enable_x64", True)
+# Programs run where they are called from: to hand a small one to another thread takes longer than to run it. Large ones
+# share their work out to threads all the same.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 from calibray.fields.compiled import keep_compiled  # noqa: E402
 

@@ -33,8 +33,7 @@ class Contributions:
     """All that the fields take from the materials.
 
     Attributes:
-        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [J + 1], the last of which
-            changes nothing; or their tables.
+        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
         straight: S sqrt(f_s dOmega (1 - K_x)) of the diffuse interactions, which keep the polarization [D].
         crossed: S sqrt(f_s dOmega K_x), which turns it [D].
     """
@@ -64,7 +63,7 @@ def contributions(program: GroupedProgram, table: jax.Array) -> Contributions:
             source.transmitted if source.any_transmitted else False,
             source.transmitted | source.raw,
         )
-        coefficients = _followed_by_one(*found)
+        coefficients = found if source.blank is None else _filled(source.blank, *found)
     else:
         coefficients = tabulation.nodes(source, table, program.wavelength)
     material, solid_angle, scattered, cosine, specular, backward = program.diffuse
@@ -95,7 +94,7 @@ def tangents(
     return found, tuple(push(jnp.zeros_like(table).at[:, column].set(1.0)) for column in columns)
 
 
-def pieces(program: GroupedProgram, found: Contributions) -> tuple[Pieces, ...]:
+def pieces(program: GroupedProgram, found: Contributions, blank: float = 1.0) -> tuple[Pieces, ...]:
     """The contributions cut into what each position of each group takes, in the order of the program.
 
     Derivatives are taken by these pieces: by the flat arrays, every piece would cost a pass over all of them.
@@ -103,12 +102,13 @@ def pieces(program: GroupedProgram, found: Contributions) -> tuple[Pieces, ...]:
     Args:
         program: The program.
         found: The contributions, or their derivatives by something.
+        blank: What a coefficient is where nothing stands: 1, or of derivatives 0.
 
     Returns:
         The pieces, group by group.
     """
     cut, row = [], 0
-    given = _coefficients(program, found)
+    given = _coefficients(program, found, blank)
     for group in program.groups:
         coefficients, diffuse = [], []
         for letter in group.signature:
@@ -121,23 +121,42 @@ def pieces(program: GroupedProgram, found: Contributions) -> tuple[Pieces, ...]:
     return tuple(cut)
 
 
-def _coefficients(program: GroupedProgram, found: Contributions) -> Iterator[tuple[slab.Pair, slab.Pair]]:
+def _coefficients(
+    program: GroupedProgram, found: Contributions, blank: float
+) -> Iterator[tuple[slab.Pair, slab.Pair]]:
     """The coefficients of one position after the other."""
     source = program.coefficients
     if isinstance(source, tabulation.Lookup) and isinstance(found.coefficients, tabulation.Nodes):
         for cell, fraction in zip(source.cell, source.fraction, strict=True):
             yield tabulation.interpolate(found.coefficients, cell, fraction)
     elif not isinstance(found.coefficients, tabulation.Nodes):
-        (te_real, te_imag), (tm_real, tm_imag) = found.coefficients
-        for place in cast(Formula, source).place:
-            te_at, tm_at = (
-                tuple(part.at[place].get(mode="promise_in_bounds") for part in parts)
-                for parts in ((te_real, te_imag), (tm_real, tm_imag))
+        start, (te, tm) = 0, found.coefficients
+        for shape, lines in zip(cast(Formula, source).shapes, cast(Formula, source).lines, strict=True):
+            some = start, lines, shape
+            yield (
+                (_laid(te[0], *some, blank), _laid(te[1], *some)),
+                (_laid(tm[0], *some, blank), _laid(tm[1], *some)),
             )
-            yield cast(slab.Pair, te_at), cast(slab.Pair, tm_at)
+            start += sum(lines)
 
 
-def _followed_by_one(te: slab.Pair, tm: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
-    one, zero = jnp.ones(1, te[0].dtype), jnp.zeros(1, te[0].dtype)
-    whole = [(jnp.append(real, one), jnp.append(imaginary, zero)) for real, imaginary in (te, tm)]
+def _laid(
+    values: jax.Array, start: int, lines: tuple[int, ...], shape: tuple[int, ...], blank: float = 0.0
+) -> jax.Array:
+    """The numbers of one step of a group, the last line first; `blank` stands where nothing is evaluated.
+
+    A line is read on into the next one and the rest left out, which takes no pass of its own over the numbers.
+    """
+    parts, size = [], shape[-1]
+    for length in reversed(lines):
+        part = values[start : start + size]
+        part = jnp.pad(part, (0, size - len(part)))
+        parts.append(part if length == size else jnp.where(jnp.arange(size) < length, part, blank))
+        start += length
+    return jnp.stack(parts[::-1]) if len(shape) > 1 else parts[0]
+
+
+def _filled(blank: jax.Array, te: slab.Pair, tm: slab.Pair) -> tuple[slab.Pair, slab.Pair]:
+    """Coefficients that are 1 where nothing stands."""
+    whole = [(jnp.where(blank, 1.0, real), jnp.where(blank, 0.0, imaginary)) for real, imaginary in (te, tm)]
     return whole[0], whole[1]

@@ -223,7 +223,7 @@ def _contract(
     parts = []
     for rate in rates:
         rises = [[], []]
-        for group, rate_of_group in zip(slope, pieces(program, rate), strict=True):
+        for group, rate_of_group in zip(slope, pieces(program, rate, blank=0.0), strict=True):
             for rise, outer, inner in zip(rises, group, rate_of_group, strict=True):
                 rise += [_dot(a, b).ravel() for a, b in zip(outer, inner, strict=True)]
         sums = [

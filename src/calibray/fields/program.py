@@ -67,19 +67,24 @@ class Group:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["material", "cosine", "transmitted", "raw", "place"],
-    meta_fields=["any_transmitted"],
+    data_fields=["material", "cosine", "transmitted", "raw", "blank"],
+    meta_fields=["shapes", "lines", "any_transmitted"],
 )
 @dataclass(frozen=True)
 class Formula:
-    """What the formula of the coefficients takes, for J coefficients.
+    """What the formula of the coefficients takes, for K places of the groups' steps, one after the other.
+
+    Coefficients are evaluated where they stand: to gather them from elsewhere would take nearly as long as the formula.
+    Places at the end of a line at which nothing stands are left out.
 
     Attributes:
-        material: Material [J].
-        cosine: Cosine of the angle of incidence [J].
-        transmitted: Whether it is a transmission [J].
-        raw: Whether it is a reflection that keeps the scattered energy, as a diffuse one does [J].
-        place: The coefficients that stand at each step of each group, [n] or [k, n]; J where none does.
+        material: Material [K].
+        cosine: Cosine of the angle of incidence [K].
+        transmitted: Whether it is a transmission [K].
+        raw: Whether it is a reflection that keeps the scattered energy, as a diffuse one does [K].
+        blank: Whether nothing stands there, and the coefficient is 1 [K]; None where there is no such place.
+        shapes: Of the places at each step of each group, (n,) or (k, n).
+        lines: How many are evaluated in each line of each step, of the one or the k lines; the last line comes first.
         any_transmitted: Whether any coefficient is a transmission.
     """
 
@@ -87,7 +92,9 @@ class Formula:
     cosine: jax.Array
     transmitted: jax.Array
     raw: jax.Array
-    place: tuple[jax.Array, ...]
+    blank: jax.Array | None
+    shapes: tuple[tuple[int, ...], ...]
+    lines: tuple[tuple[int, ...], ...]
     any_transmitted: bool
 
 
@@ -301,14 +308,26 @@ def _coefficients(
     if intervals is not None:
         root = tabulation.roots(material_table(paths), speed_of_light / paths.frequency)
         return tabulation.make_lookup(material, mode, cosine, root, flat.places, intervals, dtype)
+    lines = [[_filled(line, flat.count) for line in np.atleast_2d(place)] for place in flat.places]
+    at = _joined([line for step in lines for line in reversed(step)], np.int64)
+    blank = at == flat.count
+    # Where nothing stands, something is evaluated and left out.
+    material, mode, cosine = np.append(material, 0)[at], np.append(mode, 0)[at], np.append(cosine, 1.0)[at]
     return Formula(
-        material=jnp.asarray(material),
+        material=jnp.asarray(material.astype(np.int32)),
         cosine=jnp.asarray(cosine.astype(dtype)),
         transmitted=jnp.asarray(mode == tabulation.TRANSMITTED),
         raw=jnp.asarray(mode == tabulation.RAW),
-        place=tuple(jnp.asarray(place.astype(np.int32)) for place in flat.places),
+        blank=jnp.asarray(blank) if blank.any() else None,
+        shapes=tuple(place.shape for place in flat.places),
+        lines=tuple(tuple(len(line) for line in step) for step in lines),
         any_transmitted=bool((mode == tabulation.TRANSMITTED).any()),
     )
+
+
+def _filled(line: NDArray[np.int64], nothing: int) -> NDArray[np.int64]:
+    """A line without the places at its end at which nothing stands."""
+    return line[: int(np.flatnonzero(line != nothing).max(initial=-1)) + 1]
 
 
 def _diffuse(

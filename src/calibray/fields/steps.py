@@ -50,7 +50,8 @@ class Steps:
             paths: The path program.
 
         Returns:
-            The groups; a row is as long as that of the path with the most, the others' are filled up.
+            The groups, paths with most reflections and transmissions first; a row is as long as that of the path with
+            the most, the others' are filled up.
         """
         number = _numbers(paths)
         depth, at = np.diff(paths.first), np.arange(paths.num_interactions)
@@ -60,7 +61,10 @@ class Steps:
         row = before[:-1] - before[paths.first[path]]
         last = np.maximum.accumulate(np.where(special, at, -1))
         rank = at - np.maximum(last + 1, paths.first[path])  # within its row
-        index = _equal(_code(paths, np.where(special, number, 0)))
+        longest = np.bincount(path, number == 1, paths.num_paths)
+        # Paths with more to fill up stand last, so that most of a row's places that stay empty are at its end.
+        index = [some[np.argsort(-longest[some], kind="stable")]
+                 for some in _equal(_code(paths, np.where(special, number, 0)))]  # fmt: skip
         group, column = np.zeros((2, paths.num_paths), dtype=np.int64)
         for place, some in enumerate(index):
             group[some], column[some] = place, np.arange(len(some))
@@ -69,7 +73,7 @@ class Steps:
             mine = at[group[path] == place]
             where = row[mine], rank[mine], column[path[mine]]
             of.append(_rows(mine, number[mine], where, len(some)))
-        return cls(index, tuple(of))
+        return cls(tuple(index), tuple(of))
 
 
 def _rows(

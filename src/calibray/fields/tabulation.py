@@ -45,6 +45,9 @@ MODES: Final = 3
 Intervals = int | NDArray[np.integer]
 """Intervals over a root of the cosine: of every row, or by material and mode [M, 3]."""
 
+CHOSEN: Final = 12
+"""Materials among which a constant is chosen by comparing; of more, it is gathered."""
+
 _MARGIN: Final = 3
 """Nodes of a row beyond its intervals: one before the first, one at the end of the last, one behind it."""
 
@@ -180,15 +183,25 @@ def evaluate(
     column = {name: table[:, index] for name, index in _COLUMN.items()}
     te, tm = slab.coefficients(
         cosine,
-        column["relative_permittivity"][material],
-        slab.loss_term(column["conductivity"], wavelength)[material],
-        column["thickness"][material],
+        _of_material(column["relative_permittivity"], material),
+        _of_material(slab.loss_term(column["conductivity"], wavelength), material),
+        _of_material(column["thickness"], material),
         wavelength,
         transmitted,
     )
-    kept = slab.safe_sqrt(1 - column["scattering_coefficient"] ** 2)[material]
+    kept = _of_material(slab.safe_sqrt(1 - column["scattering_coefficient"] ** 2), material)
     factor = jnp.where(whole, 1.0, kept).astype(cosine.dtype)
     return (te[0] * factor, te[1] * factor), (tm[0] * factor, tm[1] * factor)
+
+
+def _of_material(constant: jax.Array, material: jax.Array) -> jax.Array:
+    """A constant of each interaction's material; chosen from a few, as numbers are gathered one after the other."""
+    if not 0 < len(constant) <= CHOSEN:
+        return constant[material]
+    found = jnp.broadcast_to(constant[0], material.shape)
+    for number in range(1, len(constant)):
+        found = jnp.where(material == number, constant[number], found)
+    return found
 
 
 def nodes(lookup: Lookup, table: jax.Array, wavelength: jax.Array) -> Nodes:
