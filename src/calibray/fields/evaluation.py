@@ -244,13 +244,13 @@ def _dot(a: object, b: object) -> jax.Array:
 
 _decibel = jax.jit(decibel)
 _contributions = jax.jit(contributions)
-_pieces = jax.jit(pieces)
+_pieces = jax.jit(pieces, compiler_options=WIDE)
 _tangents = jax.jit(tangents, static_argnums=2)
 _gains = jax.jit(lambda program, found: path_fields(program, pieces(program, found)))
 _path_powers = jax.jit(lambda program, found: path_power(path_fields(program, found)))
-_link_power_of_pieces = jax.jit(_power, static_argnums=2)
-_power_and_slope = jax.jit(_slope, static_argnums=2)
-_decibel_slope = jax.jit(_contract, static_argnums=4)
+_link_power_of_pieces = jax.jit(_power, static_argnums=2, compiler_options=WIDE)
+_power_and_slope = jax.jit(_slope, static_argnums=2, compiler_options=WIDE)
+_decibel_slope = jax.jit(_contract, static_argnums=4, compiler_options=WIDE)
 
 
 @jax.jit
@@ -260,7 +260,7 @@ def _table_error(program: GroupedProgram, found: Contributions) -> jax.Array:
     return tabulation.table_error(tables, cast(tabulation.Lookup, program.coefficients))
 
 
-@partial(jax.jit, static_argnums=2)
+@partial(jax.jit, static_argnums=2, compiler_options=WIDE)
 def _link_power(program: GroupedProgram, found: Contributions, combining: str, offsets: Offsets) -> jax.Array:
     return _power(program, pieces(program, found), combining, offsets)
 
