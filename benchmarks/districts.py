@@ -1,6 +1,7 @@
 """Districts made from seeds: streets, buildings, materials, carriers and links that no part of the package knows.
 
-Even seeds are to develop on, odd ones are run once at the end. Buildings are boxes with windows, so that the building
+Seeds 100 to 109 are to develop on, though the odd ones of them were once judged by; those to judge by are run once, at
+the end. Buildings are boxes with windows, so that the building
 an interaction belongs to follows from where it happens.
 """
 
@@ -23,10 +24,10 @@ from calibray.scenarios.district import Building, building_meshes, district
 from calibray.scenes.meshes import Mesh, MeshObject, joined, write_scene
 from calibray.study import Setup, Study
 
-DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 102, 104, 106, 108))
+DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105, 106, 107, 108, 109))
 """Districts to develop on."""
 
-JUDGING = tuple(f"district-{seed}" for seed in (101, 103, 105, 107, 109))
+JUDGING = tuple(f"district-{seed}" for seed in (111, 113, 115, 117, 119))
 """Districts to judge by, run once at the end."""
 
 DEMO = "demo"

@@ -61,19 +61,26 @@ def problem() -> Problem:
     return Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
 
 
-def test_derivatives_by_single_buildings_add_up(problem):
-    """Over all buildings, and what is none, they are those by the material's constant."""
+def test_buildings_alike_are_the_material_and_others_have_their_own(problem):
+    """A factor on all buildings of a material is one on the material; the ground is none of them."""
     apart = buildings(problem)
     assert apart is not None
-    candidates = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
-    found = apart.slopes(candidates)
-    _, whole = problem.engine.path_loss_and_jacobian(candidates)
-    for index in range(3):
-        together = found[:, :, apart.owner == index].sum(axis=2)
-        assert together == pytest.approx(whole[:, :, index] * candidates[:, None, index], abs=1e-9)
+    means = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
+    alike = apart.factors(np.zeros(2))
+    assert (alike == 1).all()
+    assert apart.path_loss(means, alike) == pytest.approx(problem.engine.path_loss(means), abs=1e-9)
+    factor = np.where(apart.owner == 1, 1.1, 1.0)[None].repeat(2, axis=0)
+    found = problem.engine.path_loss(means * [1.0, 1.1, 1.0])
+    assert apart.path_loss(means, factor) == pytest.approx(found, abs=1e-9)
     # Concrete is the ground here, which is one and does not differ from itself.
     assert set(apart.building[apart.owner == 0]) == {-1}
     assert (apart.building[apart.owner > 0] >= 0).all()
+    drawn = np.log(apart.factors(np.full(4000, 0.15)))
+    assert drawn.std(axis=0) == pytest.approx(np.where(apart.building >= 0, 0.15, 0.0), rel=0.05)
+    assert (
+        np.abs(np.corrcoef(drawn[:, apart.building >= 0].T) - np.eye((apart.building >= 0).sum())).max()
+        < 0.06
+    )
 
 
 def test_intervals_are_those_of_the_mean_over_buildings():
@@ -99,4 +106,5 @@ def test_intervals_are_those_of_the_mean_over_buildings():
     assert found["mean"][1] == pytest.approx(marble, rel=0.15)
     assert found["seen"][1] < 0.75 * marble
     assert marble > 1.3 * found["seen"][1]
-    assert found["mean"][0] == pytest.approx(found["seen"][0], rel=0.1)
+    # The ground does not differ; where it trades off with what does, means cannot always be followed.
+    assert found["mean"][0] == pytest.approx(found["seen"][0], rel=0.25)

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from calibray.inference.clusters import moved, shared_covariance, spreads
+from calibray.inference.clusters import Leaning, means_behind, overstated, spreads
 from calibray.inference.marginal import DIFFERING, NoiseModel, noise_models
 from calibray.inference.posterior import Draws
 from calibray.inference.verdicts import verdicts
@@ -17,48 +18,120 @@ COUNTS = np.array([30, 6, 3, 1])
 
 LINK_BUILDING = np.repeat(np.arange(4), COUNTS)
 NONE = np.zeros((len(LINK_BUILDING), 0))
+HALF = 0.5
+"""What the links tell as if all buildings were alike, in the unit cube."""
 
 
-def slopes(effect: np.ndarray | float = 1.0) -> np.ndarray:
-    """Derivatives of links that lean on one building each [1, m, 4]."""
-    return ((LINK_BUILDING[:, None] == np.arange(4)) * np.reshape(effect, (-1, 1)))[None]
+def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray = NONE, prior: float = 0.0):
+    """Means that give `HALF` where buildings have so much of their own [n, 4] and path loss is linear [n]."""
+    effect = np.broadcast_to(effect, len(LINK_BUILDING))
+    slope = np.broadcast_to(effect[:, None], (len(own), len(effect), 1))
+    precision = np.full((len(own), 1 + design.shape[1]), 0.0)
+    precision[:, 0] = prior
+
+    def change(x, portion):
+        return effect * (x - HALF + portion * own[:, LINK_BUILDING])
+
+    return means_behind(Leaning(np.full((len(own), 1), HALF), slope, design, precision), change)[:, 0]
+
+
+def drawn(spread: float, count: int = 2000) -> np.ndarray:
+    """What buildings have of their own [n, 4]."""
+    return spread * np.random.default_rng(4).standard_normal((count, 4))
 
 
 def test_many_links_on_one_building_are_one():
-    share = COUNTS / COUNTS.sum()
-    found = shared_covariance(slopes(), np.zeros(4, int), np.arange(4), NONE, np.zeros(1))
-    assert found == pytest.approx(np.sum(share**2))
+    own, share = drawn(0.05), COUNTS / COUNTS.sum()
+    assert behind(own) == pytest.approx(HALF - own @ share)
 
 
-def test_what_is_no_building_does_not_differ():
-    place = np.array([-1, 1, 2, 3])
-    found = shared_covariance(slopes(), np.zeros(4, int), place, NONE, np.zeros(1))
-    assert found == pytest.approx(np.sum((COUNTS[1:] / COUNTS.sum()) ** 2))
-
-
-def test_planted_buildings_move_estimates_so_far():
-    """With an offset fitted beside; as if every link had a building of its own, it would be said to be far less."""
-    random, spread = np.random.default_rng(4), 0.15
-    effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
+def test_what_buildings_have_is_told_beside_an_offset():
+    """Least squares with an offset beside, to what the means found give, ends where the links said."""
+    own, effect = drawn(0.05, 50), np.random.default_rng(4).uniform(2.0, 20.0, len(LINK_BUILDING))
+    found = behind(own, effect, np.ones((len(effect), 1)))
     design = np.column_stack([effect, np.ones(len(effect))])
-    drawn = spread * random.standard_normal((4000, 4))
-    estimate = np.linalg.lstsq(design, (effect * drawn[:, LINK_BUILDING]).T, rcond=None)[0][0]
-    offset = np.ones((len(effect), 1))
-    own = np.zeros(4, int)
-    found = shared_covariance(slopes(effect), own, np.arange(4), offset, np.zeros(2))[0, 0]
-    assert spread**2 * found == pytest.approx(estimate.var(), rel=0.07)
-    single = np.diag(effect)[None]
-    many = np.arange(len(effect))
-    alone = shared_covariance(single, np.zeros(len(effect), int), many, offset, np.zeros(2))[0, 0]
-    assert alone < 0.5 * found
+    answers = effect * (found[:, None] + own[:, LINK_BUILDING])
+    assert np.linalg.lstsq(design, answers.T, rcond=None)[0][0] == pytest.approx(HALF)
+    assert np.abs(behind(own, effect) - found).max() > 0.01
 
 
 def test_a_prior_holds_what_buildings_could_move():
-    free, held = (
-        shared_covariance(slopes(), np.zeros(4, int), np.arange(4), NONE, np.array([precision]))[0, 0]
-        for precision in (0.0, 1e6)
+    assert np.abs(behind(drawn(0.05), prior=1e6) - HALF).max() < 1e-4
+
+
+def test_waves_that_buildings_smear_do_not_look_like_loss():
+    """A damped wave for each of many buildings: fitted as one wave it looks more damped than it is for any of them."""
+    random, wave, spread = np.random.default_rng(1), 25.0, 0.05
+    link = random.uniform(0.5, 1.5, (1, 60))
+    own = spread * random.standard_normal((200, 60))
+
+    def response(damping, phase):
+        return 10.0 * np.exp(-3.0 * damping * link) * np.sin(wave * phase + 6.0 * link)
+
+    truth = np.full((200, 2), [0.3, 0.5])
+    told = response(truth[:, :1], truth[:, 1:] + own)
+
+    def residuals(x, answer):
+        return response(x[0], x[1])[0] - answer
+
+    estimate = np.array([
+        least_squares(residuals, [0.3, 0.5], args=(answer,), bounds=([0, 0], [1, 1])).x for answer in told
+    ])  # fmt: skip
+    assert np.median(estimate[:, 0]) > 0.4
+    step = 1e-6
+    slope = np.stack(
+        [
+            (response(*(estimate + step * unit).T[..., None]) - response(*estimate.T[..., None])) / step
+            for unit in np.eye(2)
+        ],
+        axis=2,
     )
-    assert held < 1e-6 * free
+    others = spread * random.standard_normal((200, 60))
+
+    def change(x, portion):
+        return response(x[:, :1], x[:, 1:] + portion * others) - response(*estimate.T[..., None])
+
+    found = means_behind(Leaning(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6)), change)
+    assert np.median(found[:, 0]) == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_density_is_too_sure_which_place_it_is():
+    """Of two places, by the variance of the logarithm of their ratio, over that which noise alone gives it."""
+    random = np.random.default_rng(4)
+    effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
+    other = np.where(LINK_BUILDING == 0, random.standard_normal(len(effect)), 0.0)
+    columns = np.column_stack([effect, np.ones(len(effect))])
+
+    def followed(gap: np.ndarray) -> np.ndarray:
+        return gap - (columns @ np.linalg.lstsq(columns, gap.T, rcond=None)[0]).T
+
+    own = random.standard_normal((2000, 1)) * other + drawn(0.3)[:, LINK_BUILDING]
+    noise = random.standard_normal(own.shape)
+    ratio, plain = (
+        0.5 * (np.sum(followed(gap) ** 2, axis=1) - np.sum(followed(gap - other) ** 2, axis=1))
+        for gap in (own + noise, noise)
+    )
+    leaning = Leaning(
+        np.full((len(own), 1), HALF), np.broadcast_to(effect[:, None], (len(own), len(effect), 1)),
+        np.ones((len(effect), 1)), np.zeros((len(own), 2)),
+    )  # fmt: skip
+    others = np.broadcast_to(other, (len(own), 1, len(effect)))
+    found = overstated(leaning, own, others)
+    # The square of a normal number is 1 on the mean and 0.45 in the middle.
+    assert 1.0 + (found - 1.0) / 0.455 == pytest.approx(ratio.var() / plain.var(), rel=0.1)
+    assert found > 3.0
+    assert overstated(leaning, own, 1e-3 * others) == 1.0  # no place of its own
+    shared = np.broadcast_to(columns @ [0.3, -2.0], own.shape)
+    assert overstated(leaning, shared, others) == pytest.approx(1.0)
+
+
+def test_a_density_divided_is_that_of_more_noise():
+    point = np.random.default_rng(6).uniform(-20.0, 20.0, (40_000, 1))
+    density = -0.5 * point[:, 0] ** 2
+    draws = Draws(point, density, np.exp(density) / np.exp(density).sum())
+    wider = draws.tempered(9.0)
+    assert wider.weight @ point[:, 0] ** 2 == pytest.approx(9.0, rel=0.05)
+    assert draws.tempered(1.0) is draws
 
 
 @pytest.fixture
@@ -88,20 +161,7 @@ def test_spreads_are_as_likely_as_the_data_say(models):
 def test_a_study_of_like_buildings_moves_nothing(models):
     alike = tuple(model for model in models if model.kind != DIFFERING)
     share = weights(alike, gaussian=1.0)
-    value = np.full((len(share), 2), 5.0)
-    spread = spreads(alike, share, alike)
-    assert (spread == 0).all()
-    there, far = moved(value, spread, np.eye(2))
-    assert (there == value).all()
-    assert (far == 0).all()
-
-
-def test_values_are_moved_by_spread_and_covariance():
-    covariance = np.array([[0.5, 0.2], [0.2, 0.3]])
-    value = np.tile([5.0, 0.1], (20_000, 1))
-    there, far = moved(value, np.full(len(value), 0.1), covariance)
-    assert np.cov(np.log(there / value).T) == pytest.approx(0.01 * covariance, rel=0.06)
-    assert far.mean() == pytest.approx(1.0, abs=0.05)
+    assert (spreads(alike, share, alike) == 0).all()
 
 
 def test_models_left_out_count_as_unlikely(models):

@@ -1,7 +1,7 @@
-"""Paths whose buildings have walls of their own: how path loss follows each building's constants, and what that means.
+"""Paths whose buildings have walls of their own: what path loss they have, and what that means for estimates.
 
 The building of every interaction follows from where it happens and from the scene's meshes (`scenes/wholes.py`). With a
-material for each building, one pass backwards gives the derivatives of every link by the constants of every building.
+material for each building, candidates are buildings.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from calibray.calibration.explaining import Explaining
 from calibray.calibration.problem import Problem
 from calibray.engines.observable import PATH_LOSS
 from calibray.engines.replay import Replay
-from calibray.inference.clusters import moved, shared_covariance, spreads
+from calibray.inference.clusters import TRIED, Leaning, means_behind, overstated, spreads
 from calibray.inference.marginal import NoiseModel
 from calibray.inference.posterior import Draws
-from calibray.materials import Material
+from calibray.materials import BOUNDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
 from calibray.scenes import Scene
@@ -28,20 +28,25 @@ from calibray.scenes.triangles import read_triangles
 from calibray.scenes.wholes import wholes
 
 INTERACTIONS: Final = 30_000
-"""Interactions beyond which buildings are not told apart: derivatives by each one's constants would be dear."""
-
-ANSWERS: Final = 200_000
-"""Derivatives of a candidate beyond which they are not."""
+"""Interactions beyond which buildings are not told apart: replays with constants of each one's own would be dear."""
 
 FEWEST: Final = 2
 """Buildings below which none differs from another."""
 
+DRAWN: Final = (64, 256)
+"""Fewest and most draws that are moved."""
 
-DRAWN: Final = 1000
-"""Draws that are moved."""
+JUDGED: Final = 16
+"""Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
 
-LINEAR: Final = 48
-"""Draws that derivatives are taken at."""
+OTHERS: Final = 64
+"""Other draws that they are told apart from."""
+
+EVALUATED: Final = 6_000_000
+"""Interactions that are evaluated for them: on larger programs fewer draws are moved."""
+
+KNOWN: Final = 9.0
+"""Inverse variance of a prior as wide as a third of the range: it keeps what the data cannot tell within it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,74 +54,133 @@ class Buildings:
     """A scene whose buildings have walls of their own.
 
     Attributes:
+        alike: The study's own replay.
         engine: The replay; its parameters are a constant of one building each, or of what is no building.
         owner: Which of the study's parameters each of them stands in for [c].
         building: Its building, from 0; -1 for what is no building, as the ground [c].
     """
 
+    alike: Replay
     engine: Replay
     owner: NDArray[np.int64]
     building: NDArray[np.int64]
 
-    def slopes(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How path loss follows each building's constants.
+    def factors(self, spread: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
+        """Draw buildings.
 
         Args:
-            candidates: Parameter values [n, d], in the fields' units, alike at all buildings.
+            spread: Standard deviations of the logarithm of a building's factor [n].
+            seed: Seed of the random numbers.
 
         Returns:
-            Derivatives by the logarithm of every constant [n, L, c], [dB].
+            Factors of every constant, 1 of what is no building [n, c].
         """
-        own = candidates[:, self.owner]
-        return self.engine.path_loss_and_jacobian(own)[1] * own[:, None, :]
+        normal = np.random.default_rng(seed).standard_normal((len(spread), len(self.owner)))
+        return np.exp(spread[:, None] * np.where(self.building >= 0, normal, 0.0))
+
+    def path_loss(self, means: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss where buildings differ.
+
+        Args:
+            means: Parameter values, in the fields' units [n, d].
+            factors: Factors of every constant [n, c].
+
+        Returns:
+            Path loss [n, L], [dB].
+        """
+        possible = [BOUNDS[each.field] for each in self.engine.parameters]
+        lower, upper = ([getattr(each, end) for each in possible] for end in ("lower", "upper"))
+        return self.engine.path_loss(np.clip(means[:, self.owner] * factors, lower, upper))
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Points of the search space that are asked what buildings may have added to them.
+
+    Attributes:
+        explaining: The density that they come from.
+        apart: The buildings.
+        loss: Path loss there where all buildings are alike [n, L], [dB].
+        leaning: What links tell there.
+    """
+
+    explaining: Explaining
+    apart: Buildings
+    loss: NDArray[np.float64]
+    leaning: Leaning
+
+    @classmethod
+    def at(cls, explaining: Explaining, apart: Buildings, point: NDArray[np.float64]) -> _Asked:
+        """Ask points [n, d]."""
+        problem, marginal = explaining.problem, explaining.marginal
+        parameters, rows = problem.parameters, explaining.scale / marginal.noise_db
+        lower, upper = parameters.search_bounds
+        candidates = parameters.from_search(point)
+        loss, slope = apart.alike.path_loss_and_jacobian(candidates)
+        by_unit = parameters.search_slope(candidates) * (upper - lower)
+        slope = slope[:, explaining.counted] * by_unit[:, None, :] * rows[:, None]
+        known = np.full((len(point), len(parameters) + marginal.design.shape[1]), KNOWN)
+        known[:, len(parameters) :] = (marginal.ridge / marginal.noise_db) ** 2
+        if len(problem.priors):
+            stated = problem.priors.slopes(candidates) * by_unit[:, None, :]
+            known[:, : len(parameters)] += np.square(stated).sum(axis=1)
+        unit, slope = (point - lower) / (upper - lower), np.where(np.isfinite(slope), slope, 0.0)
+        return cls(explaining, apart, loss, Leaning(unit, slope, marginal.design / marginal.noise_db, known))
+
+    def change(self, place: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What buildings about means in the unit cube [n, d] change, rows in units of the noise [n, m]."""
+        parameters = self.explaining.problem.parameters
+        lower, upper = parameters.search_bounds
+        there = self.apart.path_loss(parameters.from_search(lower + place * (upper - lower)), factors)
+        return self._rows((there - self.loss)[:, self.explaining.counted])
+
+    def means(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means that would have given the points where buildings have these factors, in the unit cube [n, d]."""
+        return means_behind(self.leaning, lambda place, portion: self.change(place, factors**portion))
+
+    def left(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the points do not explain of buildings about the means that would have given them [n, m]."""
+        return self.change(self.means(factors), factors)
+
+    def others(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far the path loss of the links that count at other places [k, m] is from that here [n, k, m]."""
+        return self._rows(loss - self.loss[:, None, self.explaining.counted])
+
+    def _rows(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rows in units of the noise, 0 where a link was lost."""
+        found = gap * (self.explaining.scale / self.explaining.marginal.noise_db)
+        return np.where(np.isfinite(found), found, 0.0)
 
 
 def over_buildings(
-    explaining: Explaining,
-    posterior: Draws,
-    point: NDArray[np.float64],
-    explained: NDArray[np.float64],
-    tried: Sequence[NoiseModel],
+    explaining: Explaining, posterior: Draws, explained: NDArray[np.float64], tried: Sequence[NoiseModel]
 ) -> Draws:
     """A posterior of what buildings have on the mean, where each of them may differ.
 
     Args:
         explaining: The density that was drawn from.
         posterior: The draws, of what the buildings seen have.
-        point: Some draws of equal weight [k, d].
-        explained: What the density told of them, under every model of the noise [k, models].
+        explained: What the density told of some draws of equal weight, under every model of the noise [k, models].
         tried: All models that were tried.
 
     Returns:
         Draws further apart; the same where buildings cannot be told apart, or do not differ.
     """
-    problem, marginal = explaining.problem, explaining.marginal
-    parameters = problem.parameters
-    apart = buildings(problem) if any(model.spread for model in tried) else None
+    apart = buildings(explaining.problem) if any(model.spread for model in tried) else None
     if apart is None:
         return posterior
-    candidates = parameters.from_search(point)
-    some = candidates[:: max(1, len(candidates) // LINEAR)]
-    noise_db, scale = marginal.noise_db, explaining.scale
-    slope = apart.slopes(some)[:, explaining.counted] * (scale[:, None] / noise_db)
-    # A prior as wide as a third of the range keeps what the data cannot tell within it.
-    width = (parameters.upper - parameters.lower) / some.mean(axis=0)
-    known = 9.0 / width**2
-    if len(problem.priors):
-        known[list(problem.priors.index)] += 1.0 / np.square(problem.priors.spread)
-    covariance = shared_covariance(
-        slope, apart.owner, apart.building, marginal.design / noise_db,
-        np.concatenate([known, (marginal.ridge / noise_db) ** 2]),
-    )  # fmt: skip
-    often, total = np.arange(DRAWN) % len(point), np.logaddexp.reduce(explained, axis=1)
-    spread = spreads(marginal.models, np.exp(explained - total[:, None])[often], tried)
-    value, far = moved(candidates[often], spread, covariance)
-    inside = ((value >= parameters.lower) & (value <= parameters.upper)).all(axis=1)
-    count = int(inside.sum())
-    return Draws(
-        parameters.to_search(value[inside]), (total[often] - far)[inside], np.full(count, 1.0 / count),
-        posterior.flattened,
-    )  # fmt: skip
+    count = int(np.clip(EVALUATED // (TRIED * apart.engine.paths.num_interactions), *DRAWN))
+    share = np.exp(explained - np.logaddexp.reduce(explained, axis=1)[:, None])
+    spread = spreads(explaining.marginal.models, share[np.arange(count) % len(share)], tried)
+    some, chosen = _Asked.at(explaining, apart, posterior.resampled(JUDGED)), posterior.chosen(count)
+    others = some.others(explaining.modelled(posterior.resampled(OTHERS, seed=1)))
+    for each in np.unique(spread[spread > 0]).tolist():
+        own, here = some.left(apart.factors(np.full(JUDGED, each), seed=1)), np.flatnonzero(spread == each)
+        chosen[here] = posterior.tempered(overstated(some.leaning, own, others)).chosen(len(here))
+    asked = _Asked.at(explaining, apart, posterior.point[chosen])
+    lower, upper = explaining.problem.parameters.search_bounds
+    found, weight = asked.means(apart.factors(spread)), np.full(count, 1.0 / count)
+    return Draws(lower + found * (upper - lower), posterior.density[chosen], weight, posterior.flattened)
 
 
 def buildings(problem: Problem) -> Buildings | None:
@@ -145,14 +209,14 @@ def _apart(engine: Replay, scene: Scene, combining: str, bandwidth: float | None
     place, kind = key // len(known) - 1, key % len(known)
     names = [f"{known[k]} of {b}" for b, k in zip(place.tolist(), kind.tolist(), strict=True)]
     items, owner, building = _parameters(parameters, names, [known[k] for k in kind], place)
-    if len(np.unique(building[building >= 0])) < FEWEST or paths.num_links * len(items) > ANSWERS:
+    if len(np.unique(building[building >= 0])) < FEWEST:
         return None
     table: Mapping[str, Material] = {
         name: paths.materials[known[k]] for name, k in zip(names, kind.tolist(), strict=True)
     }
     own = replace(paths, material=material.reshape(-1), materials=dict(table))
     again = Replay(own, Parameters(items, parameters.frequency), combining, bandwidth, tabulate=False)
-    return Buildings(again, owner, building)
+    return Buildings(engine, again, owner, building)
 
 
 def _parameters(

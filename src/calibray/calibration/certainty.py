@@ -248,7 +248,7 @@ def _from_draws(
     point = posterior.resampled(WEIGHED)
     each = explaining(point)
     noise = explaining.kinds(np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)))
-    means = over_buildings(explaining, posterior, point, each, tried)
+    means = over_buildings(explaining, posterior, each, tried)
 
     def shown(index: int, value: float) -> float:
         point = lower.copy()

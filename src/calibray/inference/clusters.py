@@ -2,17 +2,28 @@
 
 Links that lean on one building share what its walls have of their own, so that many links do not average it out: an
 estimate from m links of which each leans on one of b buildings is uncertain as from b of them, not from m. What is
-shared can hardly be seen in residuals, for the estimate follows it. With derivatives G_b of path loss by the logarithms
-of building b's own constants, J their sum over all that has constants, in units of the noise, and priors P, the
-estimate follows building b by
+shared can hardly be seen in residuals, for the estimate follows it. Worse, an estimate may follow all of them to one
+side: thick walls reflect in waves, which buildings that differ smear, so that walls look lossier than they are.
 
-    A_b = (J'J + P)^-1 J'G_b,
+So it is asked backwards, which mean over all buildings would have given an estimate (indirect inference: C. Gourieroux,
+A. Monfort and E. Renault, J. Applied Econometrics 8, 1993). Let g(t) be path loss where all buildings are alike and
+f(x, z) that of buildings whose constants are the mean x times exp(spread z), each z drawn. Least squares with g to
+what f(x, z) gives, columns Z of the nuisance beside, ends in t where
 
-which add up to one where the data tell all. Buildings that differ by factors exp(spread z) give it the covariance
-spread^2 sum_b A_b A_b' beside that of the noise, as the covariance that is robust to clusters has it (K.-Y. Liang and
-S. L. Zeger, Biometrika 73, 1986), but for a spread in place of the clusters' residuals: buildings are too few for
-those. Both products are means over the posterior, for at a single point reflections inside walls may cancel a
-derivative.
+    J'(g(t) - f(x, z)) + P (t - x) = 0,
+
+J being the derivatives of g at t beside Z, and P a prior that keeps what links do not tell. For each draw t of the
+posterior, and buildings drawn for it, this is solved for x, followed from x = t on while the buildings' own, z, grow
+from nothing: where waves are steep there are many solutions, and another one has nothing to do with these buildings.
+Where it cannot be followed to the end, it goes on as straight as so far. Where path loss follows constants in straight
+lines, x scatters about t as the covariance that is robust to clusters says (K.-Y. Liang and S. L. Zeger, Biometrika 73,
+1986).
+
+Waves make many places fit, and what single buildings have of their own makes another one fit best than would on the
+mean: a density that takes them as alike is too sure which. Two places are told apart by their difference e in path
+loss, of length one in units of the noise, whose variance is then one. With what buildings change, r, it is
+1 + (e'r)^2, of both what estimates cannot follow; the logarithm of the density is divided by this before draws are
+moved, as that of composite likelihoods is (F. Pauli, W. Racugno and L. Ventura, Statistica Sinica 21, 2011).
 
 Whether buildings differ is no alternative to errors that neighbours share or that have heavy tails: draws of every kind
 of noise are moved. How likely each spread is, is told by those two kinds of noise that differ in nothing else, as far
@@ -22,52 +33,174 @@ and the rarer the more they do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.inference.marginal import DIFFERING, GAUSSIAN, NoiseModel
 
+PORTIONS: Final = 8
+"""Portions of what buildings have of their own, in which means are followed from the estimates on."""
 
-def shared_covariance(
-    slope: NDArray[np.float64],
-    owner: NDArray[np.int64],
-    building: NDArray[np.int64],
-    design: NDArray[np.float64],
-    precision: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Covariance that estimates have from buildings of spread one.
+STEPS: Final = 1
+"""Steps of each portion, of Broyden's method, after one onward."""
+
+TRIED: Final = PORTIONS * (1 + STEPS)
+"""Places that are tried for every estimate."""
+
+LONGEST: Final = 0.2
+"""Longest step, in the unit cube."""
+
+CLOSE: Final = 0.02
+"""Length of the step that is left, in the unit cube, beyond which a mean is followed no further."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leaning:
+    """What links tell at some estimates, as if all buildings were alike. Rows are in units of the noise.
+
+    Attributes:
+        estimate: The estimates, in the unit cube [n, d].
+        slope: Derivatives of path loss by these there [n, m, d].
+        design: Columns of the nuisance [m, q].
+        precision: Inverse variances of the priors of the parameters, and of the nuisance's coefficients [n, d + q].
+    """
+
+    estimate: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    design: NDArray[np.float64]
+    precision: NDArray[np.float64]
+
+    @cached_property
+    def _columns(self) -> NDArray[np.float64]:
+        there = np.broadcast_to(self.design, (*self.slope.shape[:2], self.design.shape[1]))
+        return np.concatenate([self.slope, there], axis=2)
+
+    @cached_property
+    def _normal(self) -> NDArray[np.float64]:
+        square = self._columns.transpose(0, 2, 1) @ self._columns
+        return square + self.precision[:, None, :] * np.eye(square.shape[1])
+
+    def step(self, gap: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far least squares moves an estimate whose links have less path loss than was thought.
+
+        Args:
+            gap: How much less [n, m].
+            place: Where priors are centred, in the unit cube [n, d].
+
+        Returns:
+            The step from the estimates, less that of the priors, in the unit cube [n, d].
+        """
+        width = self.estimate.shape[1]
+        side = np.einsum("nmi,nm->ni", self._columns, gap)
+        side[:, :width] += self.precision[:, :width] * (self.estimate - place)
+        return np.linalg.solve(self._normal, side[..., None])[:, :width, 0]
+
+    def left(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What estimates and nuisance cannot follow.
+
+        Args:
+            gap: Changes of path loss at every estimate [n, k, m].
+
+        Returns:
+            What is left of them [n, k, m].
+        """
+        followed = np.linalg.solve(self._normal, self._columns.transpose(0, 2, 1) @ gap.transpose(0, 2, 1))
+        return gap - (self._columns @ followed).transpose(0, 2, 1)
+
+
+def overstated(leaning: Leaning, own: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    """How many times too sure a density is, which of several places explains the links, that takes buildings as alike.
 
     Args:
-        slope: Derivatives of path loss by the logarithms of all buildings' constants at some draws, rows in units of
-            the noise [n, m, c].
-        owner: Parameter that each of these constants stands in for [c].
-        building: Its building; -1 for what is no building [c].
-        design: Columns of the nuisance, rows in units of the noise [m, q].
-        precision: Inverse variances of the priors of the parameters' logarithms, and of the nuisance's coefficients
-            [d + q].
+        leaning: What links tell at some of these places.
+        own: What buildings of their own change there, but for what the places explain, rows in units of the noise
+            [n, m].
+        others: What path loss other places have instead, likewise [n, k, m].
 
     Returns:
-        Covariance of the parameters' logarithms [d, d].
+        Variance between a place and others, of the noise and of buildings, over that of the noise, at the middling
+        place; 1 where all are neighbours.
 
     Example:
-        >>> one_each = np.eye(4)[None]  # four links, each on a building of its own
-        >>> shared_covariance(
-        ...     one_each, np.zeros(4, int), np.arange(4), np.zeros((4, 0)), np.zeros(1)
-        ... ).round(3).tolist()
-        [[0.25]]
+        >>> alike = Leaning(np.array([[0.5]]), np.ones((1, 4, 1)), np.zeros((4, 0)), np.zeros((1, 1)))
+        >>> other = np.array([[[2.0, 2.0, -2.0, -2.0]]])
+        >>> overstated(alike, np.array([[1.0, 1.0, -1.0, -1.0]]), other)  # as if it were the other place
+        5.0
+        >>> overstated(alike, np.array([[1.0, 1.0, 1.0, 1.0]]), other)  # which an estimate follows
+        1.0
     """
-    width = len(precision) - design.shape[1]
-    whole = np.zeros((*slope.shape[:2], len(precision)))
-    for index in range(width):
-        whole[:, :, index] = slope[:, :, owner == index].sum(axis=2)
-    whole[:, :, width:] = design
-    rows = whole.reshape(-1, len(precision))
-    own = slope[:, :, building >= 0].reshape(len(rows), -1)
-    normal = rows.T @ rows / len(slope) + np.diag(precision)
-    moved = np.linalg.solve(normal, rows.T @ own / len(slope))[:width]
-    return np.asarray(moved @ moved.T, dtype=np.float64)
+    apart, left = leaning.left(others), leaning.left(own[:, None, :])[:, 0]
+    square = np.sum(apart**2, axis=2)
+    far = square > 1.0
+    along = np.einsum("nkm,nm->nk", apart, left) ** 2 / np.where(far, square, 1.0)
+    mean = np.sum(along * far, axis=1) / np.maximum(far.sum(axis=1), 1)
+    return 1.0 + float(np.median(mean))
+
+
+def means_behind(
+    leaning: Leaning, change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Means over all buildings that would have given estimates.
+
+    Args:
+        leaning: What links tell at the estimates.
+        change: Means [n, d], and a portion of what buildings have of their own, to how much their path loss exceeds
+            that at the estimates, rows in units of the noise [n, m].
+
+    Returns:
+        The means, in the unit cube [n, d].
+
+    Example:
+        >>> alike = Leaning(np.array([[0.5]]), np.ones((1, 4, 1)), np.zeros((4, 0)), np.zeros((1, 1)))
+        >>> own = np.array([0.1, 0.0, 0.0, -0.02])  # of four links, each on a building of its own
+        >>> means_behind(alike, lambda x, portion: x - 0.5 + portion * own).round(3).tolist()
+        [[0.48]]
+    """
+    estimate = leaning.estimate
+
+    def missing(place: NDArray[np.float64], portion: float) -> NDArray[np.float64]:
+        return leaning.step(-change(place, portion), place)
+
+    inverse = np.tile(np.eye(estimate.shape[1]), (len(estimate), 1, 1))
+    reached, before, place = np.zeros(len(estimate)), estimate, estimate
+    for number in range(1, PORTIONS + 1):
+        portion = number / PORTIONS
+        found = np.clip(2.0 * place - before, 0.0, 1.0)
+        left = missing(found, portion)
+        for _ in range(STEPS):
+            step = np.einsum("nij,nj->ni", inverse, left)
+            step *= np.minimum(1.0, LONGEST / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
+            there = np.clip(found + step, 0.0, 1.0)
+            told = missing(there, portion)
+            inverse = inverse + _secant(inverse, there - found, left - told)
+            shorter = (np.linalg.norm(told, axis=1) < np.linalg.norm(left, axis=1))[:, None]
+            found, left = np.where(shorter, there, found), np.where(shorter, told, left)
+        followed = (reached == number - 1) & (np.linalg.norm(left, axis=1) <= CLOSE)
+        before, place = place, np.where(followed[:, None], found, place)
+        reached = np.where(followed, number, reached)
+    onward = PORTIONS / np.maximum(reached, 1.0)
+    return np.clip(estimate + onward[:, None] * (place - estimate), 0.0, 1.0)
+
+
+def _secant(
+    inverse: NDArray[np.float64], step: NDArray[np.float64], change: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Broyden's correction of an inverse matrix after a step and the change that it made [n, d, d]."""
+    off = step - np.einsum("nij,nj->ni", inverse, change)
+    along = np.einsum("ni,nij->nj", step, inverse)
+    scale = np.einsum("nj,nj->n", along, change)
+    square = np.sum(step**2, axis=1)
+    sound = (np.abs(scale) > 0.1 * square) & (square > 1e-16)
+    return (
+        np.where(sound, 1.0 / np.where(sound, scale, 1.0), 0.0)[:, None, None]
+        * off[:, :, None]
+        * along[:, None, :]
+    )
 
 
 def spreads(
@@ -105,29 +238,6 @@ def spreads(
     other = random.choice(choices, len(share), p=odds / odds.sum())
     own = np.array([model.spread for model in models])[place]
     return np.where(np.array([model.kind == DIFFERING for model in models])[place], own, other)
-
-
-def moved(
-    value: NDArray[np.float64],
-    spread: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    seed: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Values as far from where they were as buildings that differ may have moved them.
-
-    Args:
-        value: Values of the parameters, greater than 0 [n, d].
-        spread: Spread between the buildings [n].
-        covariance: What `shared_covariance` gave [d, d].
-        seed: Seed of the random numbers.
-
-    Returns:
-        The values [n, d], and half the square of how far each was moved, in standard deviations [n].
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    normal = np.where(spread[:, None] > 0, np.random.default_rng(seed).standard_normal(value.shape), 0.0)
-    return value * np.exp(spread[:, None] * normal @ root.T), 0.5 * np.sum(normal**2, axis=1)
 
 
 def _is(model: NoiseModel, spread: float) -> bool:

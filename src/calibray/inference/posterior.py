@@ -84,7 +84,36 @@ class Draws:
         Returns:
             Points drawn by their weights [count, d].
         """
-        return self.point[_systematic(self.weight, count, np.random.default_rng(seed))]
+        return self.point[self.chosen(count, seed)]
+
+    def chosen(self, count: int, seed: int = 0) -> NDArray[np.intp]:
+        """Their places among the draws.
+
+        Args:
+            count: Number of points.
+            seed: Seed of the random numbers.
+
+        Returns:
+            Indices drawn by weight, ascending [count].
+        """
+        return _systematic(self.weight, count, np.random.default_rng(seed))
+
+    def tempered(self, divisor: float) -> Draws:
+        """The same points, weighed by a density whose logarithm is divided.
+
+        Args:
+            divisor: By how much, 1 or more.
+
+        Returns:
+            Draws of a wider posterior; the same where weights are those of a flatter density already.
+        """
+        if self.flattened or divisor == 1.0:
+            return self
+        there = self.weight > 0
+        wider = np.log(self.weight[there]) + (1.0 / divisor - 1.0) * self.density[there]
+        weight = np.zeros_like(self.weight)
+        weight[there] = np.exp(wider - wider.max())
+        return replace(self, weight=weight / weight.sum())
 
 
 def sample(
