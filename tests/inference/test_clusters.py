@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from calibray.inference.clusters import Leaning, means_behind, overstated, spreads
+from calibray.inference.clusters import Leaning, following, means_behind, overstated, spreads
 from calibray.inference.marginal import DIFFERING, NoiseModel, noise_models
 from calibray.inference.posterior import Draws
 from calibray.inference.verdicts import verdicts
@@ -32,7 +32,9 @@ def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray
     def change(x, portion):
         return effect * (x - HALF + portion * own[:, LINK_BUILDING])
 
-    return means_behind(Leaning(np.full((len(own), 1), HALF), slope, design, precision), change)[:, 0]
+    return means_behind(
+        Leaning(np.full((len(own), 1), HALF), slope, design, precision), change, np.zeros((len(own), 1))
+    )[:, 0]
 
 
 def drawn(spread: float, count: int = 2000) -> np.ndarray:
@@ -53,6 +55,27 @@ def test_what_buildings_have_is_told_beside_an_offset():
     answers = effect * (found[:, None] + own[:, LINK_BUILDING])
     assert np.linalg.lstsq(design, answers.T, rcond=None)[0][0] == pytest.approx(HALF)
     assert np.abs(behind(own, effect) - found).max() > 0.01
+
+
+def test_straight_lines_are_followed_so_far():
+    """With an offset fitted beside; as if every link had a building of its own, it would be said to be far less."""
+    random, own, place = np.random.default_rng(4), drawn(0.15, 4000), np.arange(4)
+    effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
+    design = np.column_stack([effect, np.ones(len(effect))])
+    estimate = np.linalg.lstsq(design, (effect * own[:, LINK_BUILDING]).T, rcond=None)[0][0]
+    slope = ((LINK_BUILDING[:, None] == place) * effect[:, None])[None]
+    found = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.zeros(2))
+    assert own @ found[0] == pytest.approx(estimate)
+    assert found.sum() == pytest.approx(1.0)
+    held = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.array([1e9, 0.0]))
+    assert np.abs(held).max() < 1e-3
+
+
+def test_what_cannot_be_followed_is_taken_straight():
+    """A step of path loss at the estimate: no place near it gives the estimate once buildings differ."""
+    leaning = Leaning(np.full((1, 1), HALF), np.ones((1, 3, 1)), np.zeros((3, 0)), np.zeros((1, 1)))
+    found = means_behind(leaning, lambda x, portion: np.full((1, 3), 4.0), np.full((1, 1), 0.6))
+    assert found.tolist() == [[0.6]]
 
 
 def test_a_prior_holds_what_buildings_could_move():
@@ -91,7 +114,9 @@ def test_waves_that_buildings_smear_do_not_look_like_loss():
     def change(x, portion):
         return response(x[:, :1], x[:, 1:] + portion * others) - response(*estimate.T[..., None])
 
-    found = means_behind(Leaning(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6)), change)
+    leaning = Leaning(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6))
+    found = means_behind(leaning, change, np.full((200, 2), 0.9))
+    assert (found == 0.9).mean() < 0.2  # that cannot be followed
     assert np.median(found[:, 0]) == pytest.approx(0.3, abs=0.05)
 
 

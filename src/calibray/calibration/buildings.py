@@ -17,7 +17,7 @@ from calibray.calibration.explaining import Explaining
 from calibray.calibration.problem import Problem
 from calibray.engines.observable import PATH_LOSS
 from calibray.engines.replay import Replay
-from calibray.inference.clusters import TRIED, Leaning, means_behind, overstated, spreads
+from calibray.inference.clusters import TRIED, Leaning, following, means_behind, overstated, spreads
 from calibray.inference.marginal import NoiseModel
 from calibray.inference.posterior import Draws
 from calibray.materials import BOUNDS, Material
@@ -36,8 +36,14 @@ FEWEST: Final = 2
 DRAWN: Final = (64, 256)
 """Fewest and most draws that are moved."""
 
-JUDGED: Final = 16
+JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
+
+LINEAR: Final = 48
+"""Draws, at most, that derivatives by each building's constants are taken at."""
+
+ANSWERS: Final = 5_000_000
+"""Derivatives that are taken in all: of many buildings or links at fewer draws."""
 
 OTHERS: Final = 64
 """Other draws that they are told apart from."""
@@ -78,6 +84,18 @@ class Buildings:
         normal = np.random.default_rng(seed).standard_normal((len(spread), len(self.owner)))
         return np.exp(spread[:, None] * np.where(self.building >= 0, normal, 0.0))
 
+    def slopes(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How path loss follows each building's constants.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units, alike at all buildings.
+
+        Returns:
+            Derivatives by the logarithm of every constant [n, L, c], [dB].
+        """
+        own = candidates[:, self.owner]
+        return self.engine.path_loss_and_jacobian(own)[1] * own[:, None, :]
+
     def path_loss(self, means: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss where buildings differ.
 
@@ -102,15 +120,23 @@ class _Asked:
         apart: The buildings.
         loss: Path loss there where all buildings are alike [n, L], [dB].
         leaning: What links tell there.
+        followed: How estimates follow single buildings in straight lines [d, c].
     """
 
     explaining: Explaining
     apart: Buildings
     loss: NDArray[np.float64]
     leaning: Leaning
+    followed: NDArray[np.float64]
 
     @classmethod
-    def at(cls, explaining: Explaining, apart: Buildings, point: NDArray[np.float64]) -> _Asked:
+    def at(
+        cls,
+        explaining: Explaining,
+        apart: Buildings,
+        point: NDArray[np.float64],
+        followed: NDArray[np.float64],
+    ) -> _Asked:
         """Ask points [n, d]."""
         problem, marginal = explaining.problem, explaining.marginal
         parameters, rows = problem.parameters, explaining.scale / marginal.noise_db
@@ -125,7 +151,13 @@ class _Asked:
             stated = problem.priors.slopes(candidates) * by_unit[:, None, :]
             known[:, : len(parameters)] += np.square(stated).sum(axis=1)
         unit, slope = (point - lower) / (upper - lower), np.where(np.isfinite(slope), slope, 0.0)
-        return cls(explaining, apart, loss, Leaning(unit, slope, marginal.design / marginal.noise_db, known))
+        return cls(
+            explaining,
+            apart,
+            loss,
+            Leaning(unit, slope, marginal.design / marginal.noise_db, known),
+            followed,
+        )
 
     def change(self, place: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """What buildings about means in the unit cube [n, d] change, rows in units of the noise [n, m]."""
@@ -136,7 +168,16 @@ class _Asked:
 
     def means(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Means that would have given the points where buildings have these factors, in the unit cube [n, d]."""
-        return means_behind(self.leaning, lambda place, portion: self.change(place, factors**portion))
+        parameters = self.explaining.problem.parameters
+        lower, upper = parameters.search_bounds
+        value = parameters.from_search(lower + self.leaning.estimate * (upper - lower))
+        moved = np.clip(
+            value * np.exp(-np.log(factors) @ self.followed.T), parameters.lower, parameters.upper
+        )
+        straight = (parameters.to_search(moved) - lower) / (upper - lower)
+        return means_behind(
+            self.leaning, lambda place, portion: self.change(place, factors**portion), straight
+        )
 
     def left(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the points do not explain of buildings about the means that would have given them [n, m]."""
@@ -172,15 +213,34 @@ def over_buildings(
     count = int(np.clip(EVALUATED // (TRIED * apart.engine.paths.num_interactions), *DRAWN))
     share = np.exp(explained - np.logaddexp.reduce(explained, axis=1)[:, None])
     spread = spreads(explaining.marginal.models, share[np.arange(count) % len(share)], tried)
-    some, chosen = _Asked.at(explaining, apart, posterior.resampled(JUDGED)), posterior.chosen(count)
+    followed = _followed(explaining, apart, posterior.resampled(LINEAR))
+    some = _Asked.at(explaining, apart, posterior.resampled(JUDGED), followed)
+    chosen = posterior.chosen(count)
     others = some.others(explaining.modelled(posterior.resampled(OTHERS, seed=1)))
     for each in np.unique(spread[spread > 0]).tolist():
         own, here = some.left(apart.factors(np.full(JUDGED, each), seed=1)), np.flatnonzero(spread == each)
         chosen[here] = posterior.tempered(overstated(some.leaning, own, others)).chosen(len(here))
-    asked = _Asked.at(explaining, apart, posterior.point[chosen])
+    asked = _Asked.at(explaining, apart, posterior.point[chosen], followed)
     lower, upper = explaining.problem.parameters.search_bounds
     found, weight = asked.means(apart.factors(spread)), np.full(count, 1.0 / count)
     return Draws(lower + found * (upper - lower), posterior.density[chosen], weight, posterior.flattened)
+
+
+def _followed(explaining: Explaining, apart: Buildings, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How estimates follow single buildings in straight lines, on the mean over points [d, c]."""
+    problem, marginal = explaining.problem, explaining.marginal
+    parameters = problem.parameters
+    candidates = parameters.from_search(point)
+    few = max(4, min(len(point), ANSWERS // (len(explaining.scale) * len(apart.owner))))
+    slope = apart.slopes(candidates[:: max(1, len(point) // few)])
+    slope = slope[:, explaining.counted] * (explaining.scale[:, None] / marginal.noise_db)
+    known = KNOWN * np.square(candidates.mean(axis=0) / (parameters.upper - parameters.lower))
+    if len(problem.priors):
+        known[list(problem.priors.index)] += 1.0 / np.square(problem.priors.spread)
+    precision = np.concatenate([known, (marginal.ridge / marginal.noise_db) ** 2])
+    return following(
+        np.where(np.isfinite(slope), slope, 0.0), apart.owner, marginal.design / marginal.noise_db, precision
+    )
 
 
 def buildings(problem: Problem) -> Buildings | None:

@@ -15,9 +15,8 @@ what f(x, z) gives, columns Z of the nuisance beside, ends in t where
 J being the derivatives of g at t beside Z, and P a prior that keeps what links do not tell. For each draw t of the
 posterior, and buildings drawn for it, this is solved for x, followed from x = t on while the buildings' own, z, grow
 from nothing: where waves are steep there are many solutions, and another one has nothing to do with these buildings.
-Where it cannot be followed to the end, it goes on as straight as so far. Where path loss follows constants in straight
-lines, x scatters about t as the covariance that is robust to clusters says (K.-Y. Liang and S. L. Zeger, Biometrika 73,
-1986).
+Where path loss follows constants in straight lines, x scatters about t as the covariance that is robust to clusters
+says (K.-Y. Liang and S. L. Zeger, Biometrika 73, 1986); so it is taken to do where it cannot be followed to the end.
 
 Waves make many places fit, and what single buildings have of their own makes another one fit best than would on the
 mean: a density that takes them as alike is too sure which. Two places are told apart by their difference e in path
@@ -142,8 +141,45 @@ def overstated(leaning: Leaning, own: NDArray[np.float64], others: NDArray[np.fl
     return 1.0 + float(np.median(mean))
 
 
+def following(
+    slope: NDArray[np.float64],
+    owner: NDArray[np.int64],
+    design: NDArray[np.float64],
+    precision: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """How estimates follow single buildings, where path loss follows constants in straight lines.
+
+    Args:
+        slope: Derivatives of path loss by the logarithms of all buildings' constants at some draws, rows in units of
+            the noise [n, m, c].
+        owner: Parameter that each of these constants stands in for [c].
+        design: Columns of the nuisance, rows in units of the noise [m, q].
+        precision: Inverse variances of the priors of the parameters' logarithms, and of the nuisance's coefficients
+            [d + q].
+
+    Returns:
+        Change of the logarithm of each parameter with that of each constant, on the mean over the draws, for at a
+        single one reflections inside walls may cancel a derivative [d, c].
+
+    Example:
+        >>> one_each = np.eye(4)[None]  # four links, each on a building of its own
+        >>> following(one_each, np.zeros(4, int), np.zeros((4, 0)), np.zeros(1)).tolist()
+        [[0.25, 0.25, 0.25, 0.25]]
+    """
+    width = len(precision) - design.shape[1]
+    whole = np.zeros((*slope.shape[:2], len(precision)))
+    for index in range(width):
+        whole[:, :, index] = slope[:, :, owner == index].sum(axis=2)
+    whole[:, :, width:] = design
+    rows = whole.reshape(-1, len(precision))
+    normal = rows.T @ rows / len(slope) + np.diag(precision)
+    return np.linalg.solve(normal, rows.T @ slope.reshape(len(rows), -1) / len(slope))[:width]
+
+
 def means_behind(
-    leaning: Leaning, change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]
+    leaning: Leaning,
+    change: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
+    straight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Means over all buildings that would have given estimates.
 
@@ -151,14 +187,15 @@ def means_behind(
         leaning: What links tell at the estimates.
         change: Means [n, d], and a portion of what buildings have of their own, to how much their path loss exceeds
             that at the estimates, rows in units of the noise [n, m].
+        straight: The means where path loss follows constants in straight lines, in the unit cube [n, d].
 
     Returns:
-        The means, in the unit cube [n, d].
+        The means, in the unit cube [n, d]; the straight ones where they cannot be followed.
 
     Example:
         >>> alike = Leaning(np.array([[0.5]]), np.ones((1, 4, 1)), np.zeros((4, 0)), np.zeros((1, 1)))
         >>> own = np.array([0.1, 0.0, 0.0, -0.02])  # of four links, each on a building of its own
-        >>> means_behind(alike, lambda x, portion: x - 0.5 + portion * own).round(3).tolist()
+        >>> means_behind(alike, lambda x, portion: x - 0.5 + portion * own, np.zeros((1, 1))).round(3).tolist()
         [[0.48]]
     """
     estimate = leaning.estimate
@@ -167,9 +204,8 @@ def means_behind(
         return leaning.step(-change(place, portion), place)
 
     inverse = np.tile(np.eye(estimate.shape[1]), (len(estimate), 1, 1))
-    reached, before, place = np.zeros(len(estimate)), estimate, estimate
-    for number in range(1, PORTIONS + 1):
-        portion = number / PORTIONS
+    followed, before, place = np.ones(len(estimate), dtype=bool), estimate, estimate
+    for portion in np.linspace(0.0, 1.0, PORTIONS + 1)[1:].tolist():
         found = np.clip(2.0 * place - before, 0.0, 1.0)
         left = missing(found, portion)
         for _ in range(STEPS):
@@ -180,11 +216,9 @@ def means_behind(
             inverse = inverse + _secant(inverse, there - found, left - told)
             shorter = (np.linalg.norm(told, axis=1) < np.linalg.norm(left, axis=1))[:, None]
             found, left = np.where(shorter, there, found), np.where(shorter, told, left)
-        followed = (reached == number - 1) & (np.linalg.norm(left, axis=1) <= CLOSE)
+        followed &= np.linalg.norm(left, axis=1) <= CLOSE
         before, place = place, np.where(followed[:, None], found, place)
-        reached = np.where(followed, number, reached)
-    onward = PORTIONS / np.maximum(reached, 1.0)
-    return np.clip(estimate + onward[:, None] * (place - estimate), 0.0, 1.0)
+    return np.where(followed[:, None], place, np.clip(straight, 0.0, 1.0))
 
 
 def _secant(
