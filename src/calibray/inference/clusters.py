@@ -173,7 +173,8 @@ def following(
     whole[:, :, width:] = design
     rows = whole.reshape(-1, len(precision))
     normal = rows.T @ rows / len(slope) + np.diag(precision)
-    return np.linalg.solve(normal, rows.T @ slope.reshape(len(rows), -1) / len(slope))[:width]
+    side = rows.T @ slope.reshape(len(rows), -1) / len(slope)
+    return np.asarray(np.linalg.solve(normal, side)[:width], dtype=np.float64)
 
 
 def means_behind(
