@@ -7,7 +7,7 @@ and into the amplitudes of diffuse reflection; `pieces` hands them out to the po
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, cast
 
@@ -91,7 +91,33 @@ def tangents(
         The contributions, and their derivatives by each column.
     """
     found, push = jax.linearize(partial(contributions, program), table)
-    return found, tuple(push(jnp.zeros_like(table).at[:, column].set(1.0)) for column in columns)
+    rates = {
+        column: push(jnp.zeros_like(table).at[:, column].set(1.0))
+        for column in columns
+        if not (column == _FIELD["conductivity"] and _FIELD["relative_permittivity"] in columns)
+    }
+    return found, tuple(
+        rates[column]
+        if column in rates
+        else _by_conductivity(program, rates[_FIELD["relative_permittivity"]])
+        for column in columns
+    )
+
+
+def _by_conductivity(program: GroupedProgram, by_permittivity: Contributions) -> Contributions:
+    """Derivatives by the conductivity: coefficients are analytic in eta = eps_r - j loss, the loss its multiple."""
+    per_unit = slab.loss_term(jnp.ones_like(program.wavelength), program.wavelength)
+
+    def turned(real: jax.Array, imaginary: jax.Array) -> slab.Pair:
+        return per_unit * imaginary, -per_unit * real
+
+    given = by_permittivity.coefficients
+    if isinstance(given, tabulation.Nodes):
+        pairs = given.values.reshape(len(given.values), -1, 2)
+        both = jnp.stack(turned(pairs[..., 0], pairs[..., 1]), axis=-1)
+        return replace(by_permittivity, coefficients=tabulation.Nodes(both.reshape(given.values.shape)))
+    te, tm = given
+    return replace(by_permittivity, coefficients=(turned(*te), turned(*tm)))
 
 
 def pieces(program: GroupedProgram, found: Contributions, blank: float = 1.0) -> tuple[Pieces, ...]:
