@@ -164,7 +164,9 @@ class _Asked:
         parameters = self.explaining.problem.parameters
         lower, upper = parameters.search_bounds
         there = self.apart.path_loss(parameters.from_search(lower + place * (upper - lower)), factors)
-        return self._rows((there - self.loss)[:, self.explaining.counted])
+        # A link that is lost at both is infinitely far from itself, which counts as nothing.
+        with np.errstate(invalid="ignore"):
+            return self._rows((there - self.loss)[:, self.explaining.counted])
 
     def means(self, factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Means that would have given the points where buildings have these factors, in the unit cube [n, d]."""
@@ -185,7 +187,8 @@ class _Asked:
 
     def others(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far the path loss of the links that count at other places [k, m] is from that here [n, k, m]."""
-        return self._rows(loss - self.loss[:, None, self.explaining.counted])
+        with np.errstate(invalid="ignore"):
+            return self._rows(loss - self.loss[:, None, self.explaining.counted])
 
     def _rows(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rows in units of the noise, 0 where a link was lost."""
