@@ -3,9 +3,10 @@
     python benchmarks/misleading.py --seeds 0:5
 
 runs space mapping on each problem of the families with its own cheap model, with none (the vector surrogate), and with
-two that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored, and
-*tones*, smooth random functions of the same size for every link. It prints the calls that each takes to come within a
-tolerance, and how many more than without. Finished runs are kept under out/misleading; a killed benchmark goes on.
+three that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored,
+*tones*, smooth random functions of the same size for every link, and *noise*, random numbers without any smoothness,
+the same at the same point. It prints the calls that each takes to come within a tolerance, and how many more than
+without. Finished runs are kept under out/misleading; a killed benchmark goes on.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -112,6 +113,47 @@ class Tones:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Normal random numbers, the same at the same point, with derivatives that are as random.
+
+    Attributes:
+        size: Their standard deviation [dB].
+        width: Range of each parameter [d].
+        links: Number of rows m.
+    """
+
+    size: float
+    width: NDArray[np.float64]
+    links: int
+
+    @property
+    def constants(self) -> Constants:
+        """None."""
+        return Constants.none()
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """It claims to know every row [m]."""
+        return np.ones(self.links, dtype=bool)
+
+    def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `CheapModel.residuals`."""
+        return self._drawn(points)[:, 0]
+
+    def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
+        """See `CheapModel.answer`."""
+        drawn = self._drawn(points)
+        slope = np.moveaxis(drawn[:, 1:], 1, -1) / self.width
+        return CheapAnswer(drawn[:, 0], slope, np.zeros((len(points), self.links, 0)))
+
+    def _drawn(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Numbers from generators that are seeded by the bits of each point [n, 1 + d, m]."""
+        shape = (1 + len(self.width), self.links)
+        bits = np.ascontiguousarray(points).view(np.uint64)
+        return self.size * np.array([np.random.default_rng(row).standard_normal(shape) for row in bits])
+
+
 def scrambled(arena: Arena) -> CheapModel:
     """The arena's cheap model, scrambled."""
     model = own(arena)
@@ -121,11 +163,22 @@ def scrambled(arena: Arena) -> CheapModel:
 
 def tones(arena: Arena, count: int = 20) -> CheapModel:
     """Tones of about one period over the box, as large as the residuals in its middle."""
-    rng, middle = np.random.default_rng(0), 0.5 * (arena.lower + arena.upper)
-    told = arena.evaluate(middle[None], False)
-    wave = rng.normal(0.0, np.pi, (count, len(middle))) / (arena.upper - arena.lower)
-    weight = rng.standard_normal((count, told.residuals.shape[1])) * np.sqrt(2.0 / count)
-    return Tones(float(told.value[0]), wave, rng.uniform(0.0, 2.0 * np.pi, count), weight)
+    rng, (size, links) = np.random.default_rng(0), in_the_middle(arena)
+    wave = rng.normal(0.0, np.pi, (count, len(arena.lower))) / (arena.upper - arena.lower)
+    weight = rng.standard_normal((count, links)) * np.sqrt(2.0 / count)
+    return Tones(size, wave, rng.uniform(0.0, 2.0 * np.pi, count), weight)
+
+
+def noise(arena: Arena) -> CheapModel:
+    """Noise as large as the residuals in the middle of the box."""
+    size, links = in_the_middle(arena)
+    return Noise(size, arena.upper - arena.lower, links)
+
+
+def in_the_middle(arena: Arena) -> tuple[float, int]:
+    """Root mean square of the residuals in the middle of the box [dB], and their number."""
+    told = arena.evaluate(0.5 * (arena.lower + arena.upper)[None], False)
+    return float(told.value[0]), told.residuals.shape[1]
 
 
 def own(arena: Arena) -> CheapModel:
@@ -136,7 +189,7 @@ def own(arena: Arena) -> CheapModel:
 
 
 MODELS: dict[str, Callable[[Arena], CheapModel] | None] = {
-    "none": None, "own": own, "scrambled": scrambled, "tones": tones,
+    "none": None, "own": own, "scrambled": scrambled, "tones": tones, "noise": noise,
 }  # fmt: skip
 
 
