@@ -12,8 +12,10 @@ logarithm of squared errors with the cheap model by those without, over all link
 every call the verdict is added to the doubt, which is never less than none (a cumulative sum: E. S. Page, Biometrika 41
 (1954) 100). So one bad step is forgiven, and a model that is far worse than none is given up at once.
 
-On 18 districts and 3 offices, with their own cheap models, the doubt was at most 0.9, and 0.5 from three answers on; of
-those with others that know nothing it was more than 1.1 after two to five answers for all but three.
+On planted problems of the development seeds a cheap model of their own stayed, with a doubt of at most 0.6 from three
+answers on, in 29 of 30 runs; in one, of two parameters and told wrong constants, it was given up after four. Of 45 runs
+with cheap models that know nothing it was given up after three answers in 32, after four in 8, after five in 2; in three
+it foretold about as well as none and stayed.
 """
 
 from __future__ import annotations
