@@ -14,8 +14,8 @@ every call the verdict is added to the doubt, which is never less than none (a c
 
 On planted problems of the development seeds a cheap model of their own stayed, with a doubt of at most 0.6 from three
 answers on, in 29 of 30 runs; in one, of two parameters and told wrong constants, it was given up after four. Of 45 runs
-with cheap models that know nothing it was given up after three answers in 32, after four in 8, after five in 2; in three
-it foretold about as well as none and stayed.
+with cheap models that know nothing it was given up after three answers in 32, after four in 8 and after five in 2; in
+three it foretold about as well as none and stayed.
 """
 
 from __future__ import annotations
