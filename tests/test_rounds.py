@@ -120,7 +120,7 @@ def test_links_turned_around_have_the_same_loss(yard: Tracer, rounds: Paths) -> 
         plain.with_settings(replace(plain.settings, samples=samples)).trace(TURNED)
         for samples in ("auto", 100_000)
     )
-    np.testing.assert_allclose(path_loss(there), path_loss(back), atol=1e-4)
+    np.testing.assert_allclose(path_loss(there), path_loss(back), atol=1e-5)
 
 
 def test_a_search_without_interactions_sends_no_ray(yard: Tracer) -> None:

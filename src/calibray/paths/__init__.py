@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from calibray.paths.program import join_links as join_links
     from calibray.paths.program import take as take
     from calibray.paths.program import take_links as take_links
-    from calibray.paths.reversal import reversed_paths as reversed_paths
     from calibray.paths.schema import SCHEMA_VERSION as SCHEMA_VERSION
     from calibray.paths.sealing import seal as seal
 
@@ -25,7 +24,6 @@ _HOMES = {
     "Paths": "calibray.paths.program",
     "concatenate": "calibray.paths.program",
     "join_links": "calibray.paths.program",
-    "reversed_paths": "calibray.paths.reversal",
     "seal": "calibray.paths.sealing",
     "take": "calibray.paths.program",
     "take_links": "calibray.paths.program",

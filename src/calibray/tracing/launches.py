@@ -145,7 +145,7 @@ class Plan:
 def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settings: TraceSettings) -> bool:
     """Whether rays are sent out by the receivers: they are, where there are fewer of them than transmitters.
 
-    A path is the same in both directions, and is turned around where need be. Diffuse reflection is not: how a
+    A path is the same in both directions, and is turned around after it was found. Diffuse reflection is not: how a
     ray is scattered, and how likely the tracer was to choose it, is told for one direction alone. Such traces start at
     the transmitters.
 
@@ -158,23 +158,6 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
         True where the receivers send.
     """
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
-
-
-def computed_from_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether the geometry of a link's paths is computed from its receiver.
-
-    It is computed from the higher end, mostly the transmitter, as Sionna does; of ends at one height from the one with
-    the lower y, and then the lower x. So it is the same for a link and for the link in the other direction.
-
-    Args:
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-
-    Returns:
-        True where it is [L].
-    """
-    ahead = np.where(rx[:, 2] != tx[:, 2], rx[:, 2] > tx[:, 2], rx[:, 1] < tx[:, 1])
-    return np.where((rx[:, 1:] == tx[:, 1:]).all(axis=1), rx[:, 0] < tx[:, 0], ahead)
 
 
 def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:

@@ -20,21 +20,12 @@ from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
 
 @dataclass(frozen=True)
 class Chunk:
-    """Paths in Sionna's own buffer, between one position and some others.
-
-    Attributes:
-        buffer: The paths, from their sources to their targets.
-        source: Where their sources stand.
-        target: Where their targets stand.
-        link: The link of every path [P].
-        turned: Whether their sources are the links' receivers.
-    """
+    """Paths in Sionna's own buffer, between one position and some others; `link` is the link of every path [P]."""
 
     buffer: PathsBuffer
     source: mi.Point3f
     target: mi.Point3f
     link: NDArray[np.integer]
-    turned: bool
 
 
 @contextmanager

@@ -1,16 +1,9 @@
-"""Candidates turned around: in which direction the geometry of a path is computed, and how it becomes the wave's.
+"""Candidates turned around: found from the receivers, they are made paths from the transmitters.
 
 A mirror image, a straight line through a wall and the point of an edge where a path is shortest are the same from
-either end, so what can be a path from one end can be one from the other. Sionna's method of images is in single
-precision: its points lie up to a tenth of a millimetre beside where they are, elsewhere from the other end, and near
-the angle at which nothing is reflected that changes a path's gain by a thousandth. So the geometry of a link's paths is
-computed from one and the same of its ends (`computed_from_receivers`), whichever is called transmitter and whichever
-sent out rays, and the program of the paths is turned around. What the same rays find is so the same for a link and for
-the link in the other direction. Paths that scatter or are diffracted are computed in the direction of the wave, which
-their fields in Sionna have.
-
-What has a direction is the order of the interactions, both ends, and the faces of an edge: Sionna calls the one that
-the source lights the 0-face.
+either end, so what can be a path from one end can be one from the other. Candidates are turned before their geometry is
+computed, so that a path is the same, digit by digit, from whichever end it was found. What has a direction is the order
+of the interactions, both ends, and the faces of an edge: Sionna calls the one that the source lights the 0-face.
 """
 
 # Mitsuba makes its types when its variant is chosen: its stubs know them as plain objects.
@@ -18,7 +11,7 @@ the source lights the 0-face.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,49 +20,7 @@ from numpy.typing import NDArray
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.paths import Kind
-from calibray.tracing.launches import Launch, computed_from_receivers
-from calibray.tracing.sionna.arrays import aligned, per_interaction, points, vertices_of
-from calibray.tracing.sionna.chunks import Chunk
-
-if TYPE_CHECKING:
-    from calibray.tracing.sionna.tracer import Tracer
-
-
-def settled(
-    tracer: Tracer, candidates: PathsBuffer, launch: Launch, targets: NDArray[np.float64], backwards: bool
-) -> list[Chunk]:
-    """The paths among candidates, their geometry computed from the end that it is always computed from.
-
-    Args:
-        tracer: The tracer.
-        candidates: Candidates, their geometry not computed yet.
-        launch: Where they start, and the links that they belong to.
-        targets: The other end of every one of these links [n, 3], [m].
-        backwards: Whether they start at the links' receivers.
-
-    Returns:
-        At least one chunk; those of paths that were computed from their receivers are turned.
-    """
-    source, target = points(launch.source[None]), points(targets)
-    place = np.array(candidates.target_indices, dtype=np.int64)
-    ends = (targets, launch.source) if backwards else (launch.source, targets)
-    turned = computed_from_receivers(*np.broadcast_arrays(*ends))[place]
-    kind = per_interaction(candidates, "interaction_types")
-    turned &= ~np.isin(kind, (Kind.DIFFUSE, Kind.DIFFRACTION)).any(axis=1)
-    chunks = []
-    for direction in (False, True):
-        index = np.flatnonzero(turned == direction)
-        if not len(index) and (direction or len(place)):
-            continue
-        whole = len(index) == len(place)
-        buffer = candidates if whole else candidates.gather(mi.UInt(aligned(index, np.uint32)))
-        ends = (source, target) if direction == backwards else (target, source)
-        if direction != backwards:
-            buffer = turned_around(buffer, target)
-        tracer.settle(buffer, *ends)
-        end: Any = buffer.target_indices if direction == backwards else buffer.source_indices
-        chunks.append(Chunk(buffer, *ends, launch.links[np.array(end, dtype=np.int64)], direction))
-    return chunks
+from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
 
 
 def turned_around(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +29,7 @@ from calibray.tracing.launches import Launch, Plan, directions, seed_of
 from calibray.tracing.settings import ROUND
 from calibray.tracing.sionna.arrays import aligned, points
 from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_repeats
-from calibray.tracing.sionna.reciprocity import settled
+from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.sequences import Meshes, Unhidden, keys, possible, unfolded
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class Search:
             EngineError: There are more than fit into memory.
         """
         settings = self.tracer.settings
-        power = self._keep(self._direct())
+        power = self._keep([self._direct()])
         if settings.max_depth == 0:
             return
         sent, quiet = 0, 0
@@ -223,13 +223,13 @@ class Search:
                 f"{self.rays:,}", self.launch.source.tolist(), self.change_db,
             )  # fmt: skip
 
-    def _direct(self) -> list[Chunk]:
+    def _direct(self) -> Chunk:
         """The paths without an interaction."""
         ends = points(self.launch.source[None]), points(self.targets)
         scene = self.tracer.mitsuba
         direct = self.tracer.settings.line_of_sight
         buffer = self.tracer.candidates(scene, *ends, 0, 0, direct, len(self.targets) + 2, self.room)
-        return settled(self.tracer, buffer, self.launch, self.targets, self.backwards)
+        return self._chunk(buffer, *ends)
 
     def _try(self, chains: PathsBuffer) -> list[Chunk]:
         """The paths that chains are to any of the receivers."""
@@ -242,8 +242,17 @@ class Search:
             buffer._tgt_indices = mi.UInt(aligned(target[some], np.uint32))
             buffer.schedule()
             dr.eval()
-            chunks += settled(self.tracer, buffer, self.launch, self.targets, self.backwards)
+            ends = points(self.launch.source[None]), points(self.targets)
+            chunks.append(self._chunk(buffer, *ends))
         return chunks
+
+    def _chunk(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> Chunk:
+        """Candidates of the source as paths in the direction of the wave."""
+        if self.backwards:
+            buffer, source, target = turned_around(buffer, target), target, source
+        self.tracer.settle(buffer, source, target)
+        end: Any = buffer.source_indices if self.backwards else buffer.target_indices
+        return Chunk(buffer, source, target, self.launch.links[np.array(end, dtype=np.int64)])
 
     def _keep(self, pieces: list[Chunk]) -> NDArray[np.float64]:
         """Keep what was not found before, and tell the power that every link gained [R].

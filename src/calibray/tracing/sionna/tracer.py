@@ -29,7 +29,7 @@ from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGene
 from calibray.errors import EngineError, InputError
 from calibray.interruption import interruptible
 from calibray.materials import Material
-from calibray.paths import Paths, reversed_paths
+from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name
@@ -43,7 +43,7 @@ from calibray.tracing.sionna.antennas import patterns_of
 from calibray.tracing.sionna.arrays import aligned, gather, per_interaction, points, to_complex, vertices_of
 from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_empty_places, without_repeats
 from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_pattern, shape_materials
-from calibray.tracing.sionna.reciprocity import settled
+from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.rounds import SourceChains, search
 from calibray.tracing.sionna.stored import Trace
 
@@ -200,9 +200,8 @@ class Tracer:
         if progress is not None:
             progress("tracing", 0, len(rx))
         for launch in self.plan(links).launches:
-            found = self._trace_launch(launch, ends[launch.links], room - count, backwards)
-            pieces += found
-            count += sum(len(chunk.link) for chunk in found)
+            pieces.append(self._trace_launch(launch, ends[launch.links], room - count, backwards))
+            count += len(pieces[-1].link)
             if launch.last:
                 chunks += without_repeats(pieces)
                 pieces = []
@@ -272,14 +271,18 @@ class Tracer:
 
     def _trace_launch(
         self, launch: Launch, targets: NDArray[np.float64], room: int, backwards: bool
-    ) -> list[Chunk]:
+    ) -> Chunk:
         samples = self.settings.rays
         share = directions(launch.first, launch.rays, samples) if launch.rays < samples else None
         src, tgt = points(launch.source[None]), points(targets)
         direct = self.settings.line_of_sight and launch.first == 0
         with rays_towards(share):
             buffer = self.candidates(self.mitsuba, src, tgt, launch.rays, launch.seed, direct, BUFFER, room)
-        return settled(self, buffer, launch, targets, backwards)
+        if backwards:
+            buffer, src, tgt = turned_around(buffer, tgt), tgt, src
+        self.settle(buffer, src, tgt)
+        end = buffer.source_indices if backwards else buffer.target_indices
+        return Chunk(buffer, src, tgt, launch.links[np.array(end, dtype=np.int64)])
 
     def candidates(
         self,
@@ -385,20 +388,18 @@ class Tracer:
         Returns:
             The program, its paths ordered by link.
         """
-        tx_radiator, rx_radiator = self._radiators
-        ends = (rx, tx) if chunk.turned else (tx, rx)
-        paths = compile_paths(
-            self._chains(chunk, *ends),
+        return compile_paths(
+            self._chains(chunk, tx, rx),
             chunk.link,
-            *ends,
+            tx,
+            rx,
             frequency=self.frequency,
             materials=materials,
-            antennas=(rx_radiator, tx_radiator) if chunk.turned else (tx_radiator, rx_radiator),
+            antennas=self._radiators,
             settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
         )
-        return reversed_paths(paths) if chunk.turned else paths
 
-    def _chains(self, chunk: Chunk, source: NDArray[np.float64], target: NDArray[np.float64]) -> Chains:
+    def _chains(self, chunk: Chunk, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Chains:
         buffer, count = chunk.buffer, len(chunk.link)
         depth = buffer.depth_dim_size
         shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
@@ -423,8 +424,8 @@ class Tracer:
                     np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1),
                 )
         return Chains(
-            source=source[chunk.link],
-            target=target[chunk.link],
+            source=tx[chunk.link],
+            target=rx[chunk.link],
             vertex=vertices_of(buffer),
             normal=normal,
             kind=kind,
@@ -447,10 +448,7 @@ class Tracer:
         """
         if not len(chunk.link):
             return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
-        buffer, here, there = chunk.buffer, self.tx_antenna, self.rx_antenna
-        patterns = self._tx_patterns, self._rx_patterns
-        if chunk.turned:
-            here, there, patterns = there, here, patterns[::-1]
+        buffer = chunk.buffer
         valid = mi.Bool(buffer.valid)
         ends = dr.width(chunk.source), dr.width(chunk.target)
         found: Any = self._fields(
@@ -460,14 +458,13 @@ class Tracer:
             diffraction=self.settings.diffraction,
             src_positions=chunk.source,
             tgt_positions=chunk.target,
-            src_orientations=points(np.tile(here.orientation, (ends[0], 1))),
-            tgt_orientations=points(np.tile(there.orientation, (ends[1], 1))),
-            src_antenna_patterns=patterns[0],
-            tgt_antenna_patterns=patterns[1],
+            src_orientations=points(np.tile(self.tx_antenna.orientation, (ends[0], 1))),
+            tgt_orientations=points(np.tile(self.rx_antenna.orientation, (ends[1], 1))),
+            src_antenna_patterns=self._tx_patterns,
+            tgt_antenna_patterns=self._rx_patterns,
         )
         # At once: every array read on its own would run the whole stage again.
         dr.eval(found.a, found.tau)
         # The field stage narrows it.
         buffer.valid = valid
-        gains = np.array([[to_complex(gain) for gain in row] for row in found.a])
-        return gains.transpose(2, 1, 0) if chunk.turned else gains.transpose(2, 0, 1)
+        return np.array([[to_complex(gain) for gain in row] for row in found.a]).transpose(2, 0, 1)
