@@ -48,7 +48,7 @@ def test_retracing_and_replaying_agree(retrace):
 
 
 def test_the_demo_is_replayed_as_it_is_traced():
-    """To 0.0005 dB: a path that is computed from its other end leaves what is traced by 0.012 dB near a Brewster angle."""
+    """To 0.0005 dB; a path computed from its other end leaves what is traced by 0.012 dB, near a Brewster angle."""
     setup = Study.load(demo_study_path()).opened()
     replay, traced = (engines.make(setup, name) for name in ("replay", "retrace"))
     lower, upper = replay.parameters.lower, replay.parameters.upper
