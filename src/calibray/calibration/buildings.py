@@ -39,6 +39,9 @@ DRAWN: Final = (64, 256)
 JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
 
+DIFFERENCE: Final = 1e-5
+"""Relative difference of a constant that derivatives are taken by."""
+
 LINEAR: Final = 48
 """Draws, at most, that derivatives by each building's constants are taken at."""
 
@@ -85,7 +88,7 @@ class Buildings:
         return np.exp(spread[:, None] * np.where(self.building >= 0, normal, 0.0))
 
     def slopes(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How path loss follows each building's constants.
+        """How path loss follows each building's constants: by differences, for a reverse pass would take compiling.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units, alike at all buildings.
@@ -93,8 +96,13 @@ class Buildings:
         Returns:
             Derivatives by the logarithm of every constant [n, L, c], [dB].
         """
-        own = candidates[:, self.owner]
-        return self.engine.path_loss_and_jacobian(own)[1] * own[:, None, :]
+        count, width = len(candidates), len(self.owner)
+        moved = np.concatenate([np.ones((1, width)), 1.0 + DIFFERENCE * np.eye(width)])
+        loss = self.path_loss(np.repeat(candidates, width + 1, axis=0), np.tile(moved, (count, 1)))
+        loss = loss.reshape(count, width + 1, -1)
+        with np.errstate(invalid="ignore"):  # a link that is lost at both
+            slope = (loss[:, 1:] - loss[:, :1]) / np.log1p(DIFFERENCE)
+        return slope.transpose(0, 2, 1)
 
     def path_loss(self, means: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss where buildings differ.
