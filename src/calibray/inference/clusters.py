@@ -43,12 +43,9 @@ from numpy.typing import NDArray
 from calibray.inference.marginal import DIFFERING, GAUSSIAN, NoiseModel
 
 PORTIONS: Final = 8
-"""Portions of what buildings have of their own, in which means are followed from the estimates on."""
+"""Portions of what buildings have of their own, in which means are followed: onward, and a step back to the way."""
 
-STEPS: Final = 1
-"""Steps of each portion, of Broyden's method, after one onward."""
-
-TRIED: Final = PORTIONS * (1 + STEPS)
+TRIED: Final = 2 * PORTIONS
 """Places that are tried for every estimate."""
 
 LONGEST: Final = 0.2
@@ -204,38 +201,18 @@ def means_behind(
     def missing(place: NDArray[np.float64], portion: float) -> NDArray[np.float64]:
         return leaning.step(-change(place, portion), place)
 
-    inverse = np.tile(np.eye(estimate.shape[1]), (len(estimate), 1, 1))
     followed, before, place = np.ones(len(estimate), dtype=bool), estimate, estimate
     for portion in np.linspace(0.0, 1.0, PORTIONS + 1)[1:].tolist():
         found = np.clip(2.0 * place - before, 0.0, 1.0)
         left = missing(found, portion)
-        for _ in range(STEPS):
-            step = np.einsum("nij,nj->ni", inverse, left)
-            step *= np.minimum(1.0, LONGEST / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
-            there = np.clip(found + step, 0.0, 1.0)
-            told = missing(there, portion)
-            inverse = inverse + _secant(inverse, there - found, left - told)
-            shorter = (np.linalg.norm(told, axis=1) < np.linalg.norm(left, axis=1))[:, None]
-            found, left = np.where(shorter, there, found), np.where(shorter, told, left)
+        step = left * np.minimum(1.0, LONGEST / np.maximum(np.linalg.norm(left, axis=1), 1e-12))[:, None]
+        there = np.clip(found + step, 0.0, 1.0)
+        told = missing(there, portion)
+        shorter = (np.linalg.norm(told, axis=1) < np.linalg.norm(left, axis=1))[:, None]
+        found, left = np.where(shorter, there, found), np.where(shorter, told, left)
         followed &= np.linalg.norm(left, axis=1) <= CLOSE
         before, place = place, np.where(followed[:, None], found, place)
     return np.where(followed[:, None], place, np.clip(straight, 0.0, 1.0))
-
-
-def _secant(
-    inverse: NDArray[np.float64], step: NDArray[np.float64], change: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Broyden's correction of an inverse matrix after a step and the change that it made [n, d, d]."""
-    off = step - np.einsum("nij,nj->ni", inverse, change)
-    along = np.einsum("ni,nij->nj", step, inverse)
-    scale = np.einsum("nj,nj->n", along, change)
-    square = np.sum(step**2, axis=1)
-    sound = (np.abs(scale) > 0.1 * square) & (square > 1e-16)
-    return (
-        np.where(sound, 1.0 / np.where(sound, scale, 1.0), 0.0)[:, None, None]
-        * off[:, :, None]
-        * along[:, None, :]
-    )
 
 
 def spreads(
