@@ -28,8 +28,7 @@ from calibray.optimizers.corrected import Corrected, correct
 from calibray.optimizers.discrepancy import Seen
 from calibray.optimizers.plausible import Plausible, drawn, surprise
 from calibray.optimizers.sampling import design
-from calibray.optimizers.space_mapping import CLOUD, TRIALS
-from calibray.optimizers.trust import ENOUGH, MISLED, misleading
+from calibray.optimizers.space_mapping import CLOUD, JUDGED, MISLED, TRIALS, misleading
 from calibray.parameters import Parameters
 
 FUNCTIONS: Final = 8
@@ -225,7 +224,7 @@ def ensemble(problem: Problem, trail: Trail, model: ReplayedModel | None = None)
     corrected = None
     if replayed is not None and len(asked.unit) > 1:
         corrected = _corrected(replayed, box, asked, random, noisy)
-        if len(asked.unit) >= ENOUGH and misleading(corrected) > MISLED:
+        if len(asked.unit) >= JUDGED and misleading(corrected) > MISLED:
             corrected = None
     if corrected is not None:
         ground: Ground = corrected

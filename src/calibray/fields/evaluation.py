@@ -139,7 +139,7 @@ def path_losses(
     for table in tables:
         found = _contributions(program, table)
         power = _link_power if once else _link_power_of_pieces
-        powers.append(power(program, found if once else _pieces(program, found), combining, offsets))
+        powers.append(power(program, found if once else _wide_pieces(program, found), combining, offsets))
         errors.append(_table_error(program, found))
     return _decibel(jnp.stack(powers)), float(jnp.stack(errors).max())
 
@@ -172,7 +172,7 @@ def path_losses_and_slopes(
     powers, slopes, errors = [], [], []
     for table in tables:
         found, rates = _tangents(program, table, columns)
-        power, slope = _power_and_slope(program, _pieces(program, found), combining, offsets)
+        power, slope = _power_and_slope(program, _wide_pieces(program, found), combining, offsets)
         powers.append(power)
         slopes.append(_decibel_slope(program, power, slope, rates, table.shape[0]))
         errors.append(_table_error(program, found))
@@ -244,7 +244,8 @@ def _dot(a: object, b: object) -> jax.Array:
 
 _decibel = jax.jit(decibel)
 _contributions = jax.jit(contributions)
-_pieces = jax.jit(pieces, compiler_options=WIDE)
+_pieces = jax.jit(pieces)  # where it may be part of what is compiled as a whole, which takes no options
+_wide_pieces = jax.jit(pieces, compiler_options=WIDE)
 _tangents = jax.jit(tangents, static_argnums=2)
 _gains = jax.jit(lambda program, found: path_fields(program, pieces(program, found)))
 _path_powers = jax.jit(lambda program, found: path_power(path_fields(program, found)))
