@@ -36,8 +36,14 @@ FEWEST: Final = 2
 DRAWN: Final = (64, 256)
 """Fewest and most draws that are moved."""
 
+EVALUATED: Final = 6_000_000
+"""Interactions that are evaluated for these: on larger programs fewer are moved."""
+
 JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
+
+OTHERS: Final = 64
+"""Other draws that those judged are told apart from."""
 
 DIFFERENCE: Final = 1e-5
 """Relative difference of a constant that derivatives are taken by."""
@@ -47,12 +53,6 @@ LINEAR: Final = 48
 
 ANSWERS: Final = 5_000_000
 """Derivatives that are taken in all: of many buildings or links at fewer draws."""
-
-OTHERS: Final = 64
-"""Other draws that they are told apart from."""
-
-EVALUATED: Final = 6_000_000
-"""Interactions that are evaluated for them: on larger programs fewer draws are moved."""
 
 KNOWN: Final = 9.0
 """Inverse variance of a prior as wide as a third of the range: it keeps what the data cannot tell within it."""
