@@ -147,6 +147,7 @@ def test_planted_errors_speak_for_their_kind(kind):
     }[kind]
     models = noise_models(position)
     assert sum(model.weight for model in models) == pytest.approx(1.0)
+    assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
     density = marginal(models, position=position, noise_db=2.0)
     differing = Differing(np.zeros((1, 150)), variance[None])
     assert density.spread == 0.15

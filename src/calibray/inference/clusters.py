@@ -26,7 +26,7 @@ moved, as that of composite likelihoods is (F. Pauli, W. Racugno and L. Ventura,
 
 Whether buildings differ is no alternative to errors that neighbours share or that have heavy tails: draws of every kind
 of noise are moved. How likely each spread is, is told by those two kinds of noise that differ in nothing else, as far
-as these explain the data; as far as others do, it is as before: that buildings differ is as likely as that they do not,
+as these explain the data; as far as others do, it is as before: that buildings differ weighs as every departure does,
 and the rarer the more they do.
 """
 
@@ -40,7 +40,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.inference.marginal import DIFFERING, GAUSSIAN, NoiseModel
+from calibray.inference.marginal import DEPARTURE, DIFFERING, GAUSSIAN, NoiseModel
 
 PORTIONS: Final = 8
 """Portions of what buildings have of their own, in which means are followed: onward, and a step back to the way."""
@@ -244,7 +244,7 @@ def spreads(
     )
     evidence = np.maximum(after, 1e-6) / np.where(before > 0, before, 1.0)
     rare = np.array([1.0 / spread for spread in known])
-    prior = np.concatenate([[float(before[0] > 0)], rare / rare.sum()])
+    prior = np.concatenate([[float(before[0] > 0)], DEPARTURE * rare / rare.sum()])
     odds = prior * evidence ** min(1.0, float(after.sum()))
     place = (random.random((len(share), 1)) > np.cumsum(share, axis=1)[:, :-1]).sum(axis=1)
     other = random.choice(choices, len(share), p=odds / odds.sum())

@@ -36,8 +36,8 @@ from calibray.inference.censored import log_evidence
 from calibray.inference.neighbours import Whitener, pairwise, whitener
 from calibray.inference.tails import evidence, gross, products, regular, student
 
-OFFSET_DB: Final = 10.0
-"""Standard deviation of an offset that was forgotten, as of cables and gains [dB]."""
+OFFSET_DB: Final = 6.0
+"""Standard deviation of an offset that was forgotten, as of a cable or an antenna's gain [dB]."""
 
 SHARES: Final = (0.4, 0.7, 0.95)
 """Shares of the variance that neighbours have in common, where they have."""
@@ -150,13 +150,14 @@ def noise_models(
         found.append(
             [NoiseModel(DIFFERING, 1.0, spread=s) for s in (SPREADS if spread is None else (spread,))]
         )
-    choices = (False, True) if offset else (False,)
+    choices = {False: 1.0, True: DEPARTURE} if offset else {False: 1.0}
+    whole = sum(choices.values())
     size = [1.0 if group[0].kind == GAUSSIAN else DEPARTURE for group in found]
     return tuple(
-        replace(model, weight=part / (sum(size) * len(choices) * len(group)), offset=extra)
+        replace(model, weight=part / sum(size) / len(group) * likely / whole, offset=extra)
         for part, group in zip(size, found, strict=True)
         for model in group
-        for extra in choices
+        for extra, likely in choices.items()
     )
 
 
