@@ -30,7 +30,7 @@ def calibray(tmp_path):
     }
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", "from calibray.cli import main; main()", *map(str, arguments)]
+        command = [sys.executable, "-m", "calibray", *map(str, arguments)]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
     return run

@@ -106,6 +106,22 @@ def test_what_the_data_cannot_tell_spreads_over_its_bounds():
     assert told[0].lower == pytest.approx(3.0 - 1.96 * 0.2, abs=0.08)
 
 
+def test_a_gap_among_draws_of_what_no_link_depends_on_is_chance():
+    """Few draws leave holes; a value of which nothing is known has no separate ranges. One that links depend on has."""
+    point = np.random.default_rng(4).uniform(0.0, 1.0, (400, 1))
+    point = point[np.abs(point[:, 0] - 0.5) > 0.08][:100]
+    draws = Draws(point, np.zeros(100), np.full(100, 0.01))
+
+    def told(slope):
+        return verdicts(draws, lambda x: slope * x, NAMES[:1], np.zeros(1), np.ones(1), 3.0)[0]
+
+    assert told(0.1).name == told(50.0).name == "not identifiable"
+    assert len(told(0.1).pieces) == 1
+    assert len(told(50.0).pieces) == 2
+    assert told(0.1).lower == told(50.0).lower
+    assert told(0.1).upper == told(50.0).upper
+
+
 def test_two_that_trade_off_are_said_to():
     def density(points):
         return -0.5 * (points.sum(axis=1) - 10.0) ** 2 / 0.1**2

@@ -123,8 +123,12 @@ def verdicts(
                 "others is not known, for walls of one material may differ"
             )
         elif share > WEAKLY and own > WEAKLY:
-            name = "not identifiable"
-            reason = _blindness(index, draws, modelled, names, best, lower, upper, noise_db)
+            name, change = "not identifiable", _effect(index, modelled, best, lower, upper)
+            if change < SILENT_DB:
+                reason = f"no link's path loss changes by more than {change:.1f} dB over its whole range"
+                told = ((told[0][0], told[-1][1]),)  # What lies between pieces is chance.
+            else:
+                reason = _blindness(index, draws, names, change, noise_db)
         elif max(len(pieces), len(lean)) > 1:
             several = (lean, basis) if len(lean) > 1 else (pieces, draws)
             name, reason = "ambiguous", _separate(index, *several, shown)
@@ -161,23 +165,22 @@ def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws,
     return f"{len(pieces)} separate ranges explain the links: around {', '.join(parts)}"
 
 
-def _blindness(
+def _effect(
     index: int,
-    draws: Draws,
     modelled: Modelled,
-    names: Sequence[str],
     best: NDArray[np.float64],
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
-    noise_db: float,
-) -> str:
-    """Why most of the range fits: no link depends on it, another parameter makes up for it, or errors are large."""
+) -> float:
+    """Largest change of a link's path loss over the range of a parameter, all others kept [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(lower[index], upper[index], LINE)
     loss = modelled(line)
-    change = float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
-    if change < SILENT_DB:
-        return f"no link's path loss changes by more than {change:.1f} dB over its whole range"
+    return float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
+
+
+def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> str:
+    """Why most of the range fits though links depend on it: another parameter makes up for it, or errors are large."""
     rank = np.argsort(np.argsort(draws.resampled(400), axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
     traded = np.zeros(len(names))

@@ -1,0 +1,5 @@
+"""`python -m calibray` is `calibray`, where the command is not on the path."""
+
+from calibray.cli import main
+
+main()
