@@ -9,22 +9,22 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtri
 
 from calibray.calibration.buildings import over_buildings
 from calibray.calibration.cheap import ReplayedModel
-from calibray.calibration.explaining import Explaining, has_offset
+from calibray.calibration.curvature import alone, by_curvature, covariances
+from calibray.calibration.explaining import Explaining
+from calibray.calibration.forgotten import forgotten_offset
+from calibray.calibration.minima import BASINS, likely, minima
 from calibray.calibration.noting import ROUGH, contradicted, departures, missed
-from calibray.calibration.problem import Evaluation, Problem
-from calibray.calibration.search import Trail, rounds
+from calibray.calibration.problem import Problem
+from calibray.calibration.search import Trail
 from calibray.calibration.stand_in import ensemble
 from calibray.engines.observable import PATH_LOSS
-from calibray.inference.intervals import CONFIDENCE, Interval, intervals
-from calibray.inference.nuisance import Nuisance, make_term
+from calibray.inference.intervals import CONFIDENCE, Interval
 from calibray.inference.posterior import ENOUGH, Draws, pooled, sample
 from calibray.inference.verdicts import verdicts
 from calibray.inference.widening import widened
-from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameters
 from calibray.progress import Progress
 
@@ -49,17 +49,8 @@ TIMES: Final = 3
 ALIKE: Final = 0.1
 """Differences of functions that stand in for an engine, by the links' errors, below which their mean does as well."""
 
-SEARCHES: Final = 64
-"""Local searches for the minima, where the method kept none."""
-
 KNOWN: Final = 200
 """Minima by least squares that may be such."""
-
-BASINS: Final = 24
-"""Minima that draws start around."""
-
-LIKELY: Final = 20.0
-"""Excess of the sum of squares, in variances of the noise, up to which a minimum may matter."""
 
 WEIGHED: Final = 250
 """Draws that models of the noise are weighed at."""
@@ -72,9 +63,6 @@ LINKS: Final = 10_000
 
 COLUMNS: Final = 100
 """Columns of the nuisance beyond which draws leave them as they are at the optimum."""
-
-NOTED_DB: Final = 0.1
-"""Offset below which none is spoken of [dB]."""
 
 EXACT_DB: Final = 1e-6
 """RMSE of data without noise, which tell everything [dB]."""
@@ -178,8 +166,8 @@ def _certain(
 ) -> Certainty:
     """What the data tell, by a problem and by those that differ in their engine alone, each as likely as the others."""
     told = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
-    local = _curvature(problem, trail, told)
-    freedom = _freedom(problem, told.num_rows)
+    local = by_curvature(problem, trail, told)
+    freedom = told.num_rows - problem.unknowns
     if freedom < 1:
         reason = f"{told.num_rows} links are too few for so many unknowns"
         return Certainty(
@@ -200,27 +188,58 @@ def _from_draws(
     spent: int,
     progress: Progress | None,
 ) -> Certainty:
-    parameters = problem.parameters
-    lower, upper = parameters.search_bounds
-    minima, square = _minima(problem, trail)
-    likely = _likely(minima, square, freedom)
-    offset, shifted = _free_offset(problem, likely, float(square.min()), freedom)
+    known, square = minima(problem, trail)
+    lowest, least = likely(known, square, freedom), float(square.min())
+    offset = forgotten_offset(problem, lowest, least, freedom)
+    found = Certainty(
+        free_offset_db=offset.offset_db, free_offset_error_db=offset.error_db, remarks=offset.remarks
+    )
     if problem.objective.num_counted > LINKS:
         crowd = f"for more than {LINKS:,} links, errors that neighbours share are not looked at"
-        return replace(offset, intervals=_by_curvature(local, crowd))
-    explaining = Explaining.of(problem, likely[0], float(square.min()), freedom)
+        return replace(found, intervals=alone(local, crowd))
+    explaining = Explaining.of(problem, lowest[0], least, freedom)
     tried = explaining.marginal.models
     size = _size(problem, spent, len(engines), explaining.replays)
     if size is None:
-        dear = "draws would cost more than five calibrations"
-        return replace(offset, intervals=_by_curvature(local, dear))
+        return replace(found, intervals=alone(local, "draws would cost more than five calibrations"))
     # What fits worse by least squares may fit best where errors are alike or have heavy tails.
-    known = np.concatenate([minima[np.argsort(square)[:KNOWN]], shifted[:BASINS]])
-    explained = explaining(known)
-    order = np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")
-    starts = known[order[:BASINS]]
+    places = np.concatenate([known[np.argsort(square)[:KNOWN]], offset.minima[:BASINS]])
+    explained = explaining(places)
+    starts = places[np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")[:BASINS]]
     explaining = explaining.without_negligible(explained)
-    wide = _covariances(problem, starts, freedom)
+    wide = covariances(problem, starts, freedom)
+    posterior = pooled(_drawn(explaining, engines, starts, wide, size, progress))
+    each = explaining(posterior.resampled(WEIGHED))
+    noise = explaining.kinds(np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)))
+    means = over_buildings(explaining, posterior, each, tried)
+    told = _told(explaining, posterior, means, local)
+    behind = float(posterior.density.max() - np.logaddexp.reduce(explained[0]))
+    top = problem.parameters.from_search(posterior.point[np.argmax(posterior.density)])
+    best, likeliest = problem.parameters.named(trail.best), problem.parameters.named(top)
+    said = (
+        *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
+        *contradicted(problem, best, told, likeliest, behind, noise), *(ROUGH,) * posterior.flattened,
+    )  # fmt: skip
+    return replace(
+        found,
+        intervals=told,
+        draws=_draws(problem, posterior),
+        posterior=posterior,
+        means=means,
+        noise=noise,
+        remarks=said,
+    )
+
+
+def _drawn(
+    explaining: Explaining,
+    engines: Sequence[Problem],
+    starts: NDArray[np.float64],
+    wide: NDArray[np.float64],
+    size: tuple[int, int, int],
+    progress: Progress | None,
+) -> list[Draws]:
+    """Draws by every engine: from minima [k, d] of so much covariance [k, d, d], as many as `_size` allows."""
     (batch, turns, allowed), done = size, 0
 
     def drawn(engine: Problem) -> Draws:
@@ -240,15 +259,19 @@ def _from_draws(
             return np.logaddexp.reduce(own(points), axis=1)
 
         return sample(
-            density, lower, upper, starts, wide, batch=batch, rounds=turns, more=more,
-            enough=ENOUGH / len(engines), seed=problem.setup.study.method.seed,
+            density, *engine.parameters.search_bounds, starts, wide, batch=batch, rounds=turns, more=more,
+            enough=ENOUGH / len(engines), seed=engine.setup.study.method.seed,
         )  # fmt: skip
 
-    posterior = pooled([drawn(engine) for engine in engines])
-    point = posterior.resampled(WEIGHED)
-    each = explaining(point)
-    noise = explaining.kinds(np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)))
-    means = over_buildings(explaining, posterior, each, tried)
+    return [drawn(engine) for engine in engines]
+
+
+def _told(
+    explaining: Explaining, posterior: Draws, means: Draws, local: dict[str, Interval]
+) -> dict[str, Interval]:
+    """Interval and verdict by parameter, from draws of the buildings seen and of the mean over all."""
+    parameters = explaining.problem.parameters
+    lower, upper = parameters.search_bounds
 
     def shown(index: int, value: float) -> float:
         point = lower.copy()
@@ -272,82 +295,7 @@ def _from_draws(
         )
         if posterior.flattened:
             found[name] = widened(found[name], local[name], lambda value, k=index: in_unit(k, value))
-    behind = float(posterior.density.max() - np.logaddexp.reduce(explained[0]))
-    top = posterior.point[np.argmax(posterior.density)]
-    best, likeliest = parameters.named(trail.best), parameters.named(parameters.from_search(top))
-    said = (
-        *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
-        *contradicted(problem, best, found, likeliest, behind, noise), *(ROUGH,) * posterior.flattened,
-    )  # fmt: skip
-    return replace(
-        offset,
-        intervals=found,
-        draws=_draws(problem, posterior),
-        posterior=posterior,
-        means=means,
-        noise=noise,
-        remarks=said,
-    )
-
-
-def _by_curvature(local: dict[str, Interval], why: str) -> dict[str, Interval]:
-    reason = f"by the curvature at the optimum alone: {why}"
-    return {name: replace(each, reason=reason) for name, each in local.items()}
-
-
-def _freedom(problem: Problem, rows: int) -> int:
-    """Rows of the residuals less what is fitted to them."""
-    return rows - problem.unknowns
-
-
-def _curvature(problem: Problem, trail: Trail, told: Evaluation) -> dict[str, Interval]:
-    """Intervals by linear theory, taken in the search space: of what spans decades, the logarithm is uncertain."""
-    parameters = problem.parameters
-    nuisances = int(problem.objective.determined.sum())
-    point = parameters.to_search(trail.best)
-    scale = np.sqrt(told.num_rows / told.residuals.shape[1])
-    found = intervals(
-        point, told.residuals[0] * scale, told.slopes[0] * scale, *parameters.search_bounds, nuisances,
-        told.num_rows,
-    )  # fmt: skip
-    lower, upper = (
-        parameters.from_search(np.array(ends))
-        for ends in zip(*((each.lower, each.upper) for each in found), strict=True)
-    )
-    unit = parameters.search_slope(trail.best)
-    return {
-        name: Interval(each.standard_error * float(unit[k]), float(lower[k]), float(upper[k]), each.verdict)
-        for k, (name, each) in enumerate(zip(parameters.names, found, strict=True))
-    }
-
-
-def _covariances(problem: Problem, points: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
-    """Covariance of the parameters at minima by linear theory, nowhere wider than a third of the range [k, d, d]."""
-    told = problem.squares(points, derivatives=True)
-    lower, upper = problem.parameters.search_bounds
-    curvature = told.curvature * np.outer(upper - lower, upper - lower)
-    variance = told.value**2 * told.num_rows / freedom
-    # A prior as wide as a third of the range keeps what the data cannot tell within it.
-    precision = curvature / variance[:, None, None] + 9.0 * np.eye(len(lower))
-    return np.linalg.inv(precision) * np.outer(upper - lower, upper - lower)
-
-
-def _minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Every minimum known, as points of the search space [k, d], and their mean squares; the best found leads."""
-    minima = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
-    if len(minima) <= 2:  # the method kept its best alone
-        search = LeastSquares(*problem.parameters.search_bounds, starts=SEARCHES, x0=minima)
-        for _ in rounds(search, problem.squares):
-            pass
-        minima = np.concatenate([minima, search.minima])
-    return minima, problem.squares(minima).value ** 2
-
-
-def _likely(minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
-    """Those that may matter for an interval, the lowest first."""
-    order = np.argsort(square, kind="stable")
-    order = order[square[order] <= square.min() * (1.0 + LIKELY / freedom)]
-    return minima[order]
+    return found
 
 
 def _size(problem: Problem, spent: int, engines: int, replays: int) -> tuple[int, int, int] | None:
@@ -372,36 +320,3 @@ def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
         return named
     coefficients = problem.objective.coefficients(problem.modelled(found))
     return named | dict(zip(columns, coefficients.T.tolist(), strict=True))
-
-
-def _free_offset(
-    problem: Problem, minima: NDArray[np.float64], square: float, freedom: int
-) -> tuple[Certainty, NDArray[np.float64]]:
-    """An offset for all links tried beside a model that has no term of that kind, and the minima with it."""
-    objective, none = problem.objective, np.zeros((0, len(problem.parameters)))
-    if has_offset(problem) or freedom < 2:
-        return Certainty(), none
-    term = make_term(problem.setup.links, "free offset")
-    terms = (*objective.nuisance.terms, term)
-    trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
-    search = LeastSquares(*problem.parameters.search_bounds, starts=16, x0=minima[:BASINS])
-    for _ in rounds(search, trial.squares):
-        pass
-    told = trial.squares(search.minima)
-    shifted = _likely(search.minima, told.value**2, freedom - 1)
-    best = int(np.argmin(told.value))
-    offset = float(trial.objective.coefficients(trial.modelled(search.minima[best : best + 1]))[0, -1])
-    left = float(told.value[best] ** 2)
-    # F of one further column: the offset over its standard error, squared.
-    ratio = (square - left) / left * (freedom - 1) if left > 0 else np.inf
-    if not ratio > 0 or not np.isfinite(ratio):
-        return Certainty(), shifted
-    error = abs(offset) / float(np.sqrt(ratio))
-    remarks: tuple[str, ...] = ()
-    if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= NOTED_DB:
-        remarks = (
-            f"A free offset would be {offset:+.1f} dB, with a standard error of {error:.1f} dB, and not zero: the RMSE "
-            f"would be {np.sqrt(left):.2f} instead of {np.sqrt(square):.2f} dB. Say [offset] if cables or gains may be "
-            "off.",
-        )
-    return Certainty(free_offset_db=offset, free_offset_error_db=error, remarks=remarks), shifted
