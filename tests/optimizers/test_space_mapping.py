@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate, discrepancy
 from calibray.optimizers.averaged import CAPPED, UNLIKELY, Track, averaged
 from calibray.optimizers.box import Box
 from calibray.optimizers.cheap_model import Constants, Differenced
-from calibray.optimizers.corrected import constants_fit, correct
+from calibray.optimizers.corrected import FOLLOWED, constants_fit, correct, misfit
 from calibray.optimizers.discrepancy import Seen
 from calibray.optimizers.sampling import design
 from calibray.optimizers.space_mapping import HELPFUL, misleading
@@ -99,6 +100,30 @@ def test_the_constants_are_those_that_explain_the_answers():
     mean, share = corrected.predict(unit)
     assert mean == pytest.approx(residuals, abs=0.02)  # at evaluated points it is what was answered
     assert share.max() < 1e-3 * corrected.predict(cloud)[1].max()
+
+
+def thick(x: np.ndarray, thickness: np.ndarray) -> np.ndarray:
+    """Path losses of walls, two of them, so thick that their ripples repeat many times within what is believed."""
+    ripple = np.cos(12.0 * thickness[:, :, None] * np.sqrt(x)[:, :, None] + np.stack([PHASE, PHASE[::-1]]))
+    return 6.0 * SIDE[0] * np.log(x[:, :1]) + 3.0 * ripple.sum(axis=1)
+
+
+def test_input_mappings_start_from_the_likeliest_of_many_trials():
+    """Of hundreds of minima one explains the answers, and the first trials lie in others."""
+    box, true = Box.between(LOWER, UPPER), np.array([1.1, 2.3])
+    centre = np.log([1.8, 1.6])
+    constants = Constants(centre, np.full(2, 0.5), centre - 1.5, centre + 1.5)
+    model = Differenced(lambda x, c: thick(x, np.exp(c)), UPPER - LOWER, np.ones(25, bool), constants)
+    unit = design("sobol", 3, 2, np.random.default_rng(0))
+    residuals = thick(box.from_unit(unit), np.tile(true, (3, 1)))
+    cloud = design("sobol", 64, 2, np.random.default_rng(2))
+    trials = centre + 0.5 * np.random.default_rng(1).standard_normal((600, 2))
+    few = correct(model, box, unit, residuals, cloud, trials[:FOLLOWED])
+    assert np.abs(np.exp(few.constants) - true).max() > 0.1
+    many = correct(model, box, unit, residuals, cloud, trials)
+    assert np.exp(many.constants) == pytest.approx(true, rel=1e-3)
+    believed, found = misfit(many, np.stack([centre, many.constants]))
+    assert found < believed - 50.0
 
 
 def test_slopes_of_a_corrected_model_are_those_of_its_predictions():
@@ -249,6 +274,10 @@ def test_the_process_is_a_multivariate_t_by_its_formula():
     process = discrepancy.solve(seen, remains, hyper, 0.7)
     others = np.arange(6) != 2
     fewer = discrepancy.solve(Seen(seen.unit[others], seen.response[others]), remains[others], hyper, 0.7)
+    worse = np.stack([process.whitened, 2.0 * process.whitened])
+    student = multivariate_t(np.zeros(6), np.eye(6), df=discrepancy.FREEDOM)
+    density = np.array([student.logpdf(each.T).sum() for each in worse])
+    assert np.diff(discrepancy.surprise(worse)) == pytest.approx(-np.diff(density))
     left = remains[2] - fewer.predict(Seen(seen.unit[2:3], seen.response[2:3]))[0][0]
     assert process.left_out()[2] == pytest.approx(left)
     assert np.isfinite(value)

@@ -28,7 +28,7 @@ from calibray.optimizers.corrected import Corrected, correct
 from calibray.optimizers.discrepancy import Seen
 from calibray.optimizers.plausible import Plausible, drawn, surprise
 from calibray.optimizers.sampling import design
-from calibray.optimizers.space_mapping import CLOUD, JUDGED, MISLED, TRIALS, misleading
+from calibray.optimizers.space_mapping import CLOUD, JUDGED, MISLED, misleading
 from calibray.parameters import Parameters
 
 FUNCTIONS: Final = 8
@@ -36,6 +36,9 @@ FUNCTIONS: Final = 8
 
 MOST: Final = 200
 """Calls that they pass through, for the matrix is factored some hundred times."""
+
+TRIALS: Final = 8
+"""Constants drawn from their prior that the input mapping starts from, beside the believed ones."""
 
 NEAR: Final = 0.005
 """Distance in the unit cube below which one call tells as much as two, where there are more."""

@@ -3,6 +3,7 @@
 *Input mapping*: the constants that the cheap model takes for granted are those that explain the dear model's answers
 best. Errors are weighed by the covariance of what remains, which is common to an offset and little else, so that an
 offset of a link is no reason to bend a constant; and the constants have a prior around what they are believed to be.
+Walls resonate, so that there are many minima: the search starts from the likeliest of many draws from that prior.
 This is implicit space mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory
 Tech. 52 (2004) 378). *Output mapping*: offset, slope and rest by `discrepancy.py`. The two are fitted in turns.
 """
@@ -27,6 +28,9 @@ TURNS: Final = 2
 
 STEPS: Final = 12
 """Steps of an input mapping from one start."""
+
+FOLLOWED: Final = 8
+"""Trials, those that explain the answers best, that an input mapping starts from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +176,7 @@ def correct(
         unit: The points evaluated, in the unit cube [n, d].
         residuals: The answers [n, m].
         cloud: Points spread over the unit cube, at which the cheap model's response is measured [k, d].
-        trials: Constants to start the input mapping from, beside those before [s, q].
+        trials: Constants, the likeliest of which the input mapping starts from, beside those before [s, q].
         noisy: Whether the answers scatter.
         before: The model of fewer points, to go on from.
 
@@ -191,7 +195,7 @@ def correct(
 
     corrected = around(constants, hyper)
     for _ in range(TURNS if len(constants) else 0):
-        constants = _adjusted(corrected, np.vstack([corrected.constants, trials]))
+        constants = _adjusted(corrected, trials)
         moved = np.abs(constants - corrected.constants).max() > 1e-3 * model.constants.spread.max()
         corrected, trials = around(constants, corrected.rest.hyper), trials[:0]
         if not moved:
@@ -282,12 +286,35 @@ def constants_fit(
     return evaluate
 
 
-def _adjusted(corrected: Corrected, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How badly constants explain the answers, the covariance of what remains kept.
+
+    Args:
+        corrected: The model whose constants are judged.
+        constants: Constants [s, q].
+
+    Returns:
+        Their negative log density, but for a term that all have [s]. Variances of links are integrated out, so that
+        links which other constants did not explain count again.
+    """
+    model, rest, given = corrected.model, corrected.rest, corrected.model.constants
+    points, (count, links) = corrected.box.from_unit(rest.seen.unit), corrected.residuals.shape
+    told = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
+    rows = np.linalg.inv(rest.lower) @ (corrected.residuals - told.reshape(-1, count, links))
+    return discrepancy.surprise(rows) + 0.5 * np.sum(((constants - given.centre) / given.spread) ** 2, axis=1)
+
+
+def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:
     """The constants [q] that explain the answers best, the covariance of what remains kept."""
-    given = corrected.model.constants
+    given, own = corrected.model.constants, corrected.constants[None]
     width = given.upper - given.lower
-    ended = descended((starts - given.lower) / width, constants_fit(corrected), STEPS, 1e-4)
-    return given.lower + ended.unit[np.argmin(ended.cost)] * width
+    likely = (
+        trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]] if len(trials) else trials
+    )
+    starts = (np.vstack([own, likely]) - given.lower) / width
+    ended = descended(starts, constants_fit(corrected), STEPS, 1e-4)
+    found = np.vstack([own, given.lower + ended.unit * width])
+    return found[np.argmin(misfit(corrected, found))]
 
 
 def _cheap(

@@ -200,6 +200,19 @@ def solve(seen: Seen, remains: NDArray[np.float64], hyper: NDArray[np.float64], 
     return Discrepancy(seen, remains, hyper, scale, lower, whitened, solve_triangular(lower.T, whitened))
 
 
+def surprise(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Negative log density of what remains, but for a term that all have: that of a multivariate t.
+
+    Args:
+        whitened: What remains, times the inverse of the Cholesky factor of K [..., n, m].
+
+    Returns:
+        Its sum over the residuals [...].
+    """
+    count, square = whitened.shape[-2], np.sum(whitened**2, axis=-2)
+    return 0.5 * (FREEDOM + count) * np.log1p(square / FREEDOM).sum(axis=-1)
+
+
 def _covariance(a: Seen, b: Seen, hyper: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     s, rates = np.exp(hyper[:3]), np.exp(hyper[3:-1])
     rest = matern(_distance(a, b, rates))

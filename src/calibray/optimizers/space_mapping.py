@@ -63,10 +63,10 @@ SEARCHES: Final = 16
 KEPT: Final = 8
 """Minima, and best points, that these go on from."""
 
-TRIALS: Final = 8
-"""Constants, drawn from their prior, that the first input mappings start from."""
+TRIALS: Final = 200
+"""Constants drawn from their prior for each of the first input mappings, which start from the likeliest ones."""
 
-TRIED: Final = 6
+TRIED: Final = 10
 """Calls after which input mappings go on from the one before alone."""
 
 CANDIDATES: Final = 300
@@ -226,7 +226,7 @@ class SpaceMapping(Optimizer):
             rest.tell(told.x, told.y, residuals=told.residuals)
 
     def _trials(self, model: CheapModel, count: int) -> NDArray[np.float64]:
-        """Constants to start an input mapping from [s, q]."""
+        """Constants to try for an input mapping [s, q]."""
         given = model.constants
         draws = self._rng.standard_normal((TRIALS if count <= TRIED else 0, len(given.centre)))
         return np.vstack(
