@@ -23,8 +23,8 @@ MOST: Final = 1000.0
 """Ratio beyond which how much more likely something is is not told."""
 
 ROUGH: Final = (
-    "Draws that explain the data are too few among so many parameters: intervals are rough, and wider than the data "
-    "tell. Calibrate fewer parameters, or give them priors."
+    "Draws that explain the data are too few among so many parameters: intervals are rough, and a place that fits may "
+    "be missing. Calibrate fewer parameters, or give them priors."
 )
 """Said where the posterior was flattened."""
 
