@@ -11,13 +11,15 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibration import calibrate
-from calibray.calibration.certainty import certainty
+from calibray.calibration.certainty import PLACE, certainty
 from calibray.calibration.explaining import Explaining
+from calibray.calibration.minima import BASINS
 from calibray.calibration.outcome import UNJUDGED
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
 from calibray.calibration.validate import validated
 from calibray.errors import InputError
+from calibray.inference.posterior import sample
 from calibray.inference.validation import CALIBRATED, LAW
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
@@ -70,6 +72,23 @@ def test_intervals_come_from_draws_and_say_why(result):
     text = render(*tables.tables(result))
     assert result.intervals[MARBLE].reason in text
     assert f"{result.profile_calls:,} in" in text
+
+
+def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp_path, noisy, monkeypatch):
+    """Of parameters that hardly matter each place of one that does is found many times, and 24 would be one of two."""
+    problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
+    lower, upper = problem.parameters.search_bounds
+    trail = search(problem, LeastSquares(lower, upper, starts=64, seed=0))
+    many = np.random.default_rng(0).uniform(lower, upper, (150, len(lower)))
+    seen = {}
+
+    def spy(density, lower, upper, minima, covariance, *, batch, **rest):
+        seen.update(places=len(minima), batch=batch)
+        return sample(density, lower, upper, minima, covariance, batch=batch, **rest)
+
+    monkeypatch.setattr("calibray.calibration.certainty.sample", spy)
+    certainty(problem, replace(trail, minima=many))
+    assert seen["places"] == seen["batch"] // PLACE > BASINS
 
 
 def test_draws_explain_the_links_about_as_well(result):

@@ -40,6 +40,10 @@ SIZES: Final = ((512, 20), (512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
 SHARED: Final = ((128, 4), (64, 3))
 """The same where several engines share them."""
 
+PLACE: Final = 4
+"""Points of the first round for each place that draws start around, where that makes more places than `BASINS`: of many
+parameters that hardly matter, each place of one that does is found many times."""
+
 ROUNDS: Final = 20
 """Rounds at most, where those before cost less than they might have: noise that explains little asks no replays."""
 
@@ -205,7 +209,8 @@ def _from_draws(
     # What fits worse by least squares may fit best where errors are alike or have heavy tails.
     places = np.concatenate([known[np.argsort(square)[:KNOWN]], offset.minima[:BASINS]])
     explained = explaining(places)
-    starts = places[np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")[:BASINS]]
+    order = np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")
+    starts = places[order[: max(BASINS, size[0] // PLACE)]]
     explaining = explaining.without_negligible(explained)
     wide = covariances(problem, starts, freedom)
     posterior = pooled(_drawn(explaining, engines, starts, wide, size, progress))

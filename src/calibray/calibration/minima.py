@@ -15,7 +15,7 @@ SEARCHES: Final = 64
 """Local searches for the minima, where the method kept none."""
 
 BASINS: Final = 24
-"""Minima that draws start around."""
+"""Minima that draws start around, at least."""
 
 LIKELY: Final = 20.0
 """Excess of the sum of squares, in variances of the noise, up to which a minimum may matter."""
