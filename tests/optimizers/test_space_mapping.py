@@ -277,7 +277,7 @@ def test_the_process_is_a_multivariate_t_by_its_formula():
     worse = np.stack([process.whitened, 2.0 * process.whitened])
     student = multivariate_t(np.zeros(6), np.eye(6), df=discrepancy.FREEDOM)
     density = np.array([student.logpdf(each.T).sum() for each in worse])
-    assert np.diff(discrepancy.surprise(worse)) == pytest.approx(-np.diff(density))
+    assert np.diff(discrepancy.negative_log_density(worse)) == pytest.approx(-np.diff(density))
     left = remains[2] - fewer.predict(Seen(seen.unit[2:3], seen.response[2:3]))[0][0]
     assert process.left_out()[2] == pytest.approx(left)
     assert np.isfinite(value)

@@ -301,7 +301,9 @@ def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.f
     points, (count, links) = corrected.box.from_unit(rest.seen.unit), corrected.residuals.shape
     told = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
     rows = np.linalg.inv(rest.lower) @ (corrected.residuals - told.reshape(-1, count, links))
-    return discrepancy.surprise(rows) + 0.5 * np.sum(((constants - given.centre) / given.spread) ** 2, axis=1)
+    return discrepancy.negative_log_density(rows) + 0.5 * np.sum(
+        ((constants - given.centre) / given.spread) ** 2, axis=1
+    )
 
 
 def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -200,7 +200,7 @@ def solve(seen: Seen, remains: NDArray[np.float64], hyper: NDArray[np.float64], 
     return Discrepancy(seen, remains, hyper, scale, lower, whitened, solve_triangular(lower.T, whitened))
 
 
-def surprise(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+def negative_log_density(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
     """Negative log density of what remains, but for a term that all have: that of a multivariate t.
 
     Args:
