@@ -18,8 +18,9 @@ from calibray.calibration.problem import Problem
 from calibray.engines.observable import PATH_LOSS
 from calibray.engines.replay import Replay
 from calibray.inference.clusters import TRIED, Leaning, following, means_behind, overstated, spreads
+from calibray.inference.hierarchy import Hierarchy, besides, hierarchical
 from calibray.inference.marginal import NoiseModel
-from calibray.inference.posterior import Draws
+from calibray.inference.posterior import Draws, pooled
 from calibray.materials import BOUNDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
@@ -38,6 +39,15 @@ DRAWN: Final = (64, 256)
 
 EVALUATED: Final = 6_000_000
 """Interactions that are evaluated for these: on larger programs fewer are moved."""
+
+POPULATION: Final = (96, 512)
+"""Fewest and most means that are drawn together with what each building has; where fewer could be, none are."""
+
+ASKED: Final = 50
+"""Replays that each of them takes, about."""
+
+POPULATION_EVALUATED: Final = 40_000_000
+"""Interactions that are evaluated for these."""
 
 JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
@@ -209,6 +219,10 @@ def over_buildings(
 ) -> Draws:
     """A posterior of what buildings have on the mean, where each of them may differ.
 
+    Half of the draws are means behind those of a posterior that takes buildings as alike, and half are drawn together
+    with what each building has. The first keep narrow places apart that a population loses, the second find means far
+    from any that fit where buildings are alike.
+
     Args:
         explaining: The density that was drawn from.
         posterior: The draws, of what the buildings seen have.
@@ -221,6 +235,50 @@ def over_buildings(
     apart = buildings(explaining.problem) if any(model.spread for model in tried) else None
     if apart is None:
         return posterior
+    behind = _behind(explaining, apart, posterior, explained, tried)
+    count = int(POPULATION_EVALUATED // (ASKED * apart.engine.paths.num_interactions))
+    if count < POPULATION[0]:
+        return behind
+    found = _drawn(explaining, apart, posterior, min(count, POPULATION[1]), tried)
+    return pooled([behind, found])
+
+
+def _drawn(
+    explaining: Explaining, apart: Buildings, posterior: Draws, count: int, tried: Sequence[NoiseModel]
+) -> Draws:
+    """Means drawn together with what each building has of its own."""
+    problem, own = explaining.problem, apart.building >= 0
+    parameters = problem.parameters
+
+    def gaps(point: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
+        factors = np.ones((len(point), len(own)))
+        factors[:, own] = np.exp(logarithms)
+        return explaining.gaps(apart.path_loss(parameters.from_unit(point), factors))
+
+    stated = problem.setup.study.noise.heterogeneity
+    hierarchy = Hierarchy(
+        parameters,
+        apart.owner[own],
+        np.unique(apart.building[own], return_inverse=True)[1],
+        np.array([own[apart.owner == k].all() and (apart.owner == k).any() for k in range(len(parameters))]),
+        gaps,
+        replace(explaining.marginal, models=besides(explaining.marginal.models, tried)),
+        problem.priors,
+        None if stated == "auto" else float(stated),
+    )
+    found = hierarchical(hierarchy, posterior, count, seed=problem.setup.study.method.seed)
+    # As good as the places of the others: by what explains the links where buildings are alike.
+    return replace(found, density=np.logaddexp.reduce(explaining(found.point), axis=1))
+
+
+def _behind(
+    explaining: Explaining,
+    apart: Buildings,
+    posterior: Draws,
+    explained: NDArray[np.float64],
+    tried: Sequence[NoiseModel],
+) -> Draws:
+    """Means that would have given draws where buildings differ."""
     count = int(np.clip(EVALUATED // (TRIED * apart.engine.paths.num_interactions), *DRAWN))
     share = np.exp(explained - np.logaddexp.reduce(explained, axis=1)[:, None])
     spread = spreads(explaining.marginal.models, share[np.arange(count) % len(share)], tried)

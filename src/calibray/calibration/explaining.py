@@ -103,6 +103,10 @@ class Explaining:
         """Path loss of the links that count at points of the search space [n, m], [dB]."""
         return self._loss(self.problem.parameters.from_search(points))
 
+    def gaps(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What path loss [n, L] leaves unexplained of the links that count, times the roots of weights [n, m], [dB]."""
+        return self._gaps(self.problem.objective.capped(loss)[:, self.counted])
+
     @property
     def replays(self) -> int:
         """Replays that one point takes."""
@@ -127,7 +131,7 @@ class Explaining:
     def _part(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         candidates = self.problem.parameters.from_search(points)
         loss = self._loss(candidates)
-        gap = (self.problem.objective.measured[self.counted] - self.fixed - loss) * self.scale
+        gap = self._gaps(loss)
         found = np.full((len(points), len(self.marginal.models)), -np.inf)
         apart = _differing_models(self.marginal)
         found[:, ~apart] = _only(self.marginal, ~apart).densities(gap)
@@ -148,6 +152,9 @@ class Explaining:
         ])  # fmt: skip
         with np.errstate(invalid="ignore"):  # Where no path leads to a link that was not heard either.
             return Differing((there.mean(axis=0) - loss) * self.scale, there.var(axis=0) * self.scale**2)
+
+    def _gaps(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (self.problem.objective.measured[self.counted] - self.fixed - loss) * self.scale
 
     def _loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of the links that count [n, m], [dB]."""

@@ -96,7 +96,7 @@ class Draws:
         Returns:
             Indices drawn by weight, ascending [count].
         """
-        return _systematic(self.weight, count, np.random.default_rng(seed))
+        return systematic(self.weight, count, np.random.default_rng(seed))
 
     def tempered(self, divisor: float) -> Draws:
         """The same points, weighed by a density whose logarithm is divided.
@@ -306,7 +306,7 @@ class _Learned:
 def _kernels(unit: NDArray[np.float64], raw: NDArray[np.float64], random: np.random.Generator) -> _Kernels:
     """Kernels around points that explain the data, as wide as their neighbours lie."""
     weight = _flattened(raw)
-    chosen = unit[_systematic(weight, 4 * KERNELS, random)]
+    chosen = unit[systematic(weight, 4 * KERNELS, random)]
     centre = chosen[random.choice(len(chosen), KERNELS, replace=False)]
     dimension = unit.shape[1]
     size = np.sqrt(np.maximum(np.var(chosen, axis=0), 1e-16))
@@ -331,7 +331,7 @@ def _flattened(raw: NDArray[np.float64]) -> NDArray[np.float64]:
         power *= 0.7
 
 
-def _systematic(weight: NDArray[np.float64], count: int, random: np.random.Generator) -> NDArray[np.intp]:
+def systematic(weight: NDArray[np.float64], count: int, random: np.random.Generator) -> NDArray[np.intp]:
     """Indices by weight, as even as chance lets them be."""
     steps = (np.arange(count) + random.random()) / count
     return np.minimum(np.searchsorted(np.cumsum(weight), steps), len(weight) - 1)

@@ -1,0 +1,398 @@
+"""Draws of materials' means together with what every building has of its own, and with how much buildings differ.
+
+Walls of building b have the constants x exp(s z_b): x is the material's mean, z_b normal, and the spread s exponential
+beforehand. What links tell of all three at once is drawn by tempering (sequential Monte Carlo: P. Del Moral, A. Doucet
+and A. Jasra, J. Royal Statistical Society B 68, 2006): a population of draws of a flat density follows it while the
+links count more and more, each time by as much as leaves half of the population effective. In between, draws move:
+
+- buildings, one, two or all of them, are drawn anew about what they were (S. L. Cotter, G. O. Roberts, A. M. Stuart and
+  D. White, Statistical Science 28, 2013);
+- means and the spread follow from the buildings, whose constants stay as they are, so that path loss does as well and
+  nothing is replayed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011);
+- a draw moves as two others of the population differ (C. J. F. ter Braak, Statistics and Computing 16, 2006).
+
+Each draw has a model of the noise of its own, drawn at every step from what the models tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.inference.marginal import DIFFERING, GAUSSIAN, Marginal, NoiseModel
+from calibray.inference.posterior import Draws, systematic
+from calibray.parameters import NO_PRIOR, LogNormal, Parameters
+
+SPREAD: Final = 0.1
+"""Mean of the spread between buildings, beforehand."""
+
+LEAST: Final = 0.004
+"""The least spread, which is as good as none."""
+
+MOST: Final = 0.8
+"""The largest."""
+
+PLACES: Final = 160
+"""Spreads between these that are told apart."""
+
+FIRST: Final = 0.05
+"""Power of the density that the population starts from."""
+
+EFFECTIVE: Final = 0.5
+"""Share of the population that each step is to leave effective."""
+
+STEPS: Final = 12
+"""Steps after which the density stays as flat as it is."""
+
+SWEEPS: Final = 2
+"""Times that every draw is moved in each way, at each step."""
+
+ACCEPTED: Final = 0.25
+"""Share of moves that is to be accepted: their lengths follow it."""
+
+JITTER: Final = 1e-4
+"""Size of what is added to differences of others, so that no place is out of reach."""
+
+TINY: Final = 1e-30
+"""What stands for a constant of 0, whose factors change nothing."""
+
+NEVER: Final = -1e300
+"""Logarithm of a density that is none."""
+
+Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""Points of the unit cube [n, d], and logarithms of the factors of buildings' constants [n, c], to measured minus
+modelled path loss, times the roots of the weights [n, m], [dB]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hierarchy:
+    """Means, buildings, and what links tell of them.
+
+    Attributes:
+        parameters: The parameters d.
+        owner: The parameter that each building's constant stands in for [c].
+        building: Its building, from 0 [c].
+        centred: Parameters whose constants are all those of buildings, so that these tell the mean [d].
+        gaps: What path loss is missing where buildings have constants of their own.
+        marginal: Density of the gaps, its models those of `besides`.
+        priors: Priors of the parameters.
+        spread: Spread between buildings where it is known; None where it is not.
+    """
+
+    parameters: Parameters
+    owner: NDArray[np.int64]
+    building: NDArray[np.int64]
+    centred: NDArray[np.bool_]
+    gaps: Gaps
+    marginal: Marginal
+    priors: LogNormal = NO_PRIOR
+    spread: float | None = None
+
+    def stated(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithm of the priors that are stated, at points [n, d], but for a constant [n]."""
+        if not len(self.priors):
+            return np.zeros(len(point))
+        return -0.5 * np.sum(self.priors.rows(self.parameters.from_unit(point)) ** 2, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Population:
+    """Draws.
+
+    Attributes:
+        point: Means, in the unit cube [n, d].
+        own: What buildings have of their own, normal beforehand [n, c].
+        spread: Spread between buildings [n].
+        model: Model of the noise [n].
+        gap: Measured minus modelled path loss [n, m], [dB].
+        told: Logarithm of the density of the links under that model, and of stated priors [n].
+    """
+
+    point: NDArray[np.float64]
+    own: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    model: NDArray[np.int64]
+    gap: NDArray[np.float64]
+    told: NDArray[np.float64]
+
+    def chosen(self, index: NDArray[np.intp]) -> _Population:
+        return _Population(*(part[index] for part in self._parts()))
+
+    def moved(self, accepted: NDArray[np.bool_], other: _Population) -> _Population:
+        """Those of another population where its draws are accepted [n]."""
+        pairs = zip(self._parts(), other._parts(), strict=True)
+        return _Population(
+            *(np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old) for old, new in pairs)
+        )
+
+    def _parts(self) -> tuple[NDArray, ...]:
+        return self.point, self.own, self.spread, self.model, self.gap, self.told
+
+
+@dataclass(frozen=True)
+class _Lengths:
+    """Lengths of moves, which follow how many are accepted.
+
+    Attributes:
+        anew: Share that all buildings are drawn anew by, 1 for all of what they have of their own.
+        whole: Length of moves of means and buildings together, by that which is right for a normal density.
+        means: That of moves of the means alone.
+    """
+
+    anew: float = 0.5
+    whole: float = 1.0
+    means: float = 1.0
+
+
+def besides(models: Sequence[NoiseModel], tried: Sequence[NoiseModel]) -> tuple[NoiseModel, ...]:
+    """What errors may be besides what buildings do.
+
+    Args:
+        models: The models of noise that were not negligible where all buildings are alike.
+        tried: All models that were tried.
+
+    Returns:
+        Those in which materials do not differ, and those of independent errors, for these may explain what is left
+        once buildings do the rest.
+
+    Example:
+        >>> tried = (NoiseModel("gaussian", 0.2), NoiseModel("student-t", 0.4), NoiseModel("heterogeneous", 0.4))
+        >>> [model.kind for model in besides(tried[2:], tried)]
+        ['gaussian']
+    """
+    found = [model for model in models if model.kind != DIFFERING]
+    for kind in (GAUSSIAN, DIFFERING):
+        for model in tried:
+            if model.kind == kind and not any(_plain(other, model.offset) for other in found):
+                found.append(NoiseModel(GAUSSIAN, model.weight, offset=model.offset))
+    return tuple(found)
+
+
+def _plain(model: NoiseModel, offset: bool) -> bool:
+    """Whether a model is that of independent errors, with an offset or without."""
+    return model.kind == GAUSSIAN and model.offset == offset
+
+
+def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) -> Draws:
+    """Draw means over all buildings, of which the links lean on some.
+
+    Args:
+        hierarchy: What links tell of means and buildings.
+        alike: Draws of the means, in the search space, where all buildings are alike.
+        count: Number of draws.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Draws of equal weight; flattened where so many steps did not lead to the posterior itself.
+    """
+    random, parameters = np.random.default_rng(seed), hierarchy.parameters
+    start = alike.tempered(1.0 / FIRST).resampled(count, seed)
+    population, weight = _first(hierarchy, parameters.to_unit(parameters.from_search(start)), random)
+    power, steps, lengths = FIRST, 0, _Lengths()
+    while True:
+        population = population.chosen(random.permutation(systematic(weight, count, random)))
+        population = _with_models(hierarchy, population, power, random)
+        for _ in range(SWEEPS):
+            population, lengths = _swept(hierarchy, population, power, lengths, random)
+        steps += 1
+        if power == 1.0 or steps == STEPS:
+            point = parameters.to_search(parameters.from_unit(population.point))
+            return Draws(point, population.told, np.full(count, 1.0 / count), power < 1.0)
+        before, power = power, _next(population.told, power)
+        weight = _weights((power - before) * population.told)
+
+
+def _first(
+    hierarchy: Hierarchy, point: NDArray[np.float64], random: np.random.Generator
+) -> tuple[_Population, NDArray[np.float64]]:
+    """Buildings as they may be beforehand about means that explain links where they are alike, and weights."""
+    count, none = len(point), np.zeros((len(point), len(hierarchy.owner)))
+    spread = np.full(count, hierarchy.spread or 0.0)
+    if hierarchy.spread is None:
+        spread = np.clip(random.exponential(SPREAD, count), LEAST, MOST)
+    gap = hierarchy.gaps(point, none)
+    alike = _Population(point, none, spread, np.zeros(count, dtype=np.int64), gap, np.zeros(count))
+    alike = _with_models(hierarchy, alike, FIRST, random)
+    population = _asked(hierarchy, replace(alike, own=random.standard_normal(none.shape)))
+    return population, _weights(FIRST * (population.told - alike.told))
+
+
+def _asked(hierarchy: Hierarchy, population: _Population) -> _Population:
+    """The same with what links tell of it."""
+    gap = hierarchy.gaps(population.point, population.spread[:, None] * population.own)
+    told = np.empty(len(gap))
+    for model in np.unique(population.model).tolist():
+        mine = population.model == model
+        single = replace(hierarchy.marginal, models=(hierarchy.marginal.models[model],))
+        told[mine] = single.densities(gap[mine])[:, 0]
+    told = told + hierarchy.stated(population.point)
+    return replace(population, gap=gap, told=np.where(np.isfinite(told), told, NEVER))
+
+
+def _with_models(
+    hierarchy: Hierarchy, population: _Population, power: float, random: np.random.Generator
+) -> _Population:
+    """A model of the noise for every draw, from what all of them tell."""
+    each = hierarchy.marginal.densities(population.gap)
+    each = np.where(np.isfinite(each), each, NEVER)
+    model = np.argmax(power * each + random.gumbel(size=each.shape), axis=1)
+    told = each[np.arange(len(model)), model] + hierarchy.stated(population.point)
+    return replace(population, model=model, told=np.maximum(told, NEVER))
+
+
+def _swept(
+    hierarchy: Hierarchy,
+    population: _Population,
+    power: float,
+    lengths: _Lengths,
+    random: np.random.Generator,
+) -> tuple[_Population, _Lengths]:
+    """Every draw moved in each way."""
+    for _ in range(2):
+        population, lengths = _anew(hierarchy, population, power, lengths, random)
+    population = _centred(hierarchy, population, power, random)
+    population, lengths = _along_others(hierarchy, population, power, lengths, random)
+    return _centred(hierarchy, population, power, random), lengths
+
+
+def _anew(
+    hierarchy: Hierarchy,
+    population: _Population,
+    power: float,
+    lengths: _Lengths,
+    random: np.random.Generator,
+) -> tuple[_Population, _Lengths]:
+    """One building, two, or all drawn anew about what they were: sqrt(1 - b^2) z + b xi is as normal as z was."""
+    count, width = population.own.shape
+    number = int(hierarchy.building.max()) + 1
+    one, other = (hierarchy.building == random.integers(0, number, (count, 1)) for _ in range(2))
+    some = one | (other & (random.random((count, 1)) < 0.4))
+    share = np.where(some, random.choice([0.5, 1.0], (count, 1)), 0.0)
+    whole = random.random(count) < 0.25
+    length = np.minimum(lengths.anew * np.exp(0.4 * random.standard_normal((count, 1))), 1.0)
+    share = np.where(whole[:, None], length, share)
+    own = np.sqrt(1.0 - share**2) * population.own + share * random.standard_normal((count, width))
+    found = _asked(hierarchy, replace(population, own=own))
+    accepted = _chance(count, random) < power * (found.told - population.told)
+    anew = _adapted(lengths.anew, accepted[whole], 1.0)
+    return population.moved(accepted, found), replace(lengths, anew=anew)
+
+
+def _along_others(
+    hierarchy: Hierarchy,
+    population: _Population,
+    power: float,
+    lengths: _Lengths,
+    random: np.random.Generator,
+) -> tuple[_Population, _Lengths]:
+    """Means, alone or with buildings, moved as two others of the population differ; some of the way in full."""
+    count, width = population.point.shape
+    turn = random.choice(np.arange(1, count), 2, replace=False)
+    first, second = ((np.arange(count) + each) % count for each in turn)
+    joint = random.random((count, 1)) < 0.4
+    means = random.random((count, width)) < random.choice([0.4, 1.0], (count, 1))
+    chosen = joint & (random.random(population.own.shape) < random.choice([0.2, 1.0], (count, 1)))
+    moving = np.where(joint, width + chosen.sum(axis=1, keepdims=True), width)
+    size = np.where(joint, lengths.whole, lengths.means) * 2.38 / np.sqrt(2.0 * moving)
+    size = size * np.exp(0.4 * random.standard_normal((count, 1)))
+    size = np.where(~joint & (random.random((count, 1)) < 0.2), 1.0, size)
+    place = population.point + means * size * (population.point[first] - population.point[second])
+    place = place + JITTER * random.standard_normal(place.shape)
+    apart = population.own[first] - population.own[second] + JITTER * random.standard_normal(chosen.shape)
+    inside = ((place >= 0.0) & (place <= 1.0)).all(axis=1)
+    own = population.own + chosen * size * apart
+    found = _asked(hierarchy, replace(population, point=np.clip(place, 0.0, 1.0), own=own))
+    before = 0.5 * np.sum(population.own**2 - own**2, axis=1)
+    accepted = inside & (_chance(count, random) < power * (found.told - population.told) + before)
+    return population.moved(accepted, found), replace(
+        lengths,
+        whole=_adapted(lengths.whole, accepted[joint[:, 0]], 2.0),
+        means=_adapted(lengths.means, accepted[~joint[:, 0]], 2.0),
+    )
+
+
+def _centred(
+    hierarchy: Hierarchy, population: _Population, power: float, random: np.random.Generator
+) -> _Population:
+    """Spread and means drawn from buildings' constants, which stay as they are, and with them path loss."""
+    if hierarchy.spread is None:
+        population = _spread_anew(population, random)
+    for index in np.flatnonzero(hierarchy.centred).tolist():
+        population = _mean_anew(hierarchy, population, index, power, random)
+    return population
+
+
+def _spread_anew(population: _Population, random: np.random.Generator) -> _Population:
+    """p(s | s z) = exp(-s / mean) s^-c exp(-(s z)^2 / 2 s^2), drawn among places that are as far apart in logarithm."""
+    places = np.geomspace(LEAST, MOST, PLACES)
+    square = np.sum((population.spread[:, None] * population.own) ** 2, axis=1)
+    width = population.own.shape[1]
+    density = -places / SPREAD - (width - 1) * np.log(places) - 0.5 * square[:, None] / places**2
+    found = places[np.argmax(density + random.gumbel(size=density.shape), axis=1)]
+    own = population.own * (population.spread / found)[:, None]
+    return replace(population, spread=found, own=own)
+
+
+def _mean_anew(
+    hierarchy: Hierarchy, population: _Population, index: int, power: float, random: np.random.Generator
+) -> _Population:
+    """For k buildings log x is normal about the mean of their logarithms, by s / sqrt(k), but for what was known."""
+    parameters, mine = hierarchy.parameters, hierarchy.owner == index
+    values, spread = parameters.from_unit(population.point), population.spread
+    before = np.log(np.maximum(values[:, index], TINY))
+    buildings = before[:, None] + spread[:, None] * population.own[:, mine]
+    after = buildings.mean(axis=1) + spread / np.sqrt(mine.sum()) * random.standard_normal(len(spread))
+    moved = values.copy()
+    moved[:, index] = np.exp(after)
+    inside = (moved[:, index] >= parameters.lower[index]) & (moved[:, index] <= parameters.upper[index])
+    moved[:, index] = np.clip(moved[:, index], parameters.lower[index], parameters.upper[index])
+    place = population.point.copy()
+    place[:, index] = parameters.to_unit(moved)[:, index]
+    # Flat in the search space, whose density by log x is x / (dx / du).
+    known = hierarchy.stated(place) - hierarchy.stated(population.point)
+    flat = (
+        after
+        - before
+        - np.log(parameters.search_slope(moved)[:, index] / parameters.search_slope(values)[:, index])
+    )
+    accepted = inside & (_chance(len(spread), random) < flat + power * known)
+    own = population.own.copy()
+    own[:, mine] = (buildings - after[:, None]) / spread[:, None]
+    return population.moved(accepted, replace(population, point=place, own=own, told=population.told + known))
+
+
+def _next(told: NDArray[np.float64], power: float) -> float:
+    """The next power: as much more as leaves a share of the draws effective."""
+
+    def effective(other: float) -> float:
+        weight = _weights((other - power) * told)
+        return float(1.0 / np.sum(weight**2)) / len(told)
+
+    if effective(1.0) >= EFFECTIVE:
+        return 1.0
+    low, high = power, 1.0
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if effective(middle) >= EFFECTIVE else (low, middle)
+    return high
+
+
+def _weights(logarithm: NDArray[np.float64]) -> NDArray[np.float64]:
+    weight = np.exp(logarithm - logarithm.max())
+    return weight / weight.sum()
+
+
+def _chance(count: int, random: np.random.Generator) -> NDArray[np.float64]:
+    """Logarithms of numbers that are even between 0 and 1 [n]."""
+    return -random.standard_exponential(count)
+
+
+def _adapted(length: float, accepted: NDArray[np.bool_], most: float) -> float:
+    """The length of moves, after some of them were accepted."""
+    if not len(accepted):
+        return length
+    return float(np.clip(length * np.exp(0.5 * (accepted.mean() - ACCEPTED)), 0.02, most))
