@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from calibray.calibration.buildings import over_buildings
 from calibray.calibration.cheap import ReplayedModel
@@ -61,6 +62,9 @@ WEIGHED: Final = 250
 
 KEPT: Final = 128
 """Draws that are kept with the result."""
+
+FEW: Final = 500
+"""Links up to which linear algebra takes one thread."""
 
 LINKS: Final = 10_000
 """Links beyond which errors that neighbours share are not looked at: all pairs of them would have to be."""
@@ -116,12 +120,14 @@ def certainty(
         What the data tell of the parameters.
     """
     started = time.perf_counter()
-    if problem.differentiable:
-        calls = problem.engine.calls
-        found = _certain(problem, [problem], trail, trail.rt_calls, progress)
-        calls = problem.engine.calls - calls
-    else:
-        found, calls = _approximate(problem, trail, progress, model)
+    # Matrices of few links are small: threads of the linear algebra cost more there than they give.
+    with threadpool_limits(1 if problem.objective.num_counted <= FEW else None, user_api="blas"):
+        if problem.differentiable:
+            calls = problem.engine.calls
+            found = _certain(problem, [problem], trail, trail.rt_calls, progress)
+            calls = problem.engine.calls - calls
+        else:
+            found, calls = _approximate(problem, trail, progress, model)
     return replace(found, calls=calls, seconds=time.perf_counter() - started)
 
 

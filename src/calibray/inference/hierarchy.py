@@ -39,7 +39,7 @@ MOST: Final = 0.8
 PLACES: Final = 160
 """Spreads between these that are told apart."""
 
-FIRST: Final = 0.05
+FIRST: Final = 0.1
 """Power of the density that the population starts from."""
 
 EFFECTIVE: Final = 0.5
