@@ -252,8 +252,7 @@ def _swept(
     random: np.random.Generator,
 ) -> tuple[_Population, _Lengths]:
     """Every draw moved in each way."""
-    for _ in range(2):
-        population, lengths = _anew(hierarchy, population, power, lengths, random)
+    population, lengths = _anew(hierarchy, population, power, lengths, random)
     population = _centred(hierarchy, population, power, random)
     population, lengths = _along_others(hierarchy, population, power, lengths, random)
     return _centred(hierarchy, population, power, random), lengths
