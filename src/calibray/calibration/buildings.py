@@ -40,7 +40,7 @@ DRAWN: Final = (64, 256)
 EVALUATED: Final = 6_000_000
 """Interactions that are evaluated for these: on larger programs fewer are moved."""
 
-POPULATION: Final = (96, 512)
+POPULATION: Final = (96, 384)
 """Fewest and most means that are drawn together with what each building has; where fewer could be, none are."""
 
 ASKED: Final = 50

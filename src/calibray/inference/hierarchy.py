@@ -48,7 +48,7 @@ EFFECTIVE: Final = 0.5
 STEPS: Final = 12
 """Steps after which the density stays as flat as it is."""
 
-SWEEPS: Final = 2
+SWEEPS: Final = 4
 """Times that every draw is moved in each way, at each step."""
 
 ACCEPTED: Final = 0.25

@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 STEPS: Final = 25
-"""Steps to the mode."""
+"""Steps to the mode, at most."""
+
+CLOSE: Final = 1e-3
+"""Change of the errors and of their size, by that size, below which it is there: there the density is flat."""
 
 SHARE: Final = 0.1
 """Share of gross errors, where some are."""
@@ -114,15 +117,21 @@ def evidence(
     links, columns = gap.shape[1], design.shape[1]
     size = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
     size = np.maximum(size, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
-    left, found = gap, np.zeros((len(gap), columns))
+    left, found, going = gap.copy(), np.zeros((len(gap), columns)), np.arange(len(gap))
     for _ in range(STEPS):
-        weight = tail.weight((left / size[:, None]) ** 2)
+        here, before, moved = gap[going], size[going], np.zeros(len(going))
+        weight = tail.weight((left[going] / before[:, None]) ** 2)
         if columns:
-            matrix = regular(products(design, weight) + size[:, None, None] ** 2 * np.diag(ridge**2))
-            found = np.linalg.solve(matrix, ((weight * gap) @ design)[..., None])[..., 0]
-            left = gap - found @ design.T
+            matrix = regular(products(design, weight) + before[:, None, None] ** 2 * np.diag(ridge**2))
+            found[going] = np.linalg.solve(matrix, ((weight * here) @ design)[..., None])[..., 0]
+            there = here - found[going] @ design.T
+            moved, left[going] = np.abs(there - left[going]).max(axis=1), there
         number = np.sum(weight, axis=1) if tail.quick else links
-        size = np.maximum(np.sqrt(np.sum(weight * left**2, axis=1) / number), 1e-12)
+        after = np.maximum(np.sqrt(np.sum(weight * left[going] ** 2, axis=1) / number), 1e-12)
+        size[going] = after
+        going = going[np.maximum(np.abs(after - before), moved) > CLOSE * after]
+        if not len(going):
+            break
     value = tail.log_density((left / size[:, None]) ** 2).sum(axis=1) - links * np.log(size)
     value += np.sum(np.log(ridge[ridge > 0])) - 0.5 * np.sum((found * ridge) ** 2, axis=1)
     value -= 0.5 * np.log(2 * np.pi) * int((ridge > 0).sum())
