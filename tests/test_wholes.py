@@ -112,4 +112,5 @@ def test_intervals_are_those_of_the_mean_over_buildings():
     assert found["mean"][1] == pytest.approx(marble, rel=0.15)
     assert found["seen"][1] < 0.75 * marble
     assert marble > 1.3 * found["seen"][1]
-    assert found["mean"][0] == pytest.approx(found["seen"][0], rel=0.1)
+    # The ground is one; but what walls have of their own may be taken for it: a sixth more, by 3,000 draws.
+    assert 1.0 < found["mean"][0] / found["seen"][0] < 1.25
