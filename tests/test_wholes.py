@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import planted
+from calibray.calibration import buildings as calibration_buildings
 from calibray.calibration.buildings import buildings
 from calibray.calibration.certainty import certainty
 from calibray.calibration.problem import Problem
@@ -114,3 +115,21 @@ def test_intervals_are_those_of_the_mean_over_buildings():
     assert marble > 1.3 * found["seen"][1]
     # The ground is one; but what walls have of their own may be taken for it: a sixth more, by 3,000 draws.
     assert 1.0 < found["mean"][0] / found["seen"][0] < 1.25
+
+
+def test_half_of_the_draws_are_made_together_with_buildings(problem, monkeypatch):
+    """And none where the scene is too large for as many as are worth it."""
+    here = replace(
+        problem, objective=replace(problem.objective, measured=planted.campaign(0.5).path_loss_db.to_numpy())
+    )
+    trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
+    both = certainty(here, trail).means
+    monkeypatch.setattr(calibration_buildings, "POPULATION_EVALUATED", 0)
+    behind = certainty(here, trail).means
+    assert both is not None
+    assert behind is not None
+    count = len(behind.weight)
+    assert len(both.weight) == count + calibration_buildings.POPULATION[1]
+    assert both.weight[:count].sum() == pytest.approx(0.5)
+    np.testing.assert_array_equal(both.point[:count], behind.point)
+    assert len(np.unique(both.point[count:], axis=0)) > 100
