@@ -119,9 +119,8 @@ def test_intervals_are_those_of_the_mean_over_buildings():
 
 def test_half_of_the_draws_are_made_together_with_buildings(problem, monkeypatch):
     """And none where the scene is too large for as many as are worth it."""
-    here = replace(
-        problem, objective=replace(problem.objective, measured=planted.campaign(0.5).path_loss_db.to_numpy())
-    )
+    measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
+    here = replace(problem, objective=replace(problem.objective, measured=measured))
     trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
     both = certainty(here, trail).means
     monkeypatch.setattr(calibration_buildings, "POPULATION_EVALUATED", 0)
