@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calibray.inference.hierarchy import LEAST, MOST, SPREAD, Hierarchy, besides, hierarchical
+from calibray.inference import hierarchy as module
+from calibray.inference.hierarchy import EFFECTIVE, LEAST, MOST, SPREAD, Hierarchy, besides, hierarchical
 from calibray.inference.marginal import Marginal, NoiseModel
 from calibray.inference.posterior import Draws
 from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
@@ -52,18 +53,23 @@ def _silent(point, logarithms):
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
-@pytest.mark.parametrize("centred", [True, False])
-def test_means_of_which_nothing_is_told_are_even(scale, centred):
+@pytest.mark.parametrize("spread", [0.7, None])
+def test_means_of_which_nothing_is_told_are_even(scale, spread):
     parameters = _parameters(scale)
-    found = hierarchical(
-        _hierarchy(parameters, _silent, 4, centred=centred), _even(parameters), COUNT, seed=2
-    )
+    silent = _hierarchy(parameters, _silent, 4, buildings=2, spread=spread)
+    found = hierarchical(silent, _even(parameters), 2 * COUNT, seed=2)
     lower, upper = parameters.search_bounds
     unit = ((found.point - lower) / (upper - lower))[:, 0]
     assert np.quantile(unit, [0.1, 0.25, 0.5, 0.75, 0.9]) == pytest.approx(
-        [0.1, 0.25, 0.5, 0.75, 0.9], abs=0.04
+        [0.1, 0.25, 0.5, 0.75, 0.9], abs=0.03
     )
     assert not found.flattened
+
+
+def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
+    parameters = _parameters()
+    found = hierarchical(_hierarchy(parameters, _silent, 4, centred=False), _even(parameters), COUNT, seed=2)
+    assert np.quantile(found.point, [0.25, 0.75]) == pytest.approx([4.125, 9.375], abs=0.4)
 
 
 def test_a_stated_prior_is_kept_where_nothing_is_told():
@@ -156,6 +162,32 @@ def test_links_that_only_one_building_explains_do_not_tell_the_mean():
     alike = _alike(parameters, of_one)
     one = hierarchical(_hierarchy(parameters, of_one, EACH, BUILDINGS, spread=0.15), alike, COUNT, seed=6)
     assert one.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
+
+
+def test_weights_alone_lead_to_the_posterior(monkeypatch):
+    """Draws that do not move, of one building: the mean is as the building's constant, but for the spread."""
+    monkeypatch.setattr(module, "SWEEPS", 0)
+    parameters, measured = _parameters("log"), _planted(0.15)
+    gaps = _straight(parameters, measured)
+
+    def of_one(point, logarithms):
+        return gaps(point, np.repeat(logarithms[:, :1], BUILDINGS, axis=1))[:, :EACH]
+
+    alike = _alike(parameters, of_one)
+    found = hierarchical(_hierarchy(parameters, of_one, EACH, 1, spread=0.03), alike, 20_000, seed=9)
+    mean, deviation = _moments(alike.point[:, 0], alike.weight)
+    told = found.point
+    assert told.mean() == pytest.approx(mean, abs=0.005)
+    assert told.std() == pytest.approx(np.hypot(deviation, 0.03), rel=0.06)
+
+
+def test_each_step_leaves_a_share_of_the_draws_effective():
+    told = 30.0 * np.random.default_rng(10).standard_normal(1000)
+    power = module._next(told, 0.1)
+    weight = np.exp((power - 0.1) * told)
+    assert 0.1 < power < 0.2
+    assert np.sum(weight) ** 2 / np.sum(weight**2) == pytest.approx(EFFECTIVE * len(told), rel=0.01)
+    assert module._next(0.01 * told, 0.1) == 1.0
 
 
 def test_draws_are_the_same_for_a_seed():

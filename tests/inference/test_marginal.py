@@ -106,6 +106,19 @@ def test_tails_are_densities_with_their_information(tail):
     assert np.trapezoid(density * (1 + error * slope) ** 2, error) == pytest.approx(tail.size, rel=2e-3)
 
 
+@pytest.mark.parametrize("tail", [tails.student(2.0), tails.student(4.0), tails.gross()])
+@pytest.mark.parametrize("columns", [0, 3])
+def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
+    """As far as many more steps would lead, of errors among which some are far off."""
+    random = np.random.default_rng(5)
+    gap = 3.0 * random.standard_normal((64, 60)) + 20.0 * (random.random((64, 60)) < 0.1)
+    design, ridge = random.standard_normal((60, columns)), np.full(columns, 0.2)
+    found = tails.evidence(gap, design, ridge, tail)
+    monkeypatch.setattr(tails, "STEPS", 400)
+    monkeypatch.setattr(tails, "CLOSE", 1e-9)
+    assert found == pytest.approx(tails.evidence(gap, design, ridge, tail), abs=0.02)
+
+
 def test_gross_errors_speak_for_themselves():
     """One link of ten 20 dB off: neither Student's t nor Gaussian errors explain it as well."""
     random = np.random.default_rng(5)
