@@ -196,8 +196,9 @@ def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) 
     while True:
         population = population.chosen(random.permutation(systematic(weight, count, random)))
         population = _with_models(hierarchy, population, power, random)
+        moves = _Moves(hierarchy, power, random)
         for _ in range(SWEEPS):
-            population, lengths = _swept(hierarchy, population, power, lengths, random)
+            population, lengths = moves.swept(population, lengths)
         steps += 1
         if power == 1.0 or steps == STEPS:
             point = parameters.to_search(parameters.from_unit(population.point))
@@ -244,85 +245,115 @@ def _with_models(
     return replace(population, model=model, told=np.maximum(told, NEVER))
 
 
-def _swept(
-    hierarchy: Hierarchy,
-    population: _Population,
-    power: float,
-    lengths: _Lengths,
-    random: np.random.Generator,
-) -> tuple[_Population, _Lengths]:
-    """Every draw moved in each way."""
-    population, lengths = _anew(hierarchy, population, power, lengths, random)
-    population = _centred(hierarchy, population, power, random)
-    population, lengths = _along_others(hierarchy, population, power, lengths, random)
-    return _centred(hierarchy, population, power, random), lengths
+@dataclass(frozen=True, eq=False)
+class _Moves:
+    """Moves of draws that leave their density as it is: what is known beforehand, and of the links to a power.
 
+    Attributes:
+        hierarchy: What links tell.
+        power: The power.
+        random: Random numbers.
+    """
 
-def _anew(
-    hierarchy: Hierarchy,
-    population: _Population,
-    power: float,
-    lengths: _Lengths,
-    random: np.random.Generator,
-) -> tuple[_Population, _Lengths]:
-    """One building, two, or all drawn anew about what they were: sqrt(1 - b^2) z + b xi is as normal as z was."""
-    count, width = population.own.shape
-    number = int(hierarchy.building.max()) + 1
-    one, other = (hierarchy.building == random.integers(0, number, (count, 1)) for _ in range(2))
-    some = one | (other & (random.random((count, 1)) < 0.4))
-    share = np.where(some, random.choice([0.5, 1.0], (count, 1)), 0.0)
-    whole = random.random(count) < 0.25
-    length = np.minimum(lengths.anew * np.exp(0.4 * random.standard_normal((count, 1))), 1.0)
-    share = np.where(whole[:, None], length, share)
-    own = np.sqrt(1.0 - share**2) * population.own + share * random.standard_normal((count, width))
-    found = _asked(hierarchy, replace(population, own=own))
-    accepted = _chance(count, random) < power * (found.told - population.told)
-    anew = _adapted(lengths.anew, accepted[whole], 1.0)
-    return population.moved(accepted, found), replace(lengths, anew=anew)
+    hierarchy: Hierarchy
+    power: float
+    random: np.random.Generator
 
+    def swept(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
+        """Every draw moved in each way."""
+        population, lengths = self._anew(population, lengths)
+        population = self._centred(population)
+        population, lengths = self._along_others(population, lengths)
+        return self._centred(population), lengths
 
-def _along_others(
-    hierarchy: Hierarchy,
-    population: _Population,
-    power: float,
-    lengths: _Lengths,
-    random: np.random.Generator,
-) -> tuple[_Population, _Lengths]:
-    """Means, alone or with buildings, moved as two others of the population differ; some of the way in full."""
-    count, width = population.point.shape
-    turn = random.choice(np.arange(1, count), 2, replace=False)
-    first, second = ((np.arange(count) + each) % count for each in turn)
-    joint = random.random((count, 1)) < 0.4
-    means = random.random((count, width)) < random.choice([0.4, 1.0], (count, 1))
-    chosen = joint & (random.random(population.own.shape) < random.choice([0.2, 1.0], (count, 1)))
-    moving = np.where(joint, width + chosen.sum(axis=1, keepdims=True), width)
-    size = np.where(joint, lengths.whole, lengths.means) * 2.38 / np.sqrt(2.0 * moving)
-    size = size * np.exp(0.4 * random.standard_normal((count, 1)))
-    size = np.where(~joint & (random.random((count, 1)) < 0.2), 1.0, size)
-    place = population.point + means * size * (population.point[first] - population.point[second])
-    place = place + JITTER * random.standard_normal(place.shape)
-    apart = population.own[first] - population.own[second] + JITTER * random.standard_normal(chosen.shape)
-    inside = ((place >= 0.0) & (place <= 1.0)).all(axis=1)
-    own = population.own + chosen * size * apart
-    found = _asked(hierarchy, replace(population, point=np.clip(place, 0.0, 1.0), own=own))
-    before = 0.5 * np.sum(population.own**2 - own**2, axis=1)
-    accepted = inside & (_chance(count, random) < power * (found.told - population.told) + before)
-    return population.moved(accepted, found), replace(
-        lengths,
-        whole=_adapted(lengths.whole, accepted[joint[:, 0]], 2.0),
-        means=_adapted(lengths.means, accepted[~joint[:, 0]], 2.0),
-    )
+    def _anew(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
+        """One building, two, or all drawn anew about what they were: sqrt(1 - b^2) z + b xi is as normal as z was."""
+        count, width = population.own.shape
+        number = int(self.hierarchy.building.max()) + 1
+        one, other = (
+            self.hierarchy.building == self.random.integers(0, number, (count, 1)) for _ in range(2)
+        )
+        some = one | (other & (self.random.random((count, 1)) < 0.4))
+        share = np.where(some, self.random.choice([0.5, 1.0], (count, 1)), 0.0)
+        whole = self.random.random(count) < 0.25
+        length = np.minimum(lengths.anew * np.exp(0.4 * self.random.standard_normal((count, 1))), 1.0)
+        share = np.where(whole[:, None], length, share)
+        own = np.sqrt(1.0 - share**2) * population.own + share * self.random.standard_normal((count, width))
+        found = _asked(self.hierarchy, replace(population, own=own))
+        accepted = _chance(count, self.random) < self.power * (found.told - population.told)
+        anew = _adapted(lengths.anew, accepted[whole], 1.0)
+        return population.moved(accepted, found), replace(lengths, anew=anew)
 
+    def _along_others(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
+        """Means, alone or with buildings, moved as two others of the population differ; some of the way in full."""
+        count, width = population.point.shape
+        turn = self.random.choice(np.arange(1, count), 2, replace=False)
+        first, second = ((np.arange(count) + each) % count for each in turn)
+        joint = self.random.random((count, 1)) < 0.4
+        means = self.random.random((count, width)) < self.random.choice([0.4, 1.0], (count, 1))
+        chosen = joint & (
+            self.random.random(population.own.shape) < self.random.choice([0.2, 1.0], (count, 1))
+        )
+        moving = np.where(joint, width + chosen.sum(axis=1, keepdims=True), width)
+        size = np.where(joint, lengths.whole, lengths.means) * 2.38 / np.sqrt(2.0 * moving)
+        size = size * np.exp(0.4 * self.random.standard_normal((count, 1)))
+        size = np.where(~joint & (self.random.random((count, 1)) < 0.2), 1.0, size)
+        place = population.point + means * size * (population.point[first] - population.point[second])
+        place = place + JITTER * self.random.standard_normal(place.shape)
+        apart = (
+            population.own[first]
+            - population.own[second]
+            + JITTER * self.random.standard_normal(chosen.shape)
+        )
+        inside = ((place >= 0.0) & (place <= 1.0)).all(axis=1)
+        own = population.own + chosen * size * apart
+        found = _asked(self.hierarchy, replace(population, point=np.clip(place, 0.0, 1.0), own=own))
+        before = 0.5 * np.sum(population.own**2 - own**2, axis=1)
+        accepted = inside & (
+            _chance(count, self.random) < self.power * (found.told - population.told) + before
+        )
+        return population.moved(accepted, found), replace(
+            lengths,
+            whole=_adapted(lengths.whole, accepted[joint[:, 0]], 2.0),
+            means=_adapted(lengths.means, accepted[~joint[:, 0]], 2.0),
+        )
 
-def _centred(
-    hierarchy: Hierarchy, population: _Population, power: float, random: np.random.Generator
-) -> _Population:
-    """Spread and means drawn from buildings' constants, which stay as they are, and with them path loss."""
-    if hierarchy.spread is None:
-        population = _spread_anew(population, random)
-    for index in np.flatnonzero(hierarchy.centred).tolist():
-        population = _mean_anew(hierarchy, population, index, power, random)
-    return population
+    def _centred(self, population: _Population) -> _Population:
+        """Spread and means drawn from buildings' constants, which stay as they are, and with them path loss."""
+        if self.hierarchy.spread is None:
+            population = _spread_anew(population, self.random)
+        for index in np.flatnonzero(self.hierarchy.centred).tolist():
+            population = self._mean_anew(population, index)
+        return population
+
+    def _mean_anew(self, population: _Population, index: int) -> _Population:
+        """For k buildings log x is normal about the mean of their logarithms, by s / sqrt(k), but for what is known."""
+        parameters, mine = self.hierarchy.parameters, self.hierarchy.owner == index
+        values, spread = parameters.from_unit(population.point), population.spread
+        before = np.log(np.maximum(values[:, index], TINY))
+        buildings = before[:, None] + spread[:, None] * population.own[:, mine]
+        after = buildings.mean(axis=1) + spread / np.sqrt(mine.sum()) * self.random.standard_normal(
+            len(spread)
+        )
+        moved = values.copy()
+        moved[:, index] = np.exp(after)
+        inside = (moved[:, index] >= parameters.lower[index]) & (moved[:, index] <= parameters.upper[index])
+        moved[:, index] = np.clip(moved[:, index], parameters.lower[index], parameters.upper[index])
+        place = population.point.copy()
+        place[:, index] = parameters.to_unit(moved)[:, index]
+        # Flat in the search space, whose density by log x is x / (dx / du).
+        known = self.hierarchy.stated(place) - self.hierarchy.stated(population.point)
+        flat = (
+            after
+            - before
+            - np.log(parameters.search_slope(moved)[:, index] / parameters.search_slope(values)[:, index])
+        )
+        accepted = inside & (_chance(len(spread), self.random) < flat + self.power * known)
+        own = population.own.copy()
+        own[:, mine] = (buildings - after[:, None]) / spread[:, None]
+        return population.moved(
+            accepted, replace(population, point=place, own=own, told=population.told + known)
+        )
 
 
 def _spread_anew(population: _Population, random: np.random.Generator) -> _Population:
@@ -334,34 +365,6 @@ def _spread_anew(population: _Population, random: np.random.Generator) -> _Popul
     found = places[np.argmax(density + random.gumbel(size=density.shape), axis=1)]
     own = population.own * (population.spread / found)[:, None]
     return replace(population, spread=found, own=own)
-
-
-def _mean_anew(
-    hierarchy: Hierarchy, population: _Population, index: int, power: float, random: np.random.Generator
-) -> _Population:
-    """For k buildings log x is normal about the mean of their logarithms, by s / sqrt(k), but for what was known."""
-    parameters, mine = hierarchy.parameters, hierarchy.owner == index
-    values, spread = parameters.from_unit(population.point), population.spread
-    before = np.log(np.maximum(values[:, index], TINY))
-    buildings = before[:, None] + spread[:, None] * population.own[:, mine]
-    after = buildings.mean(axis=1) + spread / np.sqrt(mine.sum()) * random.standard_normal(len(spread))
-    moved = values.copy()
-    moved[:, index] = np.exp(after)
-    inside = (moved[:, index] >= parameters.lower[index]) & (moved[:, index] <= parameters.upper[index])
-    moved[:, index] = np.clip(moved[:, index], parameters.lower[index], parameters.upper[index])
-    place = population.point.copy()
-    place[:, index] = parameters.to_unit(moved)[:, index]
-    # Flat in the search space, whose density by log x is x / (dx / du).
-    known = hierarchy.stated(place) - hierarchy.stated(population.point)
-    flat = (
-        after
-        - before
-        - np.log(parameters.search_slope(moved)[:, index] / parameters.search_slope(values)[:, index])
-    )
-    accepted = inside & (_chance(len(spread), random) < flat + power * known)
-    own = population.own.copy()
-    own[:, mine] = (buildings - after[:, None]) / spread[:, None]
-    return population.moved(accepted, replace(population, point=place, own=own, told=population.told + known))
 
 
 def _next(told: NDArray[np.float64], power: float) -> float:
