@@ -26,9 +26,9 @@ from calibray.study import Setup, Study
 DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105, 106, 107, 108, 109))
 """Districts to develop on."""
 
-JUDGING = tuple(f"district-{seed}" for seed in (139, 143, 145, 147, 149))
-"""Districts to judge by, run once at the end. (141 draws a carrier that P.2040 gives no constants for; those from 113
-to 137 judged versions before.)"""
+JUDGING = tuple(f"district-{seed}" for seed in (153, 155, 159, 161, 163))
+"""Districts to judge by, run once at the end. (151 and 157 draw a carrier that P.2040 gives no constants for; those from
+113 to 149 judged versions before.)"""
 
 DEMO = "demo"
 NEAR_M = 0.1

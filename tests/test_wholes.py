@@ -13,6 +13,7 @@ from calibray.calibration.buildings import buildings
 from calibray.calibration.certainty import certainty
 from calibray.calibration.problem import Problem
 from calibray.calibration.search import search
+from calibray.inference import hierarchy
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.scenes.triangles import Triangles
@@ -109,26 +110,29 @@ def test_intervals_are_those_of_the_mean_over_buildings():
         mean = draws.weight @ np.log(draws.point)
         found[name] = np.sqrt(draws.weight @ (np.log(draws.point) - mean) ** 2)
     marble = np.hypot(found["seen"][1], 0.15)
-    # Bounds cut off some 6 %, and 250 draws tell a spread to 4 %; without buildings it were a third less.
-    assert found["mean"][1] == pytest.approx(marble, rel=0.15)
+    # In straight lines it would be this. Populations of 1,000 that move 40 times a step, whose weights count in full,
+    # find an eighth more; fewer moves and half the weight some 15 % more again. Without buildings it were a third less.
+    assert 1.0 < found["mean"][1] / marble < 1.4
     assert found["seen"][1] < 0.75 * marble
-    assert marble > 1.3 * found["seen"][1]
-    # The ground is one; but what walls have of their own may be taken for it: a sixth more, by 3,000 draws.
-    assert 1.0 < found["mean"][0] / found["seen"][0] < 1.25
+    # The ground is one; but what walls have of their own may be taken for it: a quarter more, by 1,000 draws.
+    assert 1.0 < found["mean"][0] / found["seen"][0] < 1.4
 
 
-def test_half_of_the_draws_are_made_together_with_buildings(problem, monkeypatch):
-    """And none where the scene is too large for as many as are worth it."""
+def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_others(problem, monkeypatch):
     measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
     here = replace(problem, objective=replace(problem.objective, measured=measured))
     trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
-    both = certainty(here, trail).means
-    monkeypatch.setattr(calibration_buildings, "POPULATION_EVALUATED", 0)
-    behind = certainty(here, trail).means
-    assert both is not None
-    assert behind is not None
-    count = len(behind.weight)
-    assert len(both.weight) == count + calibration_buildings.POPULATION[1]
-    assert both.weight[:count].sum() == pytest.approx(0.5)
-    np.testing.assert_array_equal(both.point[:count], behind.point)
-    assert len(np.unique(both.point[count:], axis=0)) > 100
+    drawn = certainty(here, trail)
+    monkeypatch.setattr(calibration_buildings, "FEW", 0)
+    behind = certainty(here, trail)
+    assert drawn.means is not None
+    assert behind.means is not None
+    assert drawn.posterior is not drawn.means
+    np.testing.assert_array_equal(drawn.posterior.point, behind.posterior.point)
+    count = len(drawn.means.weight)
+    assert count == calibration_buildings.POPULATION * hierarchy.KEPT
+    assert len(behind.means.weight) <= calibration_buildings.DRAWN[1]
+    assert len(np.unique(drawn.means.point, axis=0)) > 0.2 * count
+    # Two ways to the same answer, roughly: marble is on one building, and told by the same links.
+    spread = [np.log(each.point[:, 1]).std() for each in (drawn.means, behind.means)]
+    assert 0.5 < spread[0] / spread[1] < 2.0

@@ -12,7 +12,7 @@ from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
 
 GAUSSIAN = NoiseModel("gaussian", 1.0)
 LOWER, UPPER = 1.5, 12.0
-COUNT = 2000
+COUNT = 400
 
 
 def _parameters(scale="linear"):
@@ -164,9 +164,40 @@ def test_links_that_only_one_building_explains_do_not_tell_the_mean():
     assert one.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
 
 
+def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
+    """Links that tell the product of two constants well and their ratio badly, where buildings are as good as alike."""
+    names = ("walls.relative_permittivity", "ground.relative_permittivity")
+    parameters = Parameters(
+        tuple(Parameter(name, lower=LOWER, upper=UPPER, start=5.0, scale="log") for name in names)
+    )
+    slope = np.where(np.arange(40)[:, None] % 2, [10.0, 10.0], [1.0, -1.0])
+    measured = slope @ np.log([4.0, 5.0]) + np.random.default_rng(11).standard_normal(40)
+
+    def gaps(point, logarithms):
+        constants = np.log(parameters.from_unit(point))
+        constants[:, 0] += logarithms.mean(axis=1)
+        return measured - constants @ slope.T
+
+    flat = _even(parameters, 200_000)
+    density = _marginal(40).densities(
+        gaps(parameters.to_unit(parameters.from_search(flat.point)), np.zeros((1, 2)))
+    )[:, 0]
+    weight = np.exp(density - density.max())
+    alike = Draws(flat.point, density, weight / weight.sum())
+    both = Hierarchy(parameters, np.zeros(2, dtype=int), np.arange(2), np.array([True, False]), gaps,
+                     _marginal(40), NO_PRIOR, 0.004)  # fmt: skip
+    found = hierarchical(both, alike, COUNT, seed=12)
+    for sign in (1.0, -1.0):
+        mean, deviation = _moments(alike.point @ [1.0, sign], alike.weight)
+        told = found.point @ [1.0, sign]
+        assert told.mean() == pytest.approx(mean, abs=0.2 * deviation)
+        assert told.std() == pytest.approx(deviation, rel=0.2)
+
+
 def test_weights_alone_lead_to_the_posterior(monkeypatch):
     """Draws that do not move, of one building: the mean is as the building's constant, but for the spread."""
     monkeypatch.setattr(module, "SWEEPS", 0)
+    monkeypatch.setattr(module, "POWER", 1.0)
     parameters, measured = _parameters("log"), _planted(0.15)
     gaps = _straight(parameters, measured)
 

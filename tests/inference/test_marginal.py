@@ -119,6 +119,19 @@ def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
     assert found == pytest.approx(tails.evidence(gap, design, ridge, tail), abs=0.02)
 
 
+def test_gaps_may_have_degrees_of_freedom_and_priors_of_their_own():
+    random = np.random.default_rng(6)
+    gap = 3.0 * random.standard_normal((40, 30)) + 20.0 * (random.random((40, 30)) < 0.1)
+    design, freedom = random.standard_normal((30, 2)), random.choice([2.0, 4.0, 8.0], 40)
+    ridge = random.uniform(0.1, 1.0, (40, 2))
+    found = tails.evidence(gap, design, ridge, tails.student(freedom))
+    alone = [
+        tails.evidence(gap[k : k + 1], design, ridge[k], tails.student(freedom[k]))[0] for k in range(40)
+    ]
+    assert found == pytest.approx(np.array(alone), abs=1e-6)
+    assert np.ptp(found) > 1.0
+
+
 def test_gross_errors_speak_for_themselves():
     """One link of ten 20 dB off: neither Student's t nor Gaussian errors explain it as well."""
     random = np.random.default_rng(5)

@@ -20,7 +20,7 @@ from calibray.engines.replay import Replay
 from calibray.inference.clusters import TRIED, Leaning, following, means_behind, overstated, spreads
 from calibray.inference.hierarchy import Hierarchy, besides, hierarchical
 from calibray.inference.marginal import NoiseModel
-from calibray.inference.posterior import Draws, pooled
+from calibray.inference.posterior import Draws
 from calibray.materials import BOUNDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
@@ -40,14 +40,11 @@ DRAWN: Final = (64, 256)
 EVALUATED: Final = 6_000_000
 """Interactions that are evaluated for these: on larger programs fewer are moved."""
 
-POPULATION: Final = (96, 384)
-"""Fewest and most means that are drawn together with what each building has; where fewer could be, none are."""
+POPULATION: Final = 96
+"""Means that are drawn together with what each building has."""
 
-ASKED: Final = 50
-"""Replays that each of them takes, about."""
-
-POPULATION_EVALUATED: Final = 40_000_000
-"""Interactions that are evaluated for these."""
+FEW: Final = 8_300
+"""Interactions beyond which that would be dear: it takes some 25,000 replays."""
 
 JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
@@ -219,9 +216,8 @@ def over_buildings(
 ) -> Draws:
     """A posterior of what buildings have on the mean, where each of them may differ.
 
-    Half of the draws are means behind those of a posterior that takes buildings as alike, and half are drawn together
-    with what each building has. The first keep narrow places apart that a population loses, the second find means far
-    from any that fit where buildings are alike.
+    They are drawn together with what each building has; of larger scenes they are means behind those of a posterior
+    that takes buildings as alike.
 
     Args:
         explaining: The density that was drawn from.
@@ -235,17 +231,12 @@ def over_buildings(
     apart = buildings(explaining.problem) if any(model.spread for model in tried) else None
     if apart is None:
         return posterior
-    behind = _behind(explaining, apart, posterior, explained, tried)
-    count = int(POPULATION_EVALUATED // (ASKED * apart.engine.paths.num_interactions))
-    if count < POPULATION[0]:
-        return behind
-    found = _drawn(explaining, apart, posterior, min(count, POPULATION[1]), tried)
-    return pooled([behind, found])
+    if apart.engine.paths.num_interactions > FEW:
+        return _behind(explaining, apart, posterior, explained, tried)
+    return _drawn(explaining, apart, posterior, tried)
 
 
-def _drawn(
-    explaining: Explaining, apart: Buildings, posterior: Draws, count: int, tried: Sequence[NoiseModel]
-) -> Draws:
+def _drawn(explaining: Explaining, apart: Buildings, posterior: Draws, tried: Sequence[NoiseModel]) -> Draws:
     """Means drawn together with what each building has of its own."""
     problem, own = explaining.problem, apart.building >= 0
     parameters = problem.parameters
@@ -266,7 +257,7 @@ def _drawn(
         problem.priors,
         None if stated == "auto" else float(stated),
     )
-    found = hierarchical(hierarchy, posterior, count, seed=problem.setup.study.method.seed)
+    found = hierarchical(hierarchy, posterior, POPULATION, seed=problem.setup.study.method.seed)
     # As good as the places of the others: by what explains the links where buildings are alike.
     return replace(found, density=np.logaddexp.reduce(explaining(found.point), axis=1))
 

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from calibray.calibration.buildings import over_buildings
 from calibray.calibration.cheap import ReplayedModel
@@ -28,6 +27,7 @@ from calibray.inference.verdicts import verdicts
 from calibray.inference.widening import widened
 from calibray.parameters import Parameters
 from calibray.progress import Progress
+from calibray.threads import one_thread
 
 COST: Final = 10
 """Replays of the draws by those of the calibration, at most; these take derivatives, which doubles their cost."""
@@ -121,7 +121,7 @@ def certainty(
     """
     started = time.perf_counter()
     # Matrices of few links are small: threads of the linear algebra cost more there than they give.
-    with threadpool_limits(1 if problem.objective.num_counted <= FEW else None, user_api="blas"):
+    with one_thread(problem.objective.num_counted <= FEW):
         if problem.differentiable:
             calls = problem.engine.calls
             found = _certain(problem, [problem], trail, trail.rt_calls, progress)

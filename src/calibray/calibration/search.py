@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from calibray.calibration.problem import Evaluation, Problem
 from calibray.engines.protocol import Engine
@@ -17,6 +16,7 @@ from calibray.engines.recorded import Recorded
 from calibray.errors import InputError
 from calibray.optimizers import Optimizer
 from calibray.progress import Progress
+from calibray.threads import one_thread
 
 Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Points of the search space [n, d], and whether derivatives are wanted, to what an optimizer is told."""
@@ -34,7 +34,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
     """
     derivatives = optimizer.needs_derivatives()
     # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
-    with threadpool_limits(1, user_api="blas"):
+    with one_thread():
         while not optimizer.done:
             points = optimizer.ask()
             told = evaluate(points, derivatives)

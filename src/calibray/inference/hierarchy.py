@@ -9,7 +9,12 @@ links count more and more, each time by as much as leaves half of the population
   D. White, Statistical Science 28, 2013);
 - means and the spread follow from the buildings, whose constants stay as they are, so that path loss does as well and
   nothing is replayed (interweaving: Y. Yu and X.-L. Meng, J. Computational and Graphical Statistics 20, 2011);
-- a draw moves as two others of the population differ (C. J. F. ter Braak, Statistics and Computing 16, 2006).
+- a mean, at times others with it, moves as two others of the population differ (C. J. F. ter Braak, Statistics and
+  Computing 16, 2006).
+
+Weights scatter by what buildings have of their own, however good a mean is: chosen by these in full, a large population
+that moves little ends in a few narrow places by chance. So a small one moves often, is chosen by the roots of its
+weights, the rest being left to moves, and draws are kept while it moves on in the end.
 
 Each draw has a model of the noise of its own, drawn at every step from what the models tell.
 """
@@ -18,11 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.inference.forms import Forms
 from calibray.inference.marginal import DIFFERING, GAUSSIAN, Marginal, NoiseModel
 from calibray.inference.posterior import Draws, systematic
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
@@ -36,7 +43,7 @@ LEAST: Final = 0.004
 MOST: Final = 0.8
 """The largest."""
 
-PLACES: Final = 160
+PLACES: Final = 64
 """Spreads between these that are told apart."""
 
 FIRST: Final = 0.1
@@ -45,11 +52,17 @@ FIRST: Final = 0.1
 EFFECTIVE: Final = 0.5
 """Share of the population that each step is to leave effective."""
 
-STEPS: Final = 12
+STEPS: Final = 30
 """Steps after which the density stays as flat as it is."""
 
-SWEEPS: Final = 4
+SWEEPS: Final = 11
 """Times that every draw is moved in each way, at each step."""
+
+KEPT: Final = 8
+"""Of the last step's, those after which draws are kept."""
+
+POWER: Final = 0.5
+"""Power of the weights that the population is chosen by: 1 were right for draws that do not move."""
 
 ACCEPTED: Final = 0.25
 """Share of moves that is to be accepted: their lengths follow it."""
@@ -91,6 +104,11 @@ class Hierarchy:
     marginal: Marginal
     priors: LogNormal = NO_PRIOR
     spread: float | None = None
+
+    @cached_property
+    def forms(self) -> Forms:
+        """What the models of the noise take for gaps each of which has one of them."""
+        return Forms.of(self.marginal)
 
     def stated(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of the priors that are stated, at points [n, d], but for a constant [n]."""
@@ -139,12 +157,10 @@ class _Lengths:
 
     Attributes:
         anew: Share that all buildings are drawn anew by, 1 for all of what they have of their own.
-        whole: Length of moves of means and buildings together, by that which is right for a normal density.
-        means: That of moves of the means alone.
+        means: Length of moves of means, by that which is right for a normal density.
     """
 
     anew: float = 0.5
-    whole: float = 1.0
     means: float = 1.0
 
 
@@ -183,7 +199,7 @@ def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) 
     Args:
         hierarchy: What links tell of means and buildings.
         alike: Draws of the means, in the search space, where all buildings are alike.
-        count: Number of draws.
+        count: Number of draws that move; each is kept several times.
         seed: Seed of the random numbers.
 
     Returns:
@@ -196,15 +212,19 @@ def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) 
     while True:
         population = population.chosen(random.permutation(systematic(weight, count, random)))
         population = _with_models(hierarchy, population, power, random)
-        moves = _Moves(hierarchy, power, random)
+        moves, passed = _Moves(hierarchy, power, random), [population]
         for _ in range(SWEEPS):
             population, lengths = moves.swept(population, lengths)
+            passed.append(population)
         steps += 1
         if power == 1.0 or steps == STEPS:
-            point = parameters.to_search(parameters.from_unit(population.point))
-            return Draws(point, population.told, np.full(count, 1.0 / count), power < 1.0)
+            point, told = (
+                np.concatenate([getattr(each, name) for each in passed[-KEPT:]]) for name in ("point", "told")
+            )
+            point = parameters.to_search(parameters.from_unit(point))
+            return Draws(point, told, np.full(len(told), 1.0 / len(told)), power < 1.0)
         before, power = power, _next(population.told, power)
-        weight = _weights((power - before) * population.told)
+        weight = _weights(POWER * (power - before) * population.told)
 
 
 def _first(
@@ -225,12 +245,7 @@ def _first(
 def _asked(hierarchy: Hierarchy, population: _Population) -> _Population:
     """The same with what links tell of it."""
     gap = hierarchy.gaps(population.point, population.spread[:, None] * population.own)
-    told = np.empty(len(gap))
-    for model in np.unique(population.model).tolist():
-        mine = population.model == model
-        single = replace(hierarchy.marginal, models=(hierarchy.marginal.models[model],))
-        told[mine] = single.densities(gap[mine])[:, 0]
-    told = told + hierarchy.stated(population.point)
+    told = hierarchy.forms.densities(gap, population.model) + hierarchy.stated(population.point)
     return replace(population, gap=gap, told=np.where(np.isfinite(told), told, NEVER))
 
 
@@ -261,10 +276,10 @@ class _Moves:
 
     def swept(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
         """Every draw moved in each way."""
-        population, lengths = self._anew(population, lengths)
-        population = self._centred(population)
-        population, lengths = self._along_others(population, lengths)
-        return self._centred(population), lengths
+        for move in (self._anew, self._along_others, self._along_others):
+            population, lengths = move(population, lengths)
+            population = self._centred(population)
+        return population, lengths
 
     def _anew(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
         """One building, two, or all drawn anew about what they were: sqrt(1 - b^2) z + b xi is as normal as z was."""
@@ -285,38 +300,22 @@ class _Moves:
         return population.moved(accepted, found), replace(lengths, anew=anew)
 
     def _along_others(self, population: _Population, lengths: _Lengths) -> tuple[_Population, _Lengths]:
-        """Means, alone or with buildings, moved as two others of the population differ; some of the way in full."""
+        """A mean, at times others with it, moved as two others of the population differ; half of the time in full."""
         count, width = population.point.shape
         turn = self.random.choice(np.arange(1, count), 2, replace=False)
         first, second = ((np.arange(count) + each) % count for each in turn)
-        joint = self.random.random((count, 1)) < 0.4
-        means = self.random.random((count, width)) < self.random.choice([0.4, 1.0], (count, 1))
-        chosen = joint & (
-            self.random.random(population.own.shape) < self.random.choice([0.2, 1.0], (count, 1))
-        )
-        moving = np.where(joint, width + chosen.sum(axis=1, keepdims=True), width)
-        size = np.where(joint, lengths.whole, lengths.means) * 2.38 / np.sqrt(2.0 * moving)
+        moving = self.random.random((count, width)) < self.random.choice([0.0, 0.0, 0.5], (count, 1))
+        moving[np.arange(count), self.random.integers(0, width, count)] = True
+        size = lengths.means * 2.38 / np.sqrt(2.0 * moving.sum(axis=1, keepdims=True))
         size = size * np.exp(0.4 * self.random.standard_normal((count, 1)))
-        size = np.where(~joint & (self.random.random((count, 1)) < 0.2), 1.0, size)
-        place = population.point + means * size * (population.point[first] - population.point[second])
-        place = place + JITTER * self.random.standard_normal(place.shape)
-        apart = (
-            population.own[first]
-            - population.own[second]
-            + JITTER * self.random.standard_normal(chosen.shape)
-        )
+        full = self.random.random((count, 1)) < 0.5
+        apart = np.where(full, 1.0, size) * (population.point[first] - population.point[second])
+        place = population.point + moving * (apart + JITTER * self.random.standard_normal((count, width)))
         inside = ((place >= 0.0) & (place <= 1.0)).all(axis=1)
-        own = population.own + chosen * size * apart
-        found = _asked(self.hierarchy, replace(population, point=np.clip(place, 0.0, 1.0), own=own))
-        before = 0.5 * np.sum(population.own**2 - own**2, axis=1)
-        accepted = inside & (
-            _chance(count, self.random) < self.power * (found.told - population.told) + before
-        )
-        return population.moved(accepted, found), replace(
-            lengths,
-            whole=_adapted(lengths.whole, accepted[joint[:, 0]], 2.0),
-            means=_adapted(lengths.means, accepted[~joint[:, 0]], 2.0),
-        )
+        found = _asked(self.hierarchy, replace(population, point=np.clip(place, 0.0, 1.0)))
+        accepted = inside & (_chance(count, self.random) < self.power * (found.told - population.told))
+        means = _adapted(lengths.means, accepted[~full[:, 0]], 2.0)
+        return population.moved(accepted, found), replace(lengths, means=means)
 
     def _centred(self, population: _Population) -> _Population:
         """Spread and means drawn from buildings' constants, which stay as they are, and with them path loss."""

@@ -39,6 +39,9 @@ from calibray.inference.tails import evidence, gross, products, regular, student
 OFFSET_DB: Final = 6.0
 """Standard deviation of an offset that was forgotten, as of a cable or an antenna's gain [dB]."""
 
+HELD: Final = 1e3
+"""One over the standard deviation of an offset that is none, where others have one [1/dB]."""
+
 SHARES: Final = (0.4, 0.7, 0.95)
 """Shares of the variance that neighbours have in common, where they have."""
 
@@ -269,6 +272,46 @@ class Marginal:
                 value = _plain(gap, design, ridge)
             found[good, index] = value + np.log(model.weight)
         return found
+
+    def form(self, model: NoiseModel) -> tuple[NDArray[np.float64], float, float]:
+        """The quadratic form that the density is a power of, under Gaussian noise, whose links may share errors.
+
+        Args:
+            model: The model, "gaussian" or "correlated".
+
+        Returns:
+            The matrix Q [m, m], and c and h: the logarithm of the density of gaps g is c - h log g'Q g.
+        """
+        design, ridge = self._with_offset(model.offset)
+        white, shift = np.eye(len(design)), 0.0
+        if model.kind == CORRELATED:
+            filter_ = self.whiteners[model.range_m, model.share]
+            white, shift = filter_.apply(white), 0.5 * filter_.log_determinant
+        square, freedom = white.T @ white, len(design) - int((ridge == 0).sum())
+        if len(ridge):
+            columns = white @ design
+            matrix, side = regular(columns.T @ columns + np.diag(ridge**2)), columns.T @ white
+            square -= side.T @ np.linalg.solve(matrix, side)
+            shift += 0.5 * float(np.linalg.slogdet(matrix)[1])
+        return square, _constant(freedom, ridge) - shift, 0.5 * freedom
+
+    def heavy(self, gap: NDArray[np.float64], models: Sequence[NoiseModel]) -> NDArray[np.float64]:
+        """Logarithm of the density under heavy tails, of all gaps together.
+
+        Args:
+            gap: As `densities` takes them, all finite [n, m].
+            models: The model of each, "student-t"; all with gross errors or none [n].
+
+        Returns:
+            The logarithms [n], without the models' weights.
+        """
+        offset = np.array([model.offset for model in models])
+        design, ridge = self._with_offset(bool(offset.any()))
+        each = np.tile(ridge / self.noise_db, (len(gap), 1))
+        if offset.any():
+            each[~offset, -1] = HELD
+        freedom = np.array([model.freedom for model in models])
+        return evidence(gap, design, each, gross() if models[0].gross else student(freedom))
 
     def reduced(self, densities: NDArray[np.float64]) -> Marginal:
         """The same without the models that cannot matter.

@@ -34,40 +34,45 @@ Each = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Tail(NamedTuple):
-    """A distribution of errors of size one.
+    """A distribution of errors of size one, or one for every gap.
 
     Attributes:
         log_density: Logarithm of its density, by the errors' squares.
         weight: Minus the derivative of that by half the square: 1 for a Gaussian.
-        location: Fisher's information of an error on its mean.
-        size: That on the logarithm of its size.
+        location: Fisher's information of an error on its mean, of one size or [n].
+        size: That on the logarithm of its size, likewise.
         quick: Whether the sum of the weights, in place of the number of links, makes steps of the size quicker.
+        some: The same for some of the gaps alone.
     """
 
     log_density: Each
     weight: Each
-    location: float
-    size: float
+    location: float | NDArray[np.float64]
+    size: float | NDArray[np.float64]
     quick: bool
+    some: Callable[[NDArray[np.intp]], Tail]
 
 
-def student(freedom: float) -> Tail:
+def student(freedom: float | NDArray[np.float64]) -> Tail:
     """Student's t.
 
     Args:
-        freedom: Its degrees of freedom.
+        freedom: Its degrees of freedom, the same for all gaps or those of each [n].
 
     Returns:
         The distribution.
     """
-    constant = float(gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi))
-    return Tail(
-        lambda square: constant - 0.5 * (freedom + 1) * np.log1p(square / freedom),
-        lambda square: (freedom + 1.0) / (freedom + square),
+    constant = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
+    each, constant = (np.asarray(value, dtype=np.float64)[..., None] for value in (freedom, constant))
+    tail = Tail(
+        lambda square: constant - 0.5 * (each + 1) * np.log1p(square / each),
+        lambda square: (each + 1.0) / (each + square),
         (freedom + 1) / (freedom + 3),
         2 * freedom / (freedom + 3),
         True,  # X.-L. Meng, D. van Dyk, J. R. Stat. Soc. B 59 (1997) 511.
+        lambda rows: tail if each.ndim < 2 else student(each[rows, 0]),
     )
+    return tail
 
 
 @cache
@@ -97,7 +102,8 @@ def gross(share: float = SHARE, times: float = TIMES) -> Tail:
     density, slope = 2.0 * np.exp(log_density(error**2)), error * weight(error**2)
     location = float(np.trapezoid(density * slope**2, error))
     size = float(np.trapezoid(density * (1.0 - error * slope) ** 2, error))
-    return Tail(log_density, weight, location, size, False)
+    tail = Tail(log_density, weight, location, size, False, lambda _: tail)
+    return tail
 
 
 def evidence(
@@ -108,21 +114,23 @@ def evidence(
     Args:
         gap: Measured minus modelled path loss, without the nuisance [n, m], [dB].
         design: Columns of the nuisance [m, q].
-        ridge: One over the standard deviations of their priors [q]; 0 where flat.
+        ridge: One over the standard deviations of their priors [q], or of those at every gap [n, q]; 0 where flat.
         tail: The distribution of the errors.
 
     Returns:
         The logarithms [n].
     """
     links, columns = gap.shape[1], design.shape[1]
+    ridge = np.broadcast_to(ridge, (len(gap), columns))
+    known = np.square(ridge)[:, :, None] * np.eye(columns)
     size = np.maximum(np.median(np.abs(gap - np.median(gap, axis=1)[:, None]), axis=1) * 1.2, 1e-9)
     size = np.maximum(size, 0.05 * np.sqrt(np.mean(gap**2, axis=1)) + 1e-12)
     left, found, going = gap.copy(), np.zeros((len(gap), columns)), np.arange(len(gap))
     for _ in range(STEPS):
         here, before, moved = gap[going], size[going], np.zeros(len(going))
-        weight = tail.weight((left[going] / before[:, None]) ** 2)
+        weight = tail.some(going).weight((left[going] / before[:, None]) ** 2)
         if columns:
-            matrix = regular(products(design, weight) + before[:, None, None] ** 2 * np.diag(ridge**2))
+            matrix = regular(products(design, weight) + before[:, None, None] ** 2 * known[going])
             found[going] = np.linalg.solve(matrix, ((weight * here) @ design)[..., None])[..., 0]
             there = here - found[going] @ design.T
             moved, left[going] = np.abs(there - left[going]).max(axis=1), there
@@ -133,11 +141,13 @@ def evidence(
         if not len(going):
             break
     value = tail.log_density((left / size[:, None]) ** 2).sum(axis=1) - links * np.log(size)
-    value += np.sum(np.log(ridge[ridge > 0])) - 0.5 * np.sum((found * ridge) ** 2, axis=1)
-    value -= 0.5 * np.log(2 * np.pi) * int((ridge > 0).sum())
+    stated = ridge > 0
+    value += np.log(ridge, where=stated, out=np.zeros(ridge.shape)).sum(axis=1)
+    value -= 0.5 * np.sum((found * ridge) ** 2, axis=1) + 0.5 * np.log(2 * np.pi) * stated.sum(axis=1)
     value += 0.5 * np.log(2 * np.pi) - 0.5 * np.log(links * tail.size)
     if columns:
-        matrix = tail.location * design.T @ design / size[:, None, None] ** 2 + np.diag(ridge**2)
+        information = np.asarray(tail.location / size**2)[:, None, None]
+        matrix = information * (design.T @ design) + known
         value += 0.5 * columns * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(regular(matrix))[1]
     return value
 
