@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm, t
@@ -107,9 +109,9 @@ def test_what_the_data_cannot_tell_spreads_over_its_bounds():
 
 
 def test_a_gap_among_draws_of_what_no_link_depends_on_is_chance():
-    """Few draws leave holes; a value of which nothing is known has no separate ranges. One that links depend on has."""
+    """Few draws leave out holes and ends; of what nothing is known it is all, but not where links depend on it."""
     point = np.random.default_rng(4).uniform(0.0, 1.0, (400, 1))
-    point = point[np.abs(point[:, 0] - 0.5) > 0.08][:100]
+    point = 0.06 + 0.88 * point[np.abs(point[:, 0] - 0.5) > 0.08][:100]
     draws = Draws(point, np.zeros(100), np.full(100, 0.01))
 
     def told(slope):
@@ -118,8 +120,15 @@ def test_a_gap_among_draws_of_what_no_link_depends_on_is_chance():
     assert told(0.1).name == told(50.0).name == "not identifiable"
     assert len(told(0.1).pieces) == 1
     assert len(told(50.0).pieces) == 2
-    assert told(0.1).lower == told(50.0).lower
-    assert told(0.1).upper == told(50.0).upper
+    assert told(50.0).lower > 0.02
+    assert (told(0.1).lower, told(0.1).upper) == (0.0, 1.0)
+    # A prior that keeps it from a bound is no chance.
+    far = verdicts(
+        replace(draws, point=0.3 + 0.7 * point), lambda x: 0.1 * x, NAMES[:1], np.zeros(1), np.ones(1), 3.0
+    )
+    assert far[0].name == "not identifiable"
+    assert far[0].lower == pytest.approx(0.34, abs=0.04)
+    assert far[0].upper == 1.0
 
 
 def test_two_that_trade_off_are_said_to():

@@ -25,6 +25,9 @@ WEAKLY: Final = 0.5
 SILENT_DB: Final = 1.0
 """Change of path loss below which no link is said to depend on a parameter [dB]."""
 
+CHANCE: Final = 0.1
+"""Distance from a bound, of the range, within which the end of a set is chance where no link depends on a parameter."""
+
 TRADED: Final = 0.5
 """Rank correlation from which on another parameter is said to make up for one."""
 
@@ -126,7 +129,7 @@ def verdicts(
             name, change = "not identifiable", _effect(index, modelled, best, lower, upper)
             if change < SILENT_DB:
                 reason = f"no link's path loss changes by more than {change:.1f} dB over its whole range"
-                told = ((told[0][0], told[-1][1]),)  # What lies between pieces is chance.
+                told = (_evened(told, float(lower[index]), float(upper[index])),)
             else:
                 reason = _blindness(index, draws, names, change, noise_db)
         elif max(len(pieces), len(lean)) > 1:
@@ -153,6 +156,12 @@ def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float
     if pieces[-1][1] >= upper - slack:
         found.append("upper")
     return found
+
+
+def _evened(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> tuple[float, float]:
+    """One range of what no link tells: what lies between pieces is chance, and so is little at the ends."""
+    low, high, slack = pieces[0][0], pieces[-1][1], CHANCE * (upper - lower)
+    return lower if low - lower < slack else low, upper if upper - high < slack else high
 
 
 def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> str:
