@@ -123,14 +123,18 @@ def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_
     here = replace(problem, objective=replace(problem.objective, measured=measured))
     trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
     drawn = certainty(here, trail)
+    monkeypatch.setattr(calibration_buildings, "SWEPT", 0)
+    seldom = certainty(here, trail)
     monkeypatch.setattr(calibration_buildings, "FEW", 0)
     behind = certainty(here, trail)
+    assert seldom.means is not None
     assert drawn.means is not None
     assert behind.means is not None
     assert drawn.posterior is not drawn.means
     np.testing.assert_array_equal(drawn.posterior.point, behind.posterior.point)
     count = len(drawn.means.weight)
     assert count == calibration_buildings.POPULATION * hierarchy.KEPT
+    assert len(seldom.means.weight) == calibration_buildings.POPULATION * calibration_buildings.SWEEPS[0]
     assert len(behind.means.weight) <= calibration_buildings.DRAWN[1]
     assert len(np.unique(drawn.means.point, axis=0)) > 0.2 * count
     # Two ways to the same answer, roughly: marble is on one building, and told by the same links.

@@ -12,7 +12,7 @@ from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
 
 GAUSSIAN = NoiseModel("gaussian", 1.0)
 LOWER, UPPER = 1.5, 12.0
-COUNT = 400
+COUNT, SWEEPS = 400, 11
 
 
 def _parameters(scale="linear"):
@@ -57,7 +57,7 @@ def _silent(point, logarithms):
 def test_means_of_which_nothing_is_told_are_even(scale, spread):
     parameters = _parameters(scale)
     silent = _hierarchy(parameters, _silent, 4, buildings=2, spread=spread)
-    found = hierarchical(silent, _even(parameters), 2 * COUNT, seed=2)
+    found = hierarchical(silent, _even(parameters), 2 * COUNT, SWEEPS, seed=2)
     lower, upper = parameters.search_bounds
     unit = ((found.point - lower) / (upper - lower))[:, 0]
     assert np.quantile(unit, [0.1, 0.25, 0.5, 0.75, 0.9]) == pytest.approx(
@@ -68,7 +68,9 @@ def test_means_of_which_nothing_is_told_are_even(scale, spread):
 
 def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
     parameters = _parameters()
-    found = hierarchical(_hierarchy(parameters, _silent, 4, centred=False), _even(parameters), COUNT, seed=2)
+    found = hierarchical(
+        _hierarchy(parameters, _silent, 4, centred=False), _even(parameters), COUNT, SWEEPS, seed=2
+    )
     assert np.quantile(found.point, [0.25, 0.75]) == pytest.approx([4.125, 9.375], abs=0.4)
 
 
@@ -78,7 +80,7 @@ def test_a_stated_prior_is_kept_where_nothing_is_told():
     density = -0.5 * prior.rows(flat.point)[:, 0] ** 2
     weight = np.exp(density)
     alike = Draws(flat.point, density, weight / weight.sum())
-    found = hierarchical(_hierarchy(parameters, _silent, 4, priors=prior), alike, COUNT, seed=3)
+    found = hierarchical(_hierarchy(parameters, _silent, 4, priors=prior), alike, COUNT, SWEEPS, seed=3)
     # Flat in x and normal in log x: the mean of log x is larger by the variance.
     assert np.log(found.point).mean() == pytest.approx(np.log(4.0) + 0.01, abs=0.01)
     assert np.log(found.point).std() == pytest.approx(0.1, rel=0.1)
@@ -142,7 +144,7 @@ def test_means_are_those_of_the_closed_form(known, planted):
     weights = np.exp(-np.array(spreads) / SPREAD)
     mean, deviation = _moments(*_closed(measured, spreads, weights))
     found = hierarchical(
-        _hierarchy(parameters, gaps, len(measured), BUILDINGS, spread=known), alike, COUNT, seed=5
+        _hierarchy(parameters, gaps, len(measured), BUILDINGS, spread=known), alike, COUNT, SWEEPS, seed=5
     )
     assert found.point.mean() == pytest.approx(mean, abs=0.2 * deviation)
     assert found.point.std() == pytest.approx(deviation, rel=0.2)
@@ -160,7 +162,9 @@ def test_links_that_only_one_building_explains_do_not_tell_the_mean():
         return gaps(point, logarithms)[:, first]
 
     alike = _alike(parameters, of_one)
-    one = hierarchical(_hierarchy(parameters, of_one, EACH, BUILDINGS, spread=0.15), alike, COUNT, seed=6)
+    one = hierarchical(
+        _hierarchy(parameters, of_one, EACH, BUILDINGS, spread=0.15), alike, COUNT, SWEEPS, seed=6
+    )
     assert one.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
 
 
@@ -186,7 +190,7 @@ def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
     alike = Draws(flat.point, density, weight / weight.sum())
     both = Hierarchy(parameters, np.zeros(2, dtype=int), np.arange(2), np.array([True, False]), gaps,
                      _marginal(40), NO_PRIOR, 0.004)  # fmt: skip
-    found = hierarchical(both, alike, COUNT, seed=12)
+    found = hierarchical(both, alike, COUNT, SWEEPS, seed=12)
     for sign in (1.0, -1.0):
         mean, deviation = _moments(alike.point @ [1.0, sign], alike.weight)
         told = found.point @ [1.0, sign]
@@ -196,7 +200,6 @@ def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
 
 def test_weights_alone_lead_to_the_posterior(monkeypatch):
     """Draws that do not move, of one building: the mean is as the building's constant, but for the spread."""
-    monkeypatch.setattr(module, "SWEEPS", 0)
     monkeypatch.setattr(module, "POWER", 1.0)
     parameters, measured = _parameters("log"), _planted(0.15)
     gaps = _straight(parameters, measured)
@@ -205,7 +208,7 @@ def test_weights_alone_lead_to_the_posterior(monkeypatch):
         return gaps(point, np.repeat(logarithms[:, :1], BUILDINGS, axis=1))[:, :EACH]
 
     alike = _alike(parameters, of_one)
-    found = hierarchical(_hierarchy(parameters, of_one, EACH, 1, spread=0.03), alike, 20_000, seed=9)
+    found = hierarchical(_hierarchy(parameters, of_one, EACH, 1, spread=0.03), alike, 20_000, 0, seed=9)
     mean, deviation = _moments(alike.point[:, 0], alike.weight)
     told = found.point
     assert told.mean() == pytest.approx(mean, abs=0.005)
@@ -224,7 +227,7 @@ def test_each_step_leaves_a_share_of_the_draws_effective():
 def test_draws_are_the_same_for_a_seed():
     parameters = _parameters()
     one, two, other = (
-        hierarchical(_hierarchy(parameters, _silent, 4), _even(parameters), 64, seed=seed).point
+        hierarchical(_hierarchy(parameters, _silent, 4), _even(parameters), 64, SWEEPS, seed=seed).point
         for seed in (7, 7, 8)
     )
     np.testing.assert_array_equal(one, two)

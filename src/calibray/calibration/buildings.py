@@ -43,8 +43,17 @@ EVALUATED: Final = 6_000_000
 POPULATION: Final = 96
 """Means that are drawn together with what each building has."""
 
+SWEEPS: Final = (4, 11)
+"""Fewest and most times that these move at each step: of larger scenes the fewest, some 10,000 replays in all."""
+
+SWEPT: Final = 100_000_000
+"""Interactions that are evaluated while they do, about."""
+
+STEPS: Final = 8
+"""Steps that it takes, about."""
+
 FEW: Final = 8_300
-"""Interactions beyond which that would be dear: it takes some 25,000 replays."""
+"""Interactions beyond which even the fewest would be dear."""
 
 JUDGED: Final = 24
 """Draws that tell how much too sure a density is that takes buildings as alike, for each spread."""
@@ -257,7 +266,10 @@ def _drawn(explaining: Explaining, apart: Buildings, posterior: Draws, tried: Se
         problem.priors,
         None if stated == "auto" else float(stated),
     )
-    found = hierarchical(hierarchy, posterior, POPULATION, seed=problem.setup.study.method.seed)
+    # Every sweep replays each draw three times.
+    sweeps = SWEPT // (3 * STEPS * POPULATION * apart.engine.paths.num_interactions)
+    sweeps = int(np.clip(sweeps, *SWEEPS))
+    found = hierarchical(hierarchy, posterior, POPULATION, sweeps, seed=problem.setup.study.method.seed)
     # As good as the places of the others: by what explains the links where buildings are alike.
     return replace(found, density=np.logaddexp.reduce(explaining(found.point), axis=1))
 

@@ -55,11 +55,8 @@ EFFECTIVE: Final = 0.5
 STEPS: Final = 30
 """Steps after which the density stays as flat as it is."""
 
-SWEEPS: Final = 11
-"""Times that every draw is moved in each way, at each step."""
-
 KEPT: Final = 8
-"""Of the last step's, those after which draws are kept."""
+"""Sweeps of the last step after which draws are kept."""
 
 POWER: Final = 0.5
 """Power of the weights that the population is chosen by: 1 were right for draws that do not move."""
@@ -193,13 +190,14 @@ def _plain(model: NoiseModel, offset: bool) -> bool:
     return model.kind == GAUSSIAN and model.offset == offset
 
 
-def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) -> Draws:
+def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, sweeps: int, seed: int = 0) -> Draws:
     """Draw means over all buildings, of which the links lean on some.
 
     Args:
         hierarchy: What links tell of means and buildings.
         alike: Draws of the means, in the search space, where all buildings are alike.
-        count: Number of draws that move; each is kept several times.
+        count: Number of draws that move; each is kept after each of the last sweeps.
+        sweeps: Times that every draw is moved in each way, at each step.
         seed: Seed of the random numbers.
 
     Returns:
@@ -213,13 +211,14 @@ def hierarchical(hierarchy: Hierarchy, alike: Draws, count: int, seed: int = 0) 
         population = population.chosen(random.permutation(systematic(weight, count, random)))
         population = _with_models(hierarchy, population, power, random)
         moves, passed = _Moves(hierarchy, power, random), [population]
-        for _ in range(SWEEPS):
+        for _ in range(sweeps):
             population, lengths = moves.swept(population, lengths)
             passed.append(population)
         steps += 1
         if power == 1.0 or steps == STEPS:
             point, told = (
-                np.concatenate([getattr(each, name) for each in passed[-KEPT:]]) for name in ("point", "told")
+                np.concatenate([getattr(each, name) for each in passed[-min(KEPT, max(sweeps, 1)) :]])
+                for name in ("point", "told")
             )
             point = parameters.to_search(parameters.from_unit(point))
             return Draws(point, told, np.full(len(told), 1.0 / len(told)), power < 1.0)

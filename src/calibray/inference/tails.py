@@ -63,14 +63,20 @@ def student(freedom: float | NDArray[np.float64]) -> Tail:
         The distribution.
     """
     constant = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - 0.5 * np.log(freedom * np.pi)
-    each, constant = (np.asarray(value, dtype=np.float64)[..., None] for value in (freedom, constant))
+    each, constants = (np.asarray(value, dtype=np.float64)[..., None] for value in (freedom, constant))
+    return _student(each, constants)
+
+
+def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tail:
+    """The same by what its density has in common, of one size or [n, 1]."""
+    alike, each = freedom.ndim < 2, freedom[..., 0]
     tail = Tail(
-        lambda square: constant - 0.5 * (each + 1) * np.log1p(square / each),
-        lambda square: (each + 1.0) / (each + square),
-        (freedom + 1) / (freedom + 3),
-        2 * freedom / (freedom + 3),
+        lambda square: constant - 0.5 * (freedom + 1) * np.log1p(square / freedom),
+        lambda square: (freedom + 1.0) / (freedom + square),
+        (each + 1) / (each + 3),
+        2 * each / (each + 3),
         True,  # X.-L. Meng, D. van Dyk, J. R. Stat. Soc. B 59 (1997) 511.
-        lambda rows: tail if each.ndim < 2 else student(each[rows, 0]),
+        lambda rows: tail if alike else _student(freedom[rows], constant[rows]),
     )
     return tail
 
