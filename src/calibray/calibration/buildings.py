@@ -270,8 +270,10 @@ def _drawn(explaining: Explaining, apart: Buildings, posterior: Draws, tried: Se
     sweeps = SWEPT // (3 * STEPS * POPULATION * apart.engine.paths.num_interactions)
     sweeps = int(np.clip(sweeps, *SWEEPS))
     found = hierarchical(hierarchy, posterior, POPULATION, sweeps, seed=problem.setup.study.method.seed)
-    # As good as the places of the others: by what explains the links where buildings are alike.
-    return replace(found, density=np.logaddexp.reduce(explaining(found.point), axis=1))
+    # By what explains the links where buildings are alike; asked for the last of every line of draws, which is enough.
+    density = np.full(len(found.point), -np.inf)
+    density[-POPULATION:] = np.logaddexp.reduce(explaining(found.point[-POPULATION:]), axis=1)
+    return replace(found, density=density)
 
 
 def _behind(
@@ -347,7 +349,9 @@ def _apart(engine: Replay, scene: Scene, combining: str, bandwidth: float | None
         name: paths.materials[known[k]] for name, k in zip(names, kind.tolist(), strict=True)
     }
     own = replace(paths, material=material.reshape(-1), materials=dict(table))
-    again = Replay(own, Parameters(items, parameters.frequency), combining, bandwidth, tabulate=False)
+    again = Replay(
+        own, Parameters(items, parameters.frequency), combining, bandwidth, tabulate=False, block=POPULATION
+    )
     return Buildings(engine, again, owner, building)
 
 

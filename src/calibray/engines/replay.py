@@ -34,8 +34,8 @@ TABLE_TOLERANCE: Final = 1e-4
 FORETOLD: Final = 32
 """Candidates spread over the bounds that tell how fine tables must be, beside the first one."""
 
-LARGEST_BLOCK: Final = 32
-"""Candidates a call, at most; a program is compiled for this number, and fewer cost no more than they are."""
+BLOCK: Final = 32
+"""Candidates a call, at most."""
 
 
 class Replay:
@@ -49,6 +49,7 @@ class Replay:
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             combine by power.
         tabulate: Whether coefficients come from tables; if None, where that is quicker.
+        block: Candidates a call, at most; a program is compiled for this number, and fewer cost no more than they are.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -62,11 +63,12 @@ class Replay:
         bandwidth: float | None = None,
         dtype: type | None = None,
         tabulate: bool | None = None,
+        block: int = BLOCK,
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
-        self._dtype = dtype
+        self._dtype, self._block = dtype, block
         self._offsets = fields.check_combining(paths, combining, bandwidth)
         self._combining = combining
         self._rows, columns = parameters.indices(list(paths.materials))
@@ -170,7 +172,7 @@ class Replay:
         if self._intervals is not None:
             return 1
         room = ANSWERS // max(self.paths.num_links * len(self.materials) * len(self._fields), 1)
-        return min(LARGEST_BLOCK, 1 << max(room, 1).bit_length() - 1)
+        return min(self._block, 1 << max(room, 1).bit_length() - 1)
 
 
 @jax.jit
