@@ -137,6 +137,9 @@ def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_
     assert len(seldom.means.weight) == calibration_buildings.POPULATION * calibration_buildings.SWEEPS[0]
     assert len(behind.means.weight) <= calibration_buildings.DRAWN[1]
     assert len(np.unique(drawn.means.point, axis=0)) > 0.2 * count
+    # The last of every line of draws stands for how well it explains the links.
+    last = np.arange(count) >= count - calibration_buildings.POPULATION
+    np.testing.assert_array_equal(np.isfinite(drawn.means.density), last)
     # Two ways to the same answer, roughly: marble is on one building, and told by the same links.
     spread = [np.log(each.point[:, 1]).std() for each in (drawn.means, behind.means)]
     assert 0.5 < spread[0] / spread[1] < 2.0
