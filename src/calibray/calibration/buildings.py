@@ -44,10 +44,10 @@ POPULATION: Final = 96
 """Means that are drawn together with what each building has."""
 
 SWEEPS: Final = (4, 11)
-"""Fewest and most times that these move at each step: of larger scenes the fewest, some 10,000 replays in all."""
+"""Fewest and most times that these move at each step, which takes some 10,000 and 25,000 replays in all."""
 
 SWEPT: Final = 100_000_000
-"""Interactions that are evaluated while they do, about."""
+"""Interactions that are evaluated while they do, about: of larger scenes they move less often."""
 
 STEPS: Final = 8
 """Steps that it takes, about."""
