@@ -28,7 +28,7 @@ DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105
 
 JUDGING = tuple(f"district-{seed}" for seed in (153, 155, 159, 161, 163))
 """Districts to judge by, run once at the end. (151 and 157 draw a carrier that P.2040 gives no constants for; those
-from 113 to 149 judged versions before.)"""
+from 113 to 149 judged versions before, and those from 139 on were developed on since.)"""
 
 DEMO = "demo"
 NEAR_M = 0.1
