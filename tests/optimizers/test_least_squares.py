@@ -99,6 +99,28 @@ def test_finds_the_global_minimum_of_the_district(seed):
     assert optimizer.evaluations < 12_000
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_searches_that_cannot_catch_up_with_a_known_minimum_cost_little(seed):
+    """From a minimum that is known, others are given up sooner, and none that leads lower is."""
+    landscape = tones()
+    known = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=5)).best
+
+    def run(catch_up):
+        given = {"seed": seed, "starts": 8, "x0": known.x, "catch_up": catch_up}
+        return landscape.run(LeastSquares(landscape.lower, landscape.upper, **given))
+
+    patient, quick, at_once = run(100.0), run(10.0), run(0.0)
+    assert at_once.evaluations < quick.evaluations < patient.evaluations
+    for each in (patient, quick, at_once):
+        assert each.best.y == pytest.approx(known.y, abs=1e-9)
+
+
+@pytest.mark.parametrize("catch_up", [-1.0, np.inf, "10"])
+def test_how_far_a_search_may_lie_behind_is_checked(catch_up):
+    with pytest.raises(InputError, match="catch_up"):
+        LeastSquares([0.0], [1.0], catch_up=catch_up)
+
+
 def test_active_bounds():
     """The minimum (1, 1) lies outside; the constrained one is on the face x0 = 0.5 at x1 = 0.25."""
     landscape = within(rosenbrock(), [-2.0, -2.0], [0.5, 2.0])

@@ -40,6 +40,9 @@ MOST: Final = 128
 TOLERANCE: Final = 1e-6
 """Relative decrease of the mean square below which a search has converged: predictions change by less."""
 
+CATCH_UP: Final = 10.0
+"""Predicted decreases that a search may lie behind minima that are known before it is given up."""
+
 NOTHING: Final[Mapping[str, NDArray[np.float64]]] = {}
 
 TX_OFFSET: Final = "offset of the transmitter"
@@ -113,7 +116,8 @@ def minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHE
         The minima, the best first [k, d].
     """
     bounds = problem.parameters.search_bounds
-    search = LeastSquares(*bounds, starts=searches, x0=known[:KNOWN], tolerance=TOLERANCE)
+    given = {"catch_up": CATCH_UP} if len(known) else {}
+    search = LeastSquares(*bounds, starts=searches, x0=known[:KNOWN], tolerance=TOLERANCE, **given)
     for _ in rounds(search, problem.squares):
         pass
     return search.minima

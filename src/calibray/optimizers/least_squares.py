@@ -39,7 +39,7 @@ from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0
-"""Predicted decreases that a search may lie behind the best one before it is given up."""
+"""Predicted decreases that a search may lie behind the best one before it is given up, unless told otherwise."""
 RECOMBINED = 32
 """Combinations of minima that are tried at a time, no more than there were starts."""
 FOLLOWED = 0.2
@@ -73,6 +73,8 @@ class LeastSquares(Optimizer):
         iterations: Largest number of steps of each search.
         tolerance: A search has converged when its model predicts less than this relative decrease of the mean
             square, or a step shorter than this in the unit cube.
+        catch_up: Predicted decreases that a search may lie behind the best one before it is given up; fewer where
+            starts are minima already, and the others need but show whether they lead to a better one.
         objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
             must rise with their mean square, which is what is minimised; both are checked.
 
@@ -104,12 +106,14 @@ class LeastSquares(Optimizer):
         x0: ArrayLike | None = None,
         iterations: int = 100,
         tolerance: float = 1e-10,
+        catch_up: float = CATCH_UP,
         objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
         self.starts = whole("starts", starts, at_least=1)
         self.iterations = whole("iterations", iterations, at_least=1)
         self.tolerance = real("tolerance", tolerance, at_least=0.0, at_most=1.0)
+        self.catch_up = real("catch_up", catch_up, at_least=0.0)
         self.x0 = _user_starts(x0, self.box)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search, objective)
@@ -126,7 +130,7 @@ class LeastSquares(Optimizer):
         unit, ended = np.concatenate([box.to_unit(self.x0), *told_best]), None
         for first in range(0, self.starts, ROUND):
             unit = np.concatenate([unit, sobol[first : first + ROUND]])
-            ended = yield from self._descended(unit, ended)
+            ended = yield from self._descended(unit, ended, self.catch_up)
             if returns(ended) >= RETURNS:
                 break
             unit = unit[:0]
@@ -143,14 +147,14 @@ class LeastSquares(Optimizer):
             unit = recombined(distinct(ended, SPACE).unit, number)
             if not len(unit):
                 break
-            ended = yield from self._descended(unit, ended, NEARER, followed)
+            ended = yield from self._descended(unit, ended, min(NEARER, self.catch_up), followed)
         return ended
 
     def _descended(
         self,
         unit: NDArray[np.float64],
         known: Starts | None,
-        catch_up: float = CATCH_UP,
+        catch_up: float,
         followed: int | None = None,
     ) -> Generator[NDArray[np.float64], Evaluations, Starts]:
         descent = descend(unit, self.iterations, self.tolerance, catch_up, known, followed)
