@@ -22,6 +22,7 @@ from calibray.inference.nuisance import CONSTANT, LOG_DISTANCE, Nuisance, make_t
 from calibray.inference.objective import Objective
 from calibray.inference.validation import BEFORE, CALIBRATED, PER_TX, PRIOR, PRIOR_PER_TX, SLOPE
 from calibray.optimizers import LeastSquares
+from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
 from calibray.study import Setup
 
@@ -39,9 +40,6 @@ MOST: Final = 128
 
 TOLERANCE: Final = 1e-6
 """Relative decrease of the mean square below which a search has converged: predictions change by less."""
-
-CATCH_UP: Final = 10.0
-"""Predicted decreases that a search may lie behind minima that are known before it is given up."""
 
 NOTHING: Final[Mapping[str, NDArray[np.float64]]] = {}
 
@@ -116,8 +114,8 @@ def minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHE
         The minima, the best first [k, d].
     """
     bounds = problem.parameters.search_bounds
-    given = {"catch_up": CATCH_UP} if len(known) else {}
-    search = LeastSquares(*bounds, starts=searches, x0=known[:KNOWN], tolerance=TOLERANCE, **given)
+    behind = NEARER if len(known) else CATCH_UP
+    search = LeastSquares(*bounds, starts=searches, x0=known[:KNOWN], tolerance=TOLERANCE, catch_up=behind)
     for _ in rounds(search, problem.squares):
         pass
     return search.minima

@@ -40,12 +40,12 @@ from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0
 """Predicted decreases that a search may lie behind the best one before it is given up, unless told otherwise."""
+NEARER = 10.0
+"""The same of searches that begin near their end, or beside others that stand there."""
 RECOMBINED = 32
 """Combinations of minima that are tried at a time, no more than there were starts."""
 FOLLOWED = 0.2
 """Share of them that searches start from, those that fit best."""
-NEARER = 10.0
-"""`CATCH_UP` of these searches, which begin near their end."""
 ROUND = 64
 """Starts of a round."""
 RETURNS = 10
