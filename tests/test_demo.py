@@ -14,7 +14,7 @@ from calibray.calibration.problem import Problem
 from calibray.cli.app import app
 from calibray.comparison import experiment
 from calibray.comparison.experiment import MAPPING, METHODS, run_demo
-from calibray.comparison.paper import tables
+from calibray.comparison.paper import tables, trust
 from calibray.reporting.demo import FIGURES, write
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
@@ -86,6 +86,16 @@ def test_soil_is_called_not_identifiable_and_concrete_is(demo):
     concrete = intervals["concrete.relative_permittivity"]
     assert concrete.verdict in ("identified", "weakly identified")
     assert concrete.upper - concrete.lower < 0.5 * (concrete.upper + concrete.lower)
+
+
+def test_every_piece_of_an_interval_is_shown(demo):
+    """What lies between two ranges is no part of either."""
+    found = demo[0].results["auto"].intervals["glass.relative_permittivity"]
+    assert len(found.pieces) == 2
+    (row,) = [row for row in trust(demo[0]).rows if row[0].startswith("glass")]
+    for low, high in found.pieces:
+        assert f"{low:.4g} to {high:.4g}" in row[2]
+    assert "apart from them lies" in found.reason
 
 
 def test_files_exist_and_open(demo):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -129,6 +130,28 @@ def test_a_gap_among_draws_of_what_no_link_depends_on_is_chance():
     assert far[0].name == "not identifiable"
     assert far[0].lower == pytest.approx(0.34, abs=0.04)
     assert far[0].upper == 1.0
+
+
+def test_what_an_interval_has_apart_from_the_set_that_is_judged_is_said():
+    """Seven of a hundred draws lie elsewhere: intervals of 95 % hold them, nine tenths do not."""
+    random = np.random.default_rng(3)
+    point = np.concatenate([random.normal(3.0, 0.1, 1860), random.normal(8.0, 0.02, 140)])[:, None]
+    draws = Draws(point, np.zeros(2000), np.full(2000, 1 / 2000))
+    limits = np.zeros(1), np.full(1, 10.0)
+    (verdict,) = verdicts(draws, lambda x: x, NAMES[:1], *limits, 1.0, shown=lambda _, value: 10 * value)
+    assert verdict.name == "identified"
+    assert len(verdict.pieces) == 2
+    found = re.fullmatch(
+        r"nine tenths .* range; apart from them lies (\S+) to (\S+) \((\d)% of it\)", verdict.reason
+    )
+    assert found is not None
+    low, high, share = map(float, found.groups())
+    assert 79 < low < high < 81
+    assert share in (6, 7)
+    (alone,) = verdicts(
+        Draws(point[:1860], np.zeros(1860), np.full(1860, 1 / 1860)), lambda x: x, NAMES[:1], *limits, 1.0
+    )
+    assert "apart" not in alone.reason
 
 
 def test_two_that_trade_off_are_said_to():

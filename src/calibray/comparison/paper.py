@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calibray.comparison.labels import label
+from calibray.result.tables import ends_text
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def trust(demo: Demo) -> Table:
     *_, auto = demo.results.values()
     columns = (Column("parameter"), numbers("value"), numbers("95 % interval"), Column("verdict"))
     rows = tuple(
-        (name, f"{auto.parameters[name]:.2f}", f"{found.lower:.2f} to {found.upper:.2f}", found.verdict)
+        (name, f"{auto.parameters[name]:.2f}", ends_text(found), found.told)
         for name, found in auto.intervals.items()
     )
     return Table("How far to trust auto's answer", columns, rows)

@@ -144,6 +144,7 @@ def verdicts(
         else:
             name = "identified" if share <= IDENTIFIED else "weakly identified"
             reason = f"nine tenths of the posterior take up {share:.0%} of the range"
+            reason += _apart(index, pieces, told, draws, shown)
         found.append(Verdict(told, float(best[index]), name, reason))
     return found
 
@@ -172,6 +173,22 @@ def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws,
         middle = value[inside][np.argmax(draws.density[inside])] if inside.any() else 0.5 * (low + high)
         parts.append(f"{shown(index, float(middle)):.4g} ({draws.weight[inside].sum():.0%} of the posterior)")
     return f"{len(pieces)} separate ranges explain the links: around {', '.join(parts)}"
+
+
+def _apart(
+    index: int,
+    pieces: tuple[tuple[float, float], ...],
+    told: tuple[tuple[float, float], ...],
+    draws: Draws,
+    shown: Shown,
+) -> str:
+    """What the interval that is told has apart from the set that is judged, with what speaks for each; none often."""
+    others, value = [], draws.point[:, index]
+    for low, high in told:
+        if not any(start <= high and low <= end for start, end in pieces):
+            weight = draws.weight[(value >= low) & (value <= high)].sum()
+            others.append(f"{shown(index, low):.4g} to {shown(index, high):.4g} ({weight:.0%} of it)")
+    return f"; apart from them lies {', '.join(others)}" if others else ""
 
 
 def _effect(

@@ -246,7 +246,7 @@ def _tiles(result: Result) -> list[tuple[str, str, str]]:
         ("RT calls", f"{result.rt_calls:,}", f"at {hertz(result.study.scene.frequency)}"),
     ]
     if result.intervals:
-        tiles.append(("Values identified", f"{told} of {len(result.parameters)}", "by their 95 % intervals"))
+        tiles.append(("Values identified", f"{told} of {len(result.parameters)}", "by their verdicts"))
     return tiles
 
 
