@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import planted
 from calibray.calibration import calibrate
+from calibray.calibration.suggest import suggest
 from calibray.cli.app import app
 from calibray.inference.diagnostics import shared_errors
 from calibray.inference.reach import FEW, reach
@@ -60,6 +61,33 @@ def test_received_power_is_predicted_as_it_was_measured(received):
         "no path",
     )
     assert set(told.remark[reached]) == {""}
+
+
+def test_a_table_like_the_measured_one_is_predicted_at(tmp_path):
+    """Columns that the study names, the transmitter's place with it: by Python, and by the command."""
+    names = {"rx_x": "east", "rx_y": "north"}
+    table = planted.campaign(noise_db=0.3).rename(columns=names)[["east", "north", "path_loss_db"]]
+    links = {
+        "file": "links.csv", "tx": [0.0, 0.0, 3.0], "rx": ["east", "north", 1.5], "value": "path_loss_db",
+    }  # fmt: skip
+    method = {"name": "auto", "options": {"starts": 16}}
+    found = calibrate(planted.study(tmp_path, table, links=links, method=method), engine=planted.engine())
+    standard = planted.links().iloc[::3]
+    theirs = standard.rename(columns=names)[["east", "north"]]
+    told = found.predict(standard)
+    assert np.isfinite(told).all()
+    assert found.predict(theirs) == pytest.approx(told)
+    assert found.predict_interval(theirs).upper_db.to_numpy() == pytest.approx(
+        found.predict_interval(standard).upper_db.to_numpy()
+    )
+    assert suggest(found, theirs, 1).row.tolist() == suggest(found, standard, 1).row.tolist()
+    found.save(tmp_path / "out")
+    theirs.to_csv(tmp_path / "new.csv", index=False)
+    outcome = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "new.csv")])
+    assert outcome.exit_code == 0, outcome.output
+    printed = pd.read_csv(io.StringIO(outcome.stdout))
+    assert printed.columns.tolist() == ["east", "north", "path_loss_db"]
+    assert printed.path_loss_db.to_numpy() == pytest.approx(told)
 
 
 def test_the_command_adds_the_columns_and_warns_of_odd_places(received, tmp_path):

@@ -10,11 +10,12 @@ import pytest
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
+from calibray.measurements import LINK_COLUMNS
 from calibray.measurements.preparation import Averaging, Preparation, prepare
 from calibray.measurements.tables import SourceTable
 from calibray.scenes.footprints import Footprints
 from calibray.scenes.making import make_scene
-from calibray.study import Study
+from calibray.study import Study, preparing
 
 FRAME = Frame.local(9.99, 50.01)
 SITES = {"a": (0.0, 0.0, 20.0), "b": (60.0, 0.0, 15.0)}
@@ -94,6 +95,29 @@ def test_the_studys_frame_counts_before_the_scene_files(folder):
     in_zone = Study.from_content(content, folder / "study.toml").measurements()
     # The zone's scale and convergence: centimetres and fractions of a degree so near its meridian.
     assert in_zone.rx[0] == pytest.approx([-5, 20, 1.5], abs=0.3)
+
+
+def test_places_to_predict_at_are_read_as_measured_ones_were(folder, monkeypatch):
+    """The same columns mean the same, with nothing measured, and no row is left out."""
+    monkeypatch.setattr(preparing, "_ground", lambda _: lambda x, y: 0.1 * x + 2.0 * y)
+    plan = study(folder, heights="ground", where="site == 'a'", inside="drop")
+    measured, log = plan.measurements(), pd.read_csv(folder / "log.csv").drop(columns="rsrp")
+    links = plan.places(SourceTable(log, source="new.csv"))
+    assert len(links) == len(log) == 16
+    kept = (log.site == "a").to_numpy() & (np.abs(links.rx[:, 0] - 38.5) > 0.4)
+    assert links.rx[kept] == pytest.approx(measured.rx)
+    assert links.tx[kept] == pytest.approx(measured.tx)
+    assert links.rx[0, 2] == pytest.approx(1.5 + 0.5 + 40.0, abs=0.01)
+    assert links.group is not None
+    assert links.group[:3].tolist() == ["a p1", "a p2", "b p1"]
+    assert not links.measured
+    # Metres in the scene's frame, where a table gives them, are those.
+    metres = log.assign(**{name: k + 1.0 for k, name in enumerate(LINK_COLUMNS)})
+    assert plan.places(SourceTable(metres)).rx[3].tolist() == [4.0, 5.0, 6.0]
+    with pytest.raises(InputError, match=r"new\.csv.*no column 'site'"):
+        plan.places(SourceTable(log.drop(columns="site"), source="new.csv"))
+    with pytest.raises(InputError, match="no column 'tx_x'"):
+        plan.places(SourceTable(log[["phone"]], source="new.csv"))
 
 
 @pytest.mark.parametrize(

@@ -36,8 +36,9 @@ def predict(
         Path,
         typer.Argument(
             metavar="LINKS",
-            help="CSV or Parquet file with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], and the study's "
-            "group column if its offset has one; its frequency column, if it has one, gives the carriers.",
+            help="CSV or Parquet file with the columns that the study names for positions, or tx_x, tx_y, tx_z, rx_x, "
+            "rx_y, rx_z [m], and its group column if its offset has one; its frequency column, if it has one, gives "
+            "the carriers.",
             show_default=False,
         ),
     ],

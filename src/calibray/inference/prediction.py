@@ -19,7 +19,7 @@ from calibray.inference.quantity import as_measured
 from calibray.inference.reach import FEW, reach
 from calibray.inference.remarks import PLACES, remarks
 from calibray.inference.residual_field import carried, measured_errors
-from calibray.measurements import Measurements, SourceTable, links_from_frame, links_from_table
+from calibray.measurements import Measurements, SourceTable
 from calibray.progress import Progress
 from calibray.study import Setup
 
@@ -48,9 +48,9 @@ def predict(
 
     Args:
         result: The calibration.
-        links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] and the study's group
-            column, if it has one. The study's column of frequencies gives the links' carriers; without it all
-            links have the scene's.
+        links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or else with those that
+            the study names for positions, and with its group column, if it has one. The study's column of
+            frequencies gives the links' carriers; without it all links have the scene's.
         progress: Called with the stage "tracing" after every launch.
         anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
@@ -222,11 +222,9 @@ def as_links(result: Result, links: Measurements | pd.DataFrame | SourceTable) -
     """
     if isinstance(links, Measurements):
         return links
-    study = result.study
-    group, frequency = study.offset.per if study.offset else None, study.links.frequency
-    if isinstance(links, SourceTable):
-        return links_from_table(links, group, frequency)
-    return links_from_frame(links, group, frequency)
+    if not isinstance(links, SourceTable):
+        links = SourceTable(links.reset_index(drop=True), source="links")
+    return result.study.places(links)
 
 
 def check_groups(result: Result, links: Measurements) -> None:

@@ -171,14 +171,23 @@ def links_from_frame(
 
 
 def links_from_table(
-    table: SourceTable, group: str | Sequence[str] | None = None, frequency: str | None = None
+    table: SourceTable,
+    group: str | Sequence[str] | None = None,
+    frequency: str | None = None,
+    *,
+    steps: Preparation | None = None,
+    tx: Coordinates = LINK_COLUMNS[:3],
+    rx: Coordinates = LINK_COLUMNS[3:],
 ) -> Measurements:
-    """Links without measured values from rows of a file with the columns of `links_from_frame`.
+    """Links without measured values from rows of a file.
 
     Args:
         table: The rows.
         group: Column of group labels, or several whose labels are joined.
         frequency: Column of carrier frequencies [Hz]; without that column all links have the study's carrier.
+        steps: What makes positions of the rows, of which none is left out; nothing if None.
+        tx: Transmitter position, as `Preparation` says; the columns of `links_from_frame` unless others are named.
+        rx: Receiver position, likewise.
 
     Returns:
         The links, their path losses NaN.
@@ -188,9 +197,11 @@ def links_from_table(
     """
     if len(table) == 0:
         raise InputError(f"{table.source}: holds no rows; give at least one link")
+    made = prepare(table, steps or Preparation(), tx, rx, "")
+    table = made.table
     return Measurements(
-        tx=positions(table, "tx", LINK_COLUMNS[:3]),
-        rx=positions(table, "rx", LINK_COLUMNS[3:]),
+        tx=positions(table, "tx", made.tx),
+        rx=positions(table, "rx", made.rx),
         path_loss_db=np.full(len(table), np.nan),
         group=None if group is None else group_labels(table, group),
         frequency=table.numbers(frequency) if frequency is not None and frequency in table.frame else None,

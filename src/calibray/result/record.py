@@ -310,9 +310,9 @@ class Result:
         """Path loss at links that were never measured; see `calibray.inference.prediction.predict`.
 
         Args:
-            links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] and the study's group
-                column, if it has one. The study's column of frequencies gives the links' carriers; without it all
-                links have the scene's.
+            links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or else with those that
+                the study names for positions, and with its group column, if it has one. The study's column of
+                frequencies gives the links' carriers; without it all links have the scene's.
             progress: Called with the stage "tracing" after every launch.
             anyway: Predict although a file of the scene or an antenna changed since the calibration.
 

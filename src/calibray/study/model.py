@@ -18,14 +18,14 @@ from calibray.engines.kinds import AnyEngine, default
 from calibray.errors import InputError
 from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
-from calibray.measurements import Measurements, measured_links
-from calibray.measurements.tables import read_table
+from calibray.measurements import LINK_COLUMNS, Measurements, links_from_table, measured_links
+from calibray.measurements.tables import SourceTable, read_table
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
 from calibray.spelling import shortened
 from calibray.study.engines import part_engine
 from calibray.study.faults import dotted, explain
-from calibray.study.preparing import AS_THEY_ARE, preparation
+from calibray.study.preparing import AS_THEY_ARE, placing, preparation
 from calibray.study.reading import expand, read_content, refuse_unquoted_names
 from calibray.study.sections import (
     AntennasSection,
@@ -271,6 +271,26 @@ class Study(Section):
             group=self.offset.per if self.offset else None,
             **self.links.model_dump(include=AS_THEY_ARE),
         )
+
+    def places(self, table: SourceTable) -> Measurements:
+        """Links without measured values, to predict at, grouped as the offset is.
+
+        Args:
+            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame; without these,
+                with the columns that ``[links]`` names for positions, which mean what they mean there. No row is
+                left out.
+
+        Returns:
+            A link for every row, with carriers if the table has the study's column of them.
+
+        Raises:
+            InputError: A column is missing or malformed, or a position is not finite.
+        """
+        group, links = self.offset.per if self.offset else None, self.links
+        given, own = {*table.frame}, {*links.tx, *links.rx}
+        if given >= {*LINK_COLUMNS} or not given & own:
+            return links_from_table(table, group, links.frequency)
+        return links_from_table(table, group, links.frequency, steps=placing(self), tx=links.tx, rx=links.rx)
 
     def held_out(self, measurements: Measurements) -> NDArray[np.bool_]:
         """Which links are held out; none without ``[holdout]``, or where each block is in turn.

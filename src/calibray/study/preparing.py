@@ -54,6 +54,27 @@ def preparation(study: Study) -> Preparation:
     )
 
 
+def placing(study: Study) -> Preparation:
+    """Of these steps those that tell where a row's antennas stand, and leave none out.
+
+    Args:
+        study: The study.
+
+    Returns:
+        The steps.
+
+    Raises:
+        InputError: As for `preparation`.
+    """
+    links, transmitters = study.links, study.transmitters_path
+    return Preparation(
+        ground=None if links.heights is None else _ground(study),
+        transmitters=None if transmitters is None else str(transmitters),
+        transmitter=links.transmitter,
+        frame=scene_frame(study) if links.position == "geographic" else None,
+    )
+
+
 # What looks into a scene's meshes takes SciPy along; only studies whose rows need that load it.
 
 
