@@ -7,7 +7,16 @@ import pytest
 
 from calibray.inference.blocks import blocks
 from calibray.inference.comparing import compare
-from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
+from calibray.inference.validation import (
+    BEFORE,
+    CALIBRATED,
+    FIELD,
+    KRIGING,
+    LAW,
+    PRIOR,
+    SLOPE,
+    Validation,
+)
 
 
 def places(count, seed=0):
@@ -93,3 +102,40 @@ def test_choosing_by_the_other_blocks_costs_where_models_take_turns():
     taken = Validation(found.labels, found.block, errors, found.position)
     assert taken.nested_rmse_db >= taken.table["rmse_db"].min() - 1e-9
     assert taken.nested_rmse_db > 5
+
+
+def test_calibration_has_to_earn_its_place():
+    """A little better than the materials as they were says nothing; much better does."""
+    near = made({BEFORE: 3.0, PRIOR: 2.98, CALIBRATED: 2.97, LAW: 9.0, KRIGING: 0.5}, count=60, seed=6)
+    assert near.table.loc[CALIBRATED, "rmse_db"] < near.table.loc[BEFORE, "rmse_db"]
+    assert near.chosen == BEFORE
+    assert near.best == KRIGING
+    assert near.choice == (
+        "Predictions go by the model 'before + offset', which leaves materials as they were and is worse than "
+        "'calibrated' by no more than the bootstrap error."
+    )
+    assert near.choice in near.summary()[2]
+    assert near.content()["chosen"] == BEFORE
+    clear = made({BEFORE: 6.0, PRIOR: 5.0, CALIBRATED: 2.0, LAW: 9.0, FIELD: 1.9})
+    assert clear.chosen == CALIBRATED
+    assert clear.choice == "Predictions go by the model 'calibrated', the best that tells of other places."
+
+
+def test_the_law_is_chosen_where_no_twin_comes_near():
+    far = made({BEFORE: 9.0, CALIBRATED: 8.0, LAW: 2.0})
+    assert far.chosen == LAW
+    assert far.choice == "Predictions go by the model 'log-distance', the best that tells of other places."
+    near = made({BEFORE: 9.0, CALIBRATED: 2.1, LAW: 2.0}, count=40, seed=3)
+    assert near.table.loc[LAW, "rmse_db"] < near.table.loc[CALIBRATED, "rmse_db"]
+    assert near.chosen == CALIBRATED
+    assert "which knows the scene and is worse than 'log-distance'" in near.choice
+
+
+def test_choosing_by_the_best_alone_is_worse_where_calibration_is():
+    """A few links seldom tell models that are nearly as good: what the rule is for."""
+    size, ruled, leading = {BEFORE: 3.0, CALIBRATED: 3.3, SLOPE: 3.6}, [], []
+    for seed in range(60):
+        found = made(size, count=24, seed=seed)
+        ruled.append(size[found.chosen])
+        leading.append(size[found.best])
+    assert np.mean(ruled) < np.mean(leading) - 0.05

@@ -125,10 +125,8 @@ def outcome(
         chosen, by_chosen = choose_model(problem, validation, parameters.to_search(trail.best))
         table = table.assign(chosen_db=by_chosen)
         if chosen.name != CALIBRATED:
-            judged["judgement"] += (
-                f"Predictions go by the model {chosen.name!r}, which did best on the blocks: "
-                f"{chosen.residual_db:.2f} dB, the calibrated one {judged['holdout_rmse_db']:.2f} dB.",
-            )
+            beside = f"{chosen.residual_db:.2f} dB, the calibrated one {judged['holdout_rmse_db']:.2f} dB"
+            judged["judgement"] += (f"{validation.choice} On blocks held out it has {beside}.",)
     judgement = judged.pop("judgement")
     return Result(
         study=study,

@@ -15,6 +15,9 @@ from calibray.inference.blocks import blocks
 TOGETHER: Final = 4
 """Neighbouring links that are resampled as one: they share part of their errors."""
 
+CLUSTERS: Final = 1000
+"""The largest number of them; of more links each holds more."""
+
 RESAMPLED: Final = 2000
 
 CONFIDENCE: Final = 0.95
@@ -89,7 +92,7 @@ def compare(
         return Judgement(0, np.nan, next(iter(rivals)), np.nan, np.nan, 0)
     rmse = np.sqrt(square.mean(axis=1))
     best = 1 + int(np.argmin(rmse[1:]))
-    cluster = blocks(position[known], max(count // TOGETHER, min(count, 2)))
+    cluster = blocks(position[known], min(max(count // TOGETHER, min(count, 2)), CLUSTERS))
     size = np.bincount(cluster)
     total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
     drawn = np.random.default_rng(seed).integers(len(size), size=(RESAMPLED, len(size)))

@@ -1,7 +1,14 @@
-"""What models are worth where nothing was fitted: their errors on blocks of links, each held out in turn."""
+"""What models are worth where nothing was fitted: their errors on blocks of links, each held out in turn.
+
+Predictions go by the materials as they were, with an offset, until another model is better by more than the bootstrap
+error of the difference, which is the one-standard-error rule (L. Breiman et al., Classification and Regression Trees,
+1984): first the best of the calibrated ones, and then the law of distance, which knows nothing of the scene. A few
+blocks hardly tell models apart that are nearly as good, and what was fitted is further off where it does not hold.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -26,6 +33,9 @@ KRIGING: Final = "kriging"
 
 RIVALS: Final = (BEFORE, LAW, KRIGING)
 """Models that calibrate no material."""
+
+FITTED: Final = (CALIBRATED, PRIOR, SLOPE, PER_TX, PRIOR_PER_TX)
+"""Models that calibrate materials, and that predictions can go by."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,19 +75,17 @@ class Validation:
         """The model with the least held-out RMSE."""
         return str(self.table["rmse_db"].idxmin())
 
-    @property
+    @cached_property
     def chosen(self) -> str:
-        """The best model that predictions can go by: kriging is about measured places, which blocks are not."""
-        return str(self.table["rmse_db"].drop([KRIGING, FIELD], errors="ignore").idxmin())
+        """The model that predictions go by; kriging is about measured places, which blocks are not."""
+        return self._chosen(self.block >= 0)
 
-    @property
+    @cached_property
     def nested_rmse_db(self) -> float:
-        """RMSE of the model that is best on the other blocks: what choosing is worth, [dB]."""
+        """RMSE of the models that are chosen by the other blocks: what choosing is worth, [dB]."""
         chosen = np.full(len(self.block), np.nan)
         for here in self._parts():
-            others = (self.block >= 0) & ~here
-            best = min(self.errors, key=lambda name: float(np.mean(self.errors[name][others] ** 2)))
-            chosen[here] = self.errors[best][here]
+            chosen[here] = self.errors[self._chosen((self.block >= 0) & ~here)][here]
         return float(np.sqrt(np.nanmean(chosen**2)))
 
     @cached_property
@@ -130,9 +138,18 @@ class Validation:
             for name, row in self.table.iterrows()
         )  # fmt: skip
         title = f"{len(self.labels)} blocks held out in turn, {np.count_nonzero(self.block >= 0)} links"
-        nested = f"{self.nested_rmse_db:.2f} dB"
-        chosen = f"Best: {self.best}. Choosing by the other blocks each time comes to {nested}."
-        return Table(title, columns, rows), self.sentence, chosen
+        nested = f"Choosing by the other blocks each time comes to {self.nested_rmse_db:.2f} dB."
+        return Table(title, columns, rows), self.sentence, f"Best: {self.best}. {self.choice} {nested}"
+
+    @property
+    def choice(self) -> str:
+        """Which model predictions go by, and why, in a sentence."""
+        best = self._least((BEFORE, *FITTED, LAW), self.block >= 0)
+        why = "the best that tells of other places"
+        if self.chosen != best:
+            ground = "knows the scene" if best == LAW else "leaves materials as they were"
+            why = f"which {ground} and is worse than {best!r} by no more than the bootstrap error"
+        return f"Predictions go by the model {self.chosen!r}, {why}."
 
     def content(self) -> dict[str, Any]:
         """The validation as plain values."""
@@ -140,9 +157,25 @@ class Validation:
             "blocks": list(self.labels),
             "models": {str(name): row.to_dict() for name, row in self.table.iterrows()},
             "best": self.best,
+            "chosen": self.chosen,
             "nested_rmse_db": self.nested_rmse_db,
             "sentence": self.sentence,
         }
+
+    def _least(self, names: Sequence[str], here: NDArray[np.bool_]) -> str:
+        """Which of some models has the least RMSE of some links."""
+        known = [name for name in names if name in self.errors]
+        return min(known, key=lambda name: float(np.mean(self.errors[name][here] ** 2)))
+
+    def _chosen(self, here: NDArray[np.bool_]) -> str:
+        """The choice by some links."""
+        chosen = BEFORE
+        for name in (self._least(FITTED, here), LAW):
+            if name in self.errors:
+                other = {chosen: self.errors[chosen][here]}
+                told = compare(self.errors[name][here], other, self.position[here])
+                chosen = name if told.gain_db > told.error_db else chosen
+        return chosen
 
     def _parts(self) -> list[NDArray[np.bool_]]:
         return [self.block == number for number in np.unique(self.block[self.block >= 0])]

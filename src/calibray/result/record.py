@@ -96,7 +96,7 @@ class Result:
         residual_basis: What it was taken from.
         files: SHA-256 of every file that the scene and the antennas were read from, by path; empty where not known.
         paths: The paths calibrated on, for drawing; None in a result that was loaded, or where they are not at hand.
-        chosen: The model that did best on blocks held out in turn, which predictions go by; None where none were.
+        chosen: The model that blocks held out in turn speak for, which predictions go by; None where none were.
         residual_field: What neighbouring links' errors share, which predictions beside measured links are corrected
             by; None where they show nothing.
         prepared: What was left out, averaged or moved before rows were links, and how many of them.
