@@ -1,12 +1,19 @@
 """Whether the model chosen by held-out blocks is the right one where nothing was fitted or chosen.
 
     CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml examples/auckland_tower.toml
+    CALIBRAY_DATA=FOLDER python benchmarks/choice.py examples/nist_boulder.toml --blocks 5 --uneven 22
+    python benchmarks/choice.py --rule 24 --districts demo,district-101
     python benchmarks/choice.py --planted 40
     python benchmarks/choice.py --chance 100 --workers 2 --out chance.jsonl
 
 Nested: each block is held out in turn; all models are validated on blocks of the rest, the one that is best there is
-fitted to the rest, and judged by the block, which had no say. Beside its pooled RMSE stands every model's own, and how
-often the block's links lie in the 90 % interval that the chosen model's errors on the inner blocks give.
+fitted to the rest, and judged by the block, which had no say. Beside its pooled RMSE stands what the model of the least
+RMSE on the inner blocks comes to, whether it earned its place or not, every model's own, and how often the block's
+links lie in the 90 % interval that the chosen model's errors on the inner blocks give. Blocks are even, or with
+`--uneven` clusters of receivers (k-means from that seed).
+
+With `--rule`, the same over planted truths in districts: at the study's start, near it, and anywhere, with an offset of
+3 dB and 3 dB of noise, one of four blocks left out each time.
 
 With `--planted`, how often the links of a block of the demo district lie in the interval of a prediction that knew the
 other blocks alone: planted truths, 3 dB of noise.
@@ -26,15 +33,19 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 
+import districts
 from calibray import engines
 from calibray.calibration.problem import Problem
 from calibray.calibration.validate import models, validated
 from calibray.calibration.weighing import weighed
 from calibray.inference.blocks import blocks as parted
 from calibray.inference.reach import reach
+from calibray.inference.validation import BEFORE, CALIBRATED, FITTED, LAW
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
@@ -43,7 +54,9 @@ from calibray.tables.text import render
 LEVEL = 0.9
 NOISE_DB = 4.0
 PLANTED_DB = 3.0
+OFFSET_DB = 3.0
 INTERCEPT_DB, SLOPE_DB = 40.0, 35.0
+CHOSEN = "chosen without the block"
 
 
 def opened(file: str) -> Problem:
@@ -51,6 +64,13 @@ def opened(file: str) -> Problem:
     setup = Study.load(file).opened()
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     return weighed(Problem.of(setup, engines.make(setup)))
+
+
+LEAST = "least RMSE on the others"
+"""What choosing without a margin comes to."""
+
+APART = (0.0, 0.3, 1.0)
+"""How far truths lie from the study's start, of the way to anywhere."""
 
 
 def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndarray], list[bool]]:
@@ -61,22 +81,24 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
         here: Which links are left out [L].
 
     Returns:
-        The model that the others speak for, every model's errors at the links left out, and whether each that has a
-        path lies in the chosen one's interval.
+        The model that the others speak for, every model's errors at the links left out, with those of the one of the
+        least RMSE on the others, and whether each that has a path lies in the chosen one's interval.
     """
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
     inner = validated(part)
     found = models(part)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
+    least = inner.table["rmse_db"].reindex([BEFORE, *FITTED, LAW]).idxmin()
+    errors[LEAST] = errors[str(least)]
     judged = errors[inner.chosen][np.isfinite(errors[inner.chosen])]
     return inner.chosen, errors, (np.abs(judged) <= reach(inner.sizes(inner.chosen), LEVEL)).tolist()
 
 
-def nested(problem: Problem, count: int) -> tuple[Table, str]:
+def nested(problem: Problem, count: int, uneven: int | None) -> tuple[Table, str]:
     """Leave one block out, and choose without it."""
     links, objective = problem.setup.links, problem.objective
-    block = blocks_of(problem, count)
+    block = blocks_of(problem, count, uneven)
     errors, inside, chosen = {}, [], []
     mine = np.full(len(links), np.nan)
     for number in range(count):
@@ -92,19 +114,57 @@ def nested(problem: Problem, count: int) -> tuple[Table, str]:
             file=sys.stderr,
         )
     rmse = {name: float(np.sqrt(np.nanmean(each**2))) for name, each in errors.items()}
-    rows = [("chosen without the block", f"{np.sqrt(np.nanmean(mine**2)):.2f}", f"{np.mean(inside):.0%}")]
+    rows = [(CHOSEN, f"{np.sqrt(np.nanmean(mine**2)):.2f}", f"{np.mean(inside):.0%}")]
     rows += [(name, f"{value:.2f}", "") for name, value in sorted(rmse.items(), key=lambda each: each[1])]
     columns = (Column("model"), numbers("RMSE", "dB"), numbers(f"in {LEVEL:.0%} interval"))
     title = f"{links.source}: {np.count_nonzero(objective.weight)} links, {count} blocks"
     return Table(title, columns, tuple(rows)), ", ".join(chosen)
 
 
-def blocks_of(problem: Problem, count: int) -> np.ndarray:
-    """Block of every link, -1 where it does not count [L]."""
+def blocks_of(problem: Problem, count: int, uneven: int | None = None) -> np.ndarray:
+    """Block of every link, -1 where it does not count [L]; even ones, or clusters from a seed."""
     links, counted = problem.setup.links, np.flatnonzero(problem.objective.weight > 0)
-    block = np.full(len(links), -1)
-    block[counted] = parted(links.rx[counted, :2], count)
+    block, place = np.full(len(links), -1), links.rx[counted, :2]
+    block[counted] = (
+        parted(place, count) if uneven is None else kmeans2(place, count, rng=uneven, minit="++")[1]
+    )
     return block
+
+
+def ruled(name: str, count: int, folder: Path) -> dict[float, list[dict[str, np.ndarray]]]:
+    """Errors at blocks left out of planted truths in a district, by how far these lie from the study's start."""
+    problem, found = districts.make(name, folder).problem, {apart: [] for apart in APART}
+    parameters, objective = problem.parameters, problem.objective
+    start = parameters.to_search(parameters.start)
+    for seed in range(count):
+        random, apart = np.random.default_rng([seed, 1009]), APART[seed % len(APART)]
+        anywhere = random.uniform(*parameters.search_bounds)
+        loss = problem.engine.path_loss(parameters.from_search(start + apart * (anywhere - start))[None])[0]
+        measured = np.where(np.isfinite(loss), loss, 0.0) + random.normal(0.0, OFFSET_DB)
+        measured += PLANTED_DB * random.standard_normal(len(loss))
+        weight = np.where(np.isfinite(loss), objective.weight, 0.0)
+        planted = replace(problem, objective=replace(objective, measured=measured, weight=weight))
+        chosen, errors, _ = left_out(planted, blocks_of(planted, 4) == seed % 4)
+        found[apart].append(errors | {CHOSEN: errors[chosen]})
+        print(f"{name}: {seed + 1} of {count}", end="\r", file=sys.stderr)
+    return found
+
+
+def rules(names: list[str], count: int) -> Table:
+    """What choosing comes to over planted truths, beside models that are always taken."""
+    every: dict[float, list[dict[str, np.ndarray]]] = {apart: [] for apart in APART}
+    with TemporaryDirectory() as folder:
+        for name in names:
+            for apart, runs in ruled(name, count, Path(folder)).items():
+                every[apart] += runs
+    taken = (CHOSEN, LEAST, BEFORE, CALIBRATED)
+    rows = []
+    for apart, runs in every.items():
+        errors = ([run[name][np.isfinite(run[name])] for run in runs] for name in taken)
+        sizes = (f"{np.sqrt(np.mean(np.concatenate(each) ** 2)):.2f}" for each in errors)
+        rows.append((f"{apart:g}", str(len(runs)), *sizes))
+    columns = (numbers("truth apart"), numbers("repetitions"), *(numbers(name, "dB") for name in taken))
+    return Table(f"RMSE on blocks left out, {', '.join(names)}", columns, tuple(rows))
 
 
 def planted(seed: int) -> tuple[str, list[bool]]:
@@ -154,14 +214,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("studies", nargs="*", help="study files")
     parser.add_argument("--blocks", type=int, default=4)
+    parser.add_argument("--uneven", type=int, help="seed of clusters of receivers in place of even blocks")
+    parser.add_argument("--rule", type=int, default=0, help="planted truths in each district")
+    parser.add_argument("--districts", default="demo,district-101,district-103,district-105,district-107")
     parser.add_argument("--planted", type=int, default=0, help="repetitions in the demo district")
     parser.add_argument("--chance", type=int, default=0, help="repetitions of the twin without a chance")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, help="file of the repetitions")
     given = parser.parse_args()
     for file in given.studies:
-        table, chosen = nested(opened(file), given.blocks)
+        table, chosen = nested(opened(file), given.blocks, given.uneven)
         print(render(table, f"Chosen for each block: {chosen}."))
+    if given.rule:
+        print(render(rules(given.districts.split(","), given.rule)))
     if given.planted:
         inside: list[bool] = []
         for seed in range(given.planted):
