@@ -1,4 +1,4 @@
-"""The model that did best where nothing was fitted, fitted once more to all links."""
+"""The model that held-out blocks speak for, fitted once more to all links."""
 
 from __future__ import annotations
 
