@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 import planted
@@ -15,8 +17,8 @@ from calibray.study import Setup, Study
 NAMES = tuple(planted.TRUTH)
 
 
-def said(found: dict[str, float], behind: float = 3.0) -> tuple[str, ...]:
-    study = Study.from_content(planted.content("links.csv"))
+def said(found: dict[str, float], behind: float = 3.0, **sections: Any) -> tuple[str, ...]:
+    study = Study.from_content(planted.content("links.csv", **sections))
     problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     pieces = ((2.0, 3.0), (6.0, 9.0))
     told = {name: Interval(0.1, 2.0, 9.0, "ambiguous", pieces) for name in NAMES}
@@ -36,4 +38,10 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     assert "errors that neighbours share" in sentence
     assert f"{np.exp(3.0):.2g} times as likely" in sentence
     assert "blocks = 4" in advice
+    # Whose links are held out in turn need not be told to.
+    judged = said({**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}, holdout={"blocks": 3})[1]
+    assert "blocks = 4" not in judged
+    assert judged.startswith("Do not take the values of the least RMSE")
+    half = said({**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}, holdout={"where": "rx_x > 0"})[1]
+    assert half == advice
     assert "more than 1,000 times" in said({**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}, 50.0)[0]

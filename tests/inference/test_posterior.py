@@ -154,6 +154,22 @@ def test_what_an_interval_has_apart_from_the_set_that_is_judged_is_said():
     assert "apart" not in alone.reason
 
 
+@pytest.mark.parametrize(("slope", "words"), [(20.0, "what else is unknown makes up"), (0.5, "too little")])
+def test_why_links_that_change_do_not_tell_a_parameter(slope, words):
+    """Nothing trades off with it, and links follow it by so many decibels over its range, with errors of 2 dB."""
+    found = sample(
+        lambda points: np.zeros(len(points)),
+        np.zeros(1),
+        np.full(1, 10.0),
+        np.array([[5.0]]),
+        np.ones((1, 1, 1)),
+    )
+    (told,) = verdicts(found, lambda x: slope * x, NAMES[:1], np.zeros(1), np.full(1, 10.0), 2.0)
+    assert told.name == "not identifiable"
+    assert words in told.reason
+    assert f"up to {10 * slope:.1f} dB" in told.reason
+
+
 def test_two_that_trade_off_are_said_to():
     def density(points):
         return -0.5 * (points.sum(axis=1) - 10.0) ** 2 / 0.1**2

@@ -115,12 +115,18 @@ def contradicted(
         return ()
     kinds = {kind: noise.get(kind, 0.0) for kind in CAUSES}
     cause = CAUSES[max(kinds, key=kinds.__getitem__)]
+    holdout = problem.setup.study.holdout
+    advice = "Do not take the values of the least RMSE for the materials'; blocks held out tell what predicts best."
+    if holdout is None or holdout.where is not None:
+        advice = (
+            "Predictions go by the values of the least RMSE unless blocks held out speak for another model: say "
+            "[holdout] blocks = 4, and do not take these values for the materials'."
+        )
     ratio = float(np.exp(np.clip(behind, 0.0, np.log(MOST))))
     times = f"more than {MOST:,.0f}" if ratio >= 0.999 * MOST else f"{ratio:.2g}"
     return (
         f"The least RMSE is not where the links are explained best: {'; '.join(outside)}. The RMSE takes the errors of "
         f"all links as independent; intervals do not, for {cause}, and the likeliest values are {times} times as "
         "likely.",
-        "Predictions go by the values of the least RMSE unless blocks held out speak for another model: say [holdout] "
-        "blocks = 4, and do not take these values for the materials'.",
+        advice,
     )

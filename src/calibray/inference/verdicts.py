@@ -31,6 +31,9 @@ CHANCE: Final = 0.1
 TRADED: Final = 0.5
 """Rank correlation from which on another parameter is said to make up for one."""
 
+LARGE: Final = 3.0
+"""Change of path loss, by the size of errors, from which on single links would tell a parameter by themselves."""
+
 LINE: Final = 25
 """Values over the range of a parameter that its effect is taken from."""
 
@@ -218,4 +221,9 @@ def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, no
     if traded.max() > TRADED:
         other = names[int(np.argmax(traded))]
         return f"{other} makes up for it: they trade off with a rank correlation of {traded.max():.2f}"
+    if change > LARGE * noise_db:
+        return (
+            f"links change by up to {change:.1f} dB over its range, and what else is unknown makes up for that: "
+            "an offset, or errors that links share"
+        )
     return f"links change by up to {change:.1f} dB over its range, too little against errors of {noise_db:.1f} dB"
