@@ -10,7 +10,7 @@ import pytest
 
 import planted
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration import calibrate, twins
 from calibray.calibration.certainty import PLACE, certainty
 from calibray.calibration.explaining import Explaining
 from calibray.calibration.minima import BASINS
@@ -196,6 +196,23 @@ def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
     found = validation(tmp_path, law, offset={}, holdout={"blocks": 3})
     assert found.sentence.startswith("Calibration did not help")
     assert found.best not in ("calibrated", "calibrated with prior")
+
+
+def test_beside_known_minima_other_searches_are_soon_given_up(tmp_path, noisy, monkeypatch):
+    """The same models, for fewer replays."""
+    problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
+    known = {CALIBRATED: twins.minima(problem, np.zeros((0, 3)), 64)}
+
+    def judged():
+        before = problem.engine.calls
+        return validated(problem, 3, known=known), problem.engine.calls - before
+
+    quick, spent = judged()
+    monkeypatch.setattr(twins, "NEARER", 1e6)
+    patient, more = judged()
+    assert spent < 0.95 * more
+    for name, errors in patient.errors.items():
+        assert quick.errors[name] == pytest.approx(errors, abs=0.05, nan_ok=True)
 
 
 def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):

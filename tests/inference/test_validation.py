@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibray.inference.blocks import blocks
-from calibray.inference.comparing import compare
+from calibray.inference.comparing import CLUSTERS, compare
 from calibray.inference.validation import (
     BEFORE,
     CALIBRATED,
@@ -63,6 +63,13 @@ def test_errors_that_neighbours_share_make_the_difference_less_sure():
     alone = compare(own, {"law": law}, position).error_db
     together = compare(own, {"law": shared}, position).error_db
     assert together > 1.2 * alone
+
+
+def test_many_links_are_resampled_in_no_more_clusters_than_memory_holds():
+    own, law = np.random.default_rng(6).normal(size=(2, 6000))
+    found = compare(own, {"law": 1.1 * law}, places(6000))
+    assert found.clusters == CLUSTERS
+    assert found.error_db == pytest.approx(np.sqrt(1 + 1.1**2) / np.sqrt(2 * 6000), rel=0.15)
 
 
 def made(scales, count=400, seed=4):
