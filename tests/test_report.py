@@ -23,7 +23,7 @@ HOSTILE = '<script>alert("x")</script>&amp;'
 
 
 def golden(name: str) -> str:
-    """What the first version printed of the records of `shown`."""
+    """What is printed of the records of `shown`: as the first version did, but for what was changed on purpose."""
     return (shown.GOLDEN / f"{name}.txt").read_text(encoding="utf-8").removesuffix("\n")
 
 
