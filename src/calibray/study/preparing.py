@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -30,21 +31,18 @@ def preparation(study: Study) -> Preparation:
     Raises:
         InputError: Nothing tells where the scene lies on the globe, or the scene cannot be read.
     """
-    links, transmitters = study.links, study.transmitters_path
+    links = study.links
     inside = None if links.inside == "keep" else links.inside
     per = study.offset.per if study.offset else None
     groups = [per] if isinstance(per, str) else [*(per or ())]
     track = links.track
-    return Preparation(
+    return replace(
+        placing(study),
         track=None
         if track is None
         else Track(str(study.track_path), track.time, track.longest_gap, track.clock),
-        ground=None if links.heights is None else _ground(study),
         wide=links.wide,
         where=links.where,
-        transmitters=None if transmitters is None else str(transmitters),
-        transmitter=links.transmitter,
-        frame=scene_frame(study) if links.position == "geographic" else None,
         noise_floor_dbm=links.noise_floor_dbm,
         censored=links.unheard == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
