@@ -28,14 +28,14 @@ import numpy as np
 
 import calibray as cb
 from calibray import engines
-from calibray.calibration.methods import choose
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import search
-from calibray.engines.blocks import Blocks
-from calibray.engines.crew import Cluster, Crew, Here
+from calibray.engines.cluster.blocks import Blocks
+from calibray.engines.cluster.executors import open_local_client
+from calibray.engines.cluster.partition import block_size, cut, seconds_to_trace
+from calibray.engines.cluster.workers import Cluster, Crew, Here
 from calibray.engines.kinds import replay
-from calibray.engines.parts import block_size, cut, seconds_to_trace
-from calibray.engines.pool import open_local_client
+from calibray.fitting.methods import choose
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
 from calibray.study import Setup, Study
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]

@@ -34,22 +34,22 @@ import make_hill as hill  # noqa: E402
 import make_town as town  # noqa: E402
 
 from calibray import engines  # noqa: E402
-from calibray.calibration.certainty import certainty  # noqa: E402
-from calibray.calibration.heard import heard  # noqa: E402
-from calibray.calibration.methods import choose  # noqa: E402
-from calibray.calibration.problem import Problem  # noqa: E402
-from calibray.calibration.search import search  # noqa: E402
+from calibray.fitting.methods import choose  # noqa: E402
+from calibray.fitting.noise_floor import heard  # noqa: E402
+from calibray.fitting.problem import Problem  # noqa: E402
+from calibray.fitting.search import search  # noqa: E402
 from calibray.measurements import Averaging, Measurements, Preparation  # noqa: E402
 from calibray.measurements.preparation import prepare  # noqa: E402
-from calibray.measurements.tables import SourceTable  # noqa: E402
-from calibray.scenes.making import make_scene  # noqa: E402
-from calibray.scenes.openstreetmap import read_openstreetmap  # noqa: E402
-from calibray.scenes.plan import read_plan  # noqa: E402
-from calibray.scenes.rooms import make_plan_scene  # noqa: E402
-from calibray.scenes.terrain import lowered, read_terrain  # noqa: E402
-from calibray.scenes.vectors import read_footprints  # noqa: E402
+from calibray.measurements.table_files import SourceTable  # noqa: E402
+from calibray.scenes.authoring.floor_plan import make_plan_scene  # noqa: E402
+from calibray.scenes.authoring.floor_plan_file import read_plan  # noqa: E402
+from calibray.scenes.authoring.openstreetmap import read_openstreetmap  # noqa: E402
+from calibray.scenes.authoring.scene_folder import make_scene  # noqa: E402
+from calibray.scenes.authoring.terrain import lowered, read_terrain  # noqa: E402
+from calibray.scenes.authoring.vector_files import read_footprints  # noqa: E402
 from calibray.study import Setup, Study  # noqa: E402
 from calibray.study.draft import draft  # noqa: E402
+from calibray.uncertainty.assessment import certainty  # noqa: E402
 
 CHOICES = 4  # recorded positions to draw from for each stop of the town
 TRACKS = 3  # tracks along the hill

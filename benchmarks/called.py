@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 
 import districts
-from calibray.calibration.certainty import certainty
-from calibray.calibration.cheap import ProblemRows, ReplayedModel, with_constants
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import search
 from calibray.engines import Replay
-from calibray.inference.credible import credible
+from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, with_constants
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, SpaceMapping, VectorSurrogate
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
+from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.credible_sets import credible
 
 LEVELS = (0.9, 0.95)
 NOISES_DB = (1.0, 3.0)

@@ -15,17 +15,17 @@ import time
 from collections.abc import Callable
 
 from calibray import engines
-from calibray.calibration.certainty import certainty
-from calibray.calibration.choosing import choose_model
-from calibray.calibration.methods import choose
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import search
-from calibray.calibration.validate import validated
-from calibray.inference.validation import CALIBRATED
+from calibray.fitting.methods import choose
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
+from calibray.uncertainty.assessment import certainty
+from calibray.validation.choice import choose_model
+from calibray.validation.validate import validated
+from calibray.validation.validation import CALIBRATED
 
 LIMIT = 10.0
 

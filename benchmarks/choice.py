@@ -40,16 +40,16 @@ from scipy.cluster.vq import kmeans2
 
 import districts
 from calibray import engines
-from calibray.calibration.problem import Problem
-from calibray.calibration.validate import models, validated
-from calibray.calibration.weighing import weighed
-from calibray.inference.blocks import blocks as parted
-from calibray.inference.reach import reach
-from calibray.inference.validation import BEFORE, CALIBRATED, FITTED, LAW
+from calibray.fitting.noise_level import weighed
+from calibray.fitting.problem import Problem
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
+from calibray.validation.blocks import blocks as parted
+from calibray.validation.conformal import reach
+from calibray.validation.validate import models, validated
+from calibray.validation.validation import BEFORE, CALIBRATED, FITTED, LAW
 
 LEVEL = 0.9
 NOISE_DB = 4.0

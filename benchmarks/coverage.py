@@ -40,14 +40,14 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 import districts
-from calibray.calibration.certainty import certainty
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import search
-from calibray.inference.credible import credible, credible_sets
-from calibray.inference.posterior import Draws
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, markdown, numbers
 from calibray.tables.text import render
+from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.credible_sets import credible, credible_sets
+from calibray.uncertainty.importance_sampling import Draws
 from districts import District
 
 NOISE_DB = 3.0

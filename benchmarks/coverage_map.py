@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 import calibray as cb
-from calibray.inference.coverage import CoverageMap
-from calibray.inference.prediction import as_links
+from calibray.prediction.coverage_map import CoverageMap
+from calibray.prediction.predict import as_links
 
 TX = (-381.5, 140.0, 4.0)
 CELL = 5.0
@@ -85,7 +85,7 @@ def _solver(result: cb.Result, coverage: CoverageMap) -> None:
     import mitsuba as mi
     import sionna.rt as rt
 
-    from calibray.reporting.export import export
+    from calibray.report.export import export
 
     with tempfile.TemporaryDirectory() as folder:
         export(result, folder)

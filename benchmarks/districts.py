@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from calibray import engines, fields
-from calibray.calibration.problem import Problem
+from calibray.fitting.problem import Problem
 from calibray.materials import Material, itu_material
 from calibray.paths import Paths
 from calibray.scenarios import demo_study_path

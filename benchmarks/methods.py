@@ -24,15 +24,16 @@ for library in (
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from calibray.cli.console import log
-from calibray.cli.progress import progress_bars
-from calibray.comparison.arena import Arena, landscape_arena, study_arena
+from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import compare
+from calibray.comparison.comparison_files import figure
+from calibray.comparison.problems import Arena, study_arena
 from calibray.comparison.tables import table
-from calibray.files import write_table, write_text
-from calibray.reporting.excess import figure
-from calibray.reporting.style import write
+from calibray.report.style import write
 from calibray.scenarios import demo_study_path
+from calibray.support.output_files import write_table, write_text
 from calibray.tables import markdown
+from problem_families.arenas import landscape_arena
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (

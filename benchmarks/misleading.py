@@ -26,14 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.cli.console import log
-from calibray.cli.progress import progress_bars
-from calibray.comparison.arena import Arena, family_arena
+from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
-from calibray.comparison.contender import Contender, code, run_contender
-from calibray.comparison.family import seed_range
-from calibray.comparison.runs import MethodRun, Runs
-from calibray.optimizers.cheap_model import CheapAnswer, CheapModel, Constants
+from calibray.comparison.contestant import Contender, code, run_contender
+from calibray.comparison.problems import Arena
+from calibray.comparison.run_log import MethodRun, Runs
+from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, markdown, numbers
+from problem_families.arenas import family_arena
+from problem_families.comparison import seed_range
 
 ROOT = Path(__file__).resolve().parents[1]
 TOLERANCES_DB = (0.05, 0.02)

@@ -13,8 +13,8 @@ import argparse
 
 import numpy as np
 
-from calibray.inference.nuisance import Nuisance, Term, make_term
-from calibray.inference.objective import Objective, make_objective
+from calibray.fitting.nuisance import Nuisance, Term, make_term
+from calibray.fitting.objective import Objective, make_objective
 from calibray.measurements import Measurements
 from timing import seconds
 

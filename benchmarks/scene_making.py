@@ -26,9 +26,9 @@ from osmium.geom import WKBFactory
 from osmium.osm import Area
 
 from calibray.coordinates import Frame
-from calibray.scenes.extrusion import Windows
-from calibray.scenes.making import Made, make_scene
-from calibray.scenes.openstreetmap import read_openstreetmap
+from calibray.scenes.authoring.extrusion import Windows
+from calibray.scenes.authoring.openstreetmap import read_openstreetmap
+from calibray.scenes.authoring.scene_folder import Made, make_scene
 
 PLACE = (11.5755, 48.1374)
 ROW = 10  # houses that share walls

@@ -5,7 +5,7 @@
     python benchmarks/suggestion.py --districts 11,12 --repetitions 200 --separate --oracle
 
 In every repetition a truth is drawn evenly from the ranges of the materials, path losses are made of it with noise of
-3 dB, and 20 links are measured. Five more are taken of the others: those that `calibray.inference.design` suggests, or
+3 dB, and 20 links are measured. Five more are taken of the others: those that `experiment_design.py` suggests, or
 random ones. The profile of every parameter is taken exactly, on a grid over the whole range, and so are the draws from
 the posterior. The demo has its 40 links. A district with a number is that of the demo built with that seed, with a
 carrier, thicknesses and 160 places in the streets of its own; the demo and 11 to 19 were developed on, others not.
@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from scipy.special import expit, fdtri
 
 from calibray import engines
-from calibray.calibration.problem import Problem
-from calibray.inference.design import Beliefs, Errors, choose
+from calibray.fitting.problem import Problem
+from calibray.prediction.experiment_design import Beliefs, Errors, choose
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import AVENUES, STREETS, district, scene_objects
 from calibray.scenes.meshes import write_scene

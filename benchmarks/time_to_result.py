@@ -68,13 +68,13 @@ def once(name: str) -> dict[str, object]:
     clock = Clock()
     from jax import monitoring
 
-    from calibray.calibration.certainty import certainty
-    from calibray.calibration.methods import choose
-    from calibray.calibration.problem import Problem
-    from calibray.calibration.search import search
-    from calibray.calibration.weighing import weighed
     from calibray.engines.kinds.replay import replay
+    from calibray.fitting.methods import choose
+    from calibray.fitting.noise_level import weighed
+    from calibray.fitting.problem import Problem
+    from calibray.fitting.search import search
     from calibray.study import Setup, Study
+    from calibray.uncertainty.assessment import certainty
 
     compiled = [0.0]
     monitoring.register_event_duration_secs_listener(
@@ -103,10 +103,10 @@ def once(name: str) -> dict[str, object]:
 
 def seeds(name: str) -> dict[str, object]:
     """The optimum and the evaluations of `auto` from other seeds, and of all 512 starts from the first of them."""
-    from calibray.calibration.methods import choose
-    from calibray.calibration.problem import Problem
-    from calibray.calibration.search import rounds, search
     from calibray.engines.kinds.replay import replay
+    from calibray.fitting.methods import choose
+    from calibray.fitting.problem import Problem
+    from calibray.fitting.search import rounds, search
     from calibray.optimizers import LeastSquares, least_squares
     from calibray.study import Setup, Study
 

@@ -3,8 +3,8 @@
 import pytest
 from hypothesis import settings
 
-from calibray import caching
-from calibray.cli import progress
+from calibray.cli import progress_bars as progress
+from calibray.support import cache_folder as caching
 
 # Every run draws the same examples, and a busy machine fails no test.
 settings.register_profile("calibray", derandomize=True, deadline=None)

@@ -2,7 +2,7 @@
 
 Both sides start from the same stored paths. Sionna computes their gains with its field stage in single
 precision, replay with `calibray.path_gains` in double precision. `benchmarks/fidelity.py` prints what
-`tests/test_fidelity.py` checks.
+`tests/tracing/test_fidelity.py` checks.
 """
 
 from __future__ import annotations

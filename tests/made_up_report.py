@@ -9,9 +9,9 @@ import pandas as pd
 
 import shown
 from calibray.paths import Kind, Paths
-from calibray.reporting.page import Shown
-from calibray.reporting.rays import strongest
-from calibray.reporting.survey import survey
+from calibray.report.link_survey import survey
+from calibray.report.page import Shown
+from calibray.report.rays import strongest
 from calibray.result import Result
 from calibray.scenes import Scene
 from calibray.scenes.triangles import Triangles

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from calibray.coordinates import Frame
-from calibray.scenes.footprints import Footprints, HeightSource, cleaned
+from calibray.scenes.authoring.footprints import Footprints, HeightSource, cleaned
 
 FRAME = Frame.local(11.5755, 48.1374)
 Ring = Sequence[tuple[float, float]]

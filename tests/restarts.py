@@ -19,7 +19,7 @@ import numpy as np
 
 import programs
 from calibray.engines import LEDGER_FILE, open_ledger
-from calibray.engines.ledger import Ledger
+from calibray.engines.ledger.ledger import Ledger
 
 # Imports once and then forks a process for each run, which takes hundredths of a second instead of many seconds.
 # Exits as the command line does. The re-tracing engine writes down what it is asked, as the programs do themselves.

@@ -10,10 +10,10 @@ import pandas as pd
 
 import synthetic
 from calibray.comparison.comparison import Comparison
-from calibray.comparison.contender import Contender
+from calibray.comparison.contestant import Contender
 from calibray.comparison.experiment import Demo
-from calibray.comparison.runs import MethodRun
-from calibray.diagnosis import Check, Diagnosis
+from calibray.comparison.run_log import MethodRun
+from calibray.doctor import Check, Diagnosis
 from calibray.paths import Kind, Paths
 from calibray.result import Result
 from calibray.study import Study

@@ -11,20 +11,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import shown
-from calibray.calibration.validate import validate
-from calibray.engines.entry import LedgerEntry, read_entry
+from calibray.engines.ledger.entry import LedgerEntry, read_entry
 from calibray.errors import InputError
-from calibray.files import check_file, check_folder
 from calibray.measurements import read_measurements
 from calibray.measurements.filters import evaluate
-from calibray.measurements.tables import read_table
-from calibray.reporting.export import export
+from calibray.measurements.table_files import read_table
+from calibray.report.export import export
 from calibray.result import Result
 from calibray.scenes import export_scene, read_scene
-from calibray.scenes.ply import check_ply
+from calibray.scenes.checks.ply import check_ply
 from calibray.study import Study
-from calibray.study.reading import expand
+from calibray.study.toml_file import expand
+from calibray.support.output_files import check_file, check_folder
 from calibray.tracing import gain_table
+from calibray.validation.validate import validate
 from fuzzing import geometry, inputs, stored, workbooks, world
 from fuzzing.outcome import ALLOWED, Watch, judge
 from test_bad_input import run, write

@@ -16,8 +16,8 @@ import pytest
 import calibray as cb
 from calibray import engines
 from calibray.comparison import comparison
-from calibray.comparison.arena import study_arena
-from calibray.comparison.runs import Runs
+from calibray.comparison.problems import study_arena
+from calibray.comparison.run_log import Runs
 from calibray.paths import Kind
 
 LEGACY = Path(__file__).parent / "legacy"

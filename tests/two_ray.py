@@ -16,9 +16,9 @@ from calibray.materials import Material
 from calibray.measurements import links_from_frame
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import Chains
-from calibray.progress import Progress
 from calibray.scenes import Scene, read_scene
 from calibray.study import Study
+from calibray.support.progress import Progress
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
 from calibray.tracing.launches import Plan, plan

@@ -50,9 +50,8 @@ LEFT_OUT = {
     "calibray run examples/auckland_tower.toml": "measured data is no part of the repository",
     "calibray validate examples/nist_boulder.toml": "measured data is no part of the repository",
     "calibray validate examples/auckland_tower.toml": "measured data is no part of the repository",
-    "calibray run study.toml --out result --scheduler": "needs a cluster; tests/test_dask.py runs on one of processes",
-    "calibray compare study.toml": "25 runs of four methods take an hour; tests/test_comparison.py runs a small one",
-    "calibray compare --family": "20 problems take an hour; tests/test_comparison_family.py runs a small one",
+    "calibray run study.toml --out result --scheduler": "needs a cluster; tests/engines/test_dask.py starts one",
+    "calibray compare study.toml": "takes an hour; tests/comparison/test_comparison.py runs a small one",
 }
 """How commands begin that are not run, and why."""
 

@@ -20,10 +20,10 @@ import rasterio
 from rasterio.transform import from_origin
 
 from calibray.coordinates import Frame
-from calibray.scenes.making import make_scene
-from calibray.scenes.overhead import Overhead
-from calibray.scenes.terrain import lowered, read_terrain
-from calibray.scenes.vectors import read_footprints
+from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring.terrain import lowered, read_terrain
+from calibray.scenes.authoring.vector_files import read_footprints
+from calibray.scenes.checks.heights import Overhead
 from synthetic import amplitudes, sample
 
 FOLDER = Path(__file__).parent / "hill"

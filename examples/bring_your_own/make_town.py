@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 
 from calibray.coordinates import Frame
-from calibray.scenes.making import make_scene
-from calibray.scenes.openstreetmap import read_openstreetmap
+from calibray.scenes.authoring.openstreetmap import read_openstreetmap
+from calibray.scenes.authoring.scene_folder import make_scene
 from synthetic import amplitudes, sample
 
 HERE = Path(__file__).parent

@@ -5,30 +5,30 @@ Names are loaded when first used, so that importing the package costs nothing.
 
 from typing import TYPE_CHECKING
 
-from calibray.lazy import lazily
+from calibray.support.lazy import lazily
 
 if TYPE_CHECKING:
     from calibray import engines as engines
     from calibray import optimizers as optimizers
     from calibray.calibration.calibrate import calibrate as calibrate
-    from calibray.calibration.suggest import suggest as suggest
-    from calibray.calibration.validate import validate as validate
     from calibray.fields import path_gains as path_gains
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
     from calibray.fields.channel import power_delay_profile as power_delay_profile
-    from calibray.inference.coverage import coverage_map as coverage_map
     from calibray.materials import Material as Material
     from calibray.materials import itu_material as itu_material
     from calibray.measurements import Measurements as Measurements
     from calibray.measurements import read_measurements as read_measurements
     from calibray.paths import Paths as Paths
-    from calibray.reporting.coverage import save_map as save_map
-    from calibray.reporting.page import report as report
+    from calibray.prediction.coverage_map import coverage_map as coverage_map
+    from calibray.prediction.suggestion import suggest as suggest
+    from calibray.report.map_files import save_map as save_map
+    from calibray.report.page import report as report
     from calibray.result import Result as Result
     from calibray.study import Setup as Setup
     from calibray.study import Study as Study
-    from calibray.study.tracing import trace as trace
+    from calibray.study.trace import trace as trace
+    from calibray.validation.validate import validate as validate
 
 _HOMES = {
     "Material": "calibray.materials",
@@ -38,20 +38,20 @@ _HOMES = {
     "Paths": "calibray.paths",
     "channel_statistics": "calibray.fields.channel",
     "power_delay_profile": "calibray.fields.channel",
-    "trace": "calibray.study.tracing",
+    "trace": "calibray.study.trace",
     "path_gains": "calibray.fields",
     "path_loss": "calibray.fields",
     "Study": "calibray.study",
     "Setup": "calibray.study",
     "Result": "calibray.result",
     "calibrate": "calibray.calibration.calibrate",
-    "validate": "calibray.calibration.validate",
-    "suggest": "calibray.calibration.suggest",
+    "validate": "calibray.validation.validate",
+    "suggest": "calibray.prediction.suggestion",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
-    "coverage_map": "calibray.inference.coverage",
-    "save_map": "calibray.reporting.coverage",
-    "report": "calibray.reporting.page",
+    "coverage_map": "calibray.prediction.coverage_map",
+    "save_map": "calibray.report.map_files",
+    "report": "calibray.report.page",
 }
 
 __all__ = sorted(_HOMES)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.extras import library
+from calibray.support.extras import library
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer

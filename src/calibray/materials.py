@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.spelling import did_you_mean
+from calibray.support.messages import did_you_mean
 
 FIELDS: Final = (
     "relative_permittivity",

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from calibray.fields import path_loss
-from calibray.scenes.ply import check_ply
+from calibray.scenes.checks.ply import check_ply
 from calibray.study import Study
 from calibray.tracing.gain_table import read_gain_table
 from fuzzing import world

@@ -13,9 +13,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from calibray.engines.entry import LedgerEntry
+from calibray.engines.ledger.entry import LedgerEntry
 from calibray.fields import path_loss
-from calibray.paths.sealing import seal
+from calibray.paths.checksum import seal
 from calibray.study import Study
 from fuzzing import world
 from fuzzing.mutations import NUMBERS, TEXTS, damage, edited, hostile

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from calibray.errors import InputError
 from calibray.optimizers import DFOLS, GWO, METHODS, LeastSquares, VectorSurrogate, make
-from calibray.optimizers.archive import root_mean_square
+from calibray.optimizers.evaluations import root_mean_square
 
 LOWER, UPPER = np.array([0.0, -4.0]), np.array([6.0, 4.0])
 LINKS, FREEDOM, SCALE = 40, 3.0, 0.2

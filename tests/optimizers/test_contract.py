@@ -5,8 +5,8 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, METHODS, LeastSquares, Optimizer
-from calibray.optimizers.archive import merged
-from calibray.optimizers.landscapes import Landscape, rosenbrock
+from calibray.optimizers.evaluations import merged
+from problem_families.landscapes import Landscape, rosenbrock
 
 LANDSCAPE = rosenbrock()
 CASES = sorted(METHODS.items())

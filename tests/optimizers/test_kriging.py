@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibray.optimizers.kriging import Kriging, Likelihood, fit, matern, matern_slope, solve
+from calibray.optimizers.multifidelity.kriging import Kriging, Likelihood, fit, matern, matern_slope, solve
 
 RNG = np.random.default_rng(1)
 POINTS = RNG.random((25, 3))

@@ -10,10 +10,10 @@ from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
 from calibray.optimizers import least_squares as module
 from calibray.optimizers.descent import descend
-from calibray.optimizers.landscapes import blocks, hall, rosenbrock, tones, within
 from calibray.optimizers.least_squares import RECOMBINED, returns
 from calibray.optimizers.recombination import SPACE, recombined
 from calibray.optimizers.sampling import design
+from problem_families.landscapes import blocks, hall, rosenbrock, tones, within
 
 
 def scipy_search(landscape, start):

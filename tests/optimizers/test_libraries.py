@@ -9,10 +9,10 @@ from scipy.stats import norm
 
 from calibray.errors import InputError
 from calibray.optimizers import CMAES, DFOLS, DifferentialEvolution, GaussianProcess, RandomSearch
-from calibray.optimizers.archive import Evaluations
+from calibray.optimizers.evaluations import Evaluations
 from calibray.optimizers.gaussian_process import log_shape
-from calibray.optimizers.inversion import inverted
-from calibray.optimizers.landscapes import rosenbrock, street, tones, within
+from calibray.optimizers.library_adapter import inverted
+from problem_families.landscapes import rosenbrock, street, tones, within
 
 LARGE = 2.0**31
 LIBRARIES = [CMAES, DFOLS, DifferentialEvolution]

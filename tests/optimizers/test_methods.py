@@ -7,7 +7,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.optimizers import GWO, METHODS, SGWOIM, LeastSquares, Optimizer, make, method
-from calibray.optimizers.landscapes import rosenbrock
+from problem_families.landscapes import rosenbrock
 
 LANDSCAPE = rosenbrock()
 BOX = (LANDSCAPE.lower, LANDSCAPE.upper)

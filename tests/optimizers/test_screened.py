@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from calibray.optimizers import SGWOIM, ScreenedSGWOIM, landscapes, make
-from calibray.optimizers.cheap_model import Differenced, value_of
+from calibray.optimizers import SGWOIM, ScreenedSGWOIM, make
+from calibray.optimizers.multifidelity.cheap_model import Differenced, value_of
+from problem_families import landscapes
 
 
 def run(screen, seed, budget=60):

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from calibray.optimizers import SpaceMapping, VectorSurrogate, discrepancy
-from calibray.optimizers.averaged import CAPPED, UNLIKELY, Track, averaged
+from calibray.optimizers import SpaceMapping, VectorSurrogate
 from calibray.optimizers.box import Box
-from calibray.optimizers.cheap_model import Constants, Differenced
-from calibray.optimizers.corrected import FOLLOWED, constants_fit, correct, misfit
-from calibray.optimizers.discrepancy import Seen
+from calibray.optimizers.multifidelity import discrepancy
+from calibray.optimizers.multifidelity.averaging import CAPPED, UNLIKELY, Track, averaged
+from calibray.optimizers.multifidelity.cheap_model import Constants, Differenced
+from calibray.optimizers.multifidelity.correction import FOLLOWED, constants_fit, correct, misfit
+from calibray.optimizers.multifidelity.discrepancy import Seen
+from calibray.optimizers.multifidelity.space_mapping import HELPFUL, misleading
 from calibray.optimizers.sampling import design
-from calibray.optimizers.space_mapping import HELPFUL, misleading
 
 LOWER, UPPER = np.array([1.5, 1.5]), np.array([12.0, 9.0])
 RNG = np.random.default_rng(5)
@@ -161,7 +162,7 @@ def test_members_pass_through_the_answers_and_come_together_with_their_number():
 
 def test_members_that_explain_the_answers_worse_are_left_out(monkeypatch):
     corrected, starts = corrected_by(3)
-    monkeypatch.setattr("calibray.optimizers.averaged.STEPS", 0)  # each stays where it starts
+    monkeypatch.setattr("calibray.optimizers.multifidelity.averaging.STEPS", 0)  # each stays where it starts
     kept = averaged(corrected, starts, np.random.default_rng(3)).members[1:]
     fit = constants_fit(corrected)
     given = corrected.model.constants

@@ -7,9 +7,13 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.optimizers import SGWOIM, LatinHypercube, VectorSurrogate
-from calibray.optimizers.kriging import fit
-from calibray.optimizers.landscapes import Landscape, blocks, rosenbrock, street
-from calibray.optimizers.vector_surrogate import expected_improvement, mean_square, predicted_minima
+from calibray.optimizers.multifidelity.kriging import fit
+from calibray.optimizers.multifidelity.vector_surrogate import (
+    expected_improvement,
+    mean_square,
+    predicted_minima,
+)
+from problem_families.landscapes import Landscape, blocks, rosenbrock, street
 
 STREET = street()
 

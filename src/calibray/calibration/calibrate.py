@@ -8,28 +8,28 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.certainty import certainty
-from calibray.calibration.cheap import aid
-from calibray.calibration.heard import heard
-from calibray.calibration.methods import check_fit, check_method, choose
 from calibray.calibration.outcome import outcome
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import search
-from calibray.calibration.settle import settle
-from calibray.calibration.twins import NOTHING
-from calibray.calibration.validate import check_engine, validated
-from calibray.calibration.weighing import weighed
-from calibray.engines.crew import Crew
-from calibray.engines.ledger import LEDGER_FILE
+from calibray.engines.cluster.workers import Crew
+from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
-from calibray.files import check_outputs
-from calibray.inference.validation import CALIBRATED
-from calibray.interruption import interruptible, noticed
-from calibray.progress import Progress
+from calibray.fitting.cheap_replay import aid
+from calibray.fitting.fidelity_loop import settle
+from calibray.fitting.methods import check_fit, check_method, choose
+from calibray.fitting.noise_floor import heard
+from calibray.fitting.noise_level import weighed
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
 from calibray.result import FILES, Result
 from calibray.study import Setup, Study
+from calibray.support.interruption import interruptible, noticed
+from calibray.support.output_files import check_outputs
+from calibray.support.progress import Progress
 from calibray.tracing.factory import SIONNA
 from calibray.tracing.protocol import TracerFactory
+from calibray.uncertainty.assessment import certainty
+from calibray.validation.validate import check_engine, validated
+from calibray.validation.validation import CALIBRATED
+from calibray.validation.variants import NOTHING
 
 FEW: Final = 2
 """Minima of a method that kept its best alone."""

@@ -9,28 +9,28 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.calibration.certainty import Certainty
-from calibray.calibration.cheap import Aid
-from calibray.calibration.choosing import choose_model
-from calibray.calibration.examining import examined
-from calibray.calibration.problem import Problem
-from calibray.calibration.search import Trail
-from calibray.calibration.settle import largest
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
-from calibray.inference.comparing import compare
-from calibray.inference.diagnostics import shared_errors
-from calibray.inference.marginal import HEAVY
-from calibray.inference.nuisance import OFFSET
-from calibray.inference.residual_field import measured_errors
-from calibray.inference.rivals import log_distance
-from calibray.inference.validation import BEFORE, CALIBRATED, LAW, Validation
+from calibray.fitting.cheap_replay import Aid
+from calibray.fitting.fidelity_loop import largest
+from calibray.fitting.nuisance import OFFSET
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
+from calibray.prediction.residual_field import measured_errors
 from calibray.result import Result
 from calibray.result.residuals import ResidualField
 from calibray.study import Study
 from calibray.tracing.enclosed import Enclosed
+from calibray.uncertainty.assessment import Certainty
+from calibray.uncertainty.link_diagnostics import examined
+from calibray.uncertainty.noise_models import HEAVY
+from calibray.uncertainty.residuals import shared_errors
+from calibray.validation.baselines import log_distance
+from calibray.validation.choice import choose_model
+from calibray.validation.judgement import compare
+from calibray.validation.validation import BEFORE, CALIBRATED, LAW, Validation
 
 FEWEST: Final = 8
 """Links held out that a scale of residuals can be taken from."""

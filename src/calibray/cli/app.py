@@ -29,7 +29,7 @@ from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
-from calibray.interruption import noticed
+from calibray.support.interruption import noticed
 
 LONGEST: Final = 4096
 """The number of characters beyond which an argument is refused; Linux takes no longer path."""

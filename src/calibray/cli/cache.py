@@ -10,13 +10,12 @@ import typer
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all that is kept.")] = False,
 ) -> None:
-    """Tell where traces, compiled programs and optima of planted problems are kept between runs, or remove them.
+    """Say where traces and compiled programs are kept between runs, or remove them.
 
     The folder is named by CALIBRAY_CACHE; where that is empty, none are kept.
     """
-    from calibray import caching
-    from calibray.caching import compiled
-    from calibray.scenarios import optima
+    from calibray.support import cache_folder as caching
+    from calibray.support.cache_folder import compiled
     from calibray.tables import Column, Table, numbers
     from calibray.tables.text import render
     from calibray.tracing import cache as traces
@@ -25,7 +24,6 @@ def cache(
     kept = {
         "traces": traces.kept(),
         "compiled programs": [] if programs is None else programs.kept(),
-        "optima": optima.kept(),
     }
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:

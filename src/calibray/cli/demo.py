@@ -25,13 +25,13 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """Run the paper's experiment in the embedded district, and space mapping and auto beside it: tables and figures."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
+        from calibray.comparison.demo_files import FIGURES, write
         from calibray.comparison.experiment import run_demo
-        from calibray.comparison.paper import tables
-        from calibray.files import check_outputs
-        from calibray.reporting.demo import FIGURES, write
+        from calibray.comparison.paper_tables import tables
+        from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
 
         check_outputs(out, ["result.json", *FIGURES], (), overwrite)

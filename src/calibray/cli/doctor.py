@@ -40,9 +40,9 @@ def doctor(
 
 def _machine() -> None:
     """Examine the machine."""
-    from calibray.cli.progress import progress_bars
-    from calibray.diagnosis import examine
-    from calibray.reporting.diagnosis import table
+    from calibray.cli.progress_bars import progress_bars
+    from calibray.doctor import examine
+    from calibray.report.doctor_table import table
     from calibray.tables.text import render
 
     with progress_bars(log()) as progress:
@@ -55,11 +55,11 @@ def _machine() -> None:
 
 def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
     """Examine a scene, or a study's scene with its antennas."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.reporting import scenes as report
-        from calibray.scenes.diagnosis import diagnose
+        from calibray.report import scene_tables as report
+        from calibray.scenes.checks.scene_check import diagnose
         from calibray.study import Study
         from calibray.tables.text import render
 
@@ -77,7 +77,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
 def _draw(study: Study, plot: Path, overwrite: bool) -> None:
     """Draw a study's antennas over its scene."""
-    from calibray.reporting.scenes import save_positions
+    from calibray.report.scene_tables import save_positions
 
     links = study.measurements()
     save_positions(plot, study.scene_source, links.tx, links.rx, study.files(), overwrite)

@@ -24,7 +24,7 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
-    from calibray.reporting.export import export as write
+    from calibray.report.export import export as write
     from calibray.result import Result
 
     names = write(Result.load(folder), out, copy, overwrite)

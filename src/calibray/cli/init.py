@@ -40,16 +40,16 @@ def init(
     ] = None,
 ) -> None:
     """Look at a scene and a table of links, tell what is assumed and why, and write a study that runs."""
-    from calibray.cli.progress import progress_bars
-    from calibray.cli.sanity import warn
-    from calibray.files import check_file, write_text
+    from calibray.cli.link_warnings import warn
+    from calibray.cli.progress_bars import progress_bars
+    from calibray.support.output_files import check_file, write_text
 
     if out.exists() or out.is_symlink():
         raise InputError(f"{out}: is there already; name another file with --out, or remove it")
     inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
-        from calibray.reporting.scenes import assumed, save_positions
+        from calibray.report.scene_tables import assumed, save_positions
         from calibray.study.draft import draft
         from calibray.study.draft_text import SCHEMA_FILE
         from calibray.study.schema import schema_text

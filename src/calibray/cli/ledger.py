@@ -30,8 +30,8 @@ def ledger(
     from contextlib import closing
 
     from calibray.engines import open_ledger
-    from calibray.files import check_table, write_table
-    from calibray.reporting.ledger import calls
+    from calibray.report.ledger_table import calls
+    from calibray.support.output_files import check_table, write_table
     from calibray.tables.text import render
 
     if out is not None:

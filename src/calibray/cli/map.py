@@ -9,7 +9,7 @@ import typer
 
 from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
-from calibray.spelling import shortened
+from calibray.support.messages import shortened
 
 
 def map(
@@ -68,17 +68,17 @@ def map(
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     target = out or folder
     with progress_bars(log()) as progress:
         import numpy as np
 
         from calibray.engines import open_crew
-        from calibray.files import check_outputs
-        from calibray.inference.coverage import coverage_map
-        from calibray.reporting.coverage import FILES, save_map
+        from calibray.prediction.coverage_map import coverage_map
+        from calibray.report.map_files import FILES, save_map
         from calibray.result import Result
+        from calibray.support.output_files import check_outputs
 
         result = Result.load(folder, anyway=anyway)
         inputs = result.study.files()

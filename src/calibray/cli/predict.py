@@ -62,19 +62,19 @@ def predict(
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
         import numpy as np
         import pandas as pd
 
         from calibray.engines import open_crew
-        from calibray.files import check_table, growing_table
-        from calibray.inference.prediction import as_links
-        from calibray.inference.quantity import as_measured
-        from calibray.inference.shared_out import predicted_in_pieces
         from calibray.measurements import PiecedTable
+        from calibray.prediction.batches import predicted_in_pieces
+        from calibray.prediction.predict import as_links
+        from calibray.prediction.quantity import as_measured
         from calibray.result import Result
+        from calibray.support.output_files import check_table, growing_table
 
         result = Result.load(folder, anyway=anyway)
         study, table = result.study, PiecedTable.open(links_file)

@@ -24,11 +24,11 @@ def report(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a result as one HTML file that opens from disk: summary, values, figures, map, and the scene in 3-D."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.reporting.page import FIGURES, FILE
-        from calibray.reporting.page import report as write
+        from calibray.report.page import FIGURES, FILE
+        from calibray.report.page import report as write
         from calibray.result import Result
 
         result = Result.load(folder)

@@ -49,18 +49,18 @@ def run(
     ] = False,
 ) -> None:
     """Calibrate a study's materials, print the result, and write it with the calibrated scene and a report."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     try:
         # Loading libraries, tables and the scene takes seconds too.
         with progress_bars(log()) as progress:
             from calibray.calibration import calibrate
-            from calibray.calibration.methods import check_method
-            from calibray.cli.sanity import warn
+            from calibray.cli.link_warnings import warn
             from calibray.engines import open_crew, open_executor
-            from calibray.files import check_outputs
+            from calibray.fitting.methods import check_method
             from calibray.result import FILES, tables
             from calibray.study import Study
+            from calibray.support.output_files import check_outputs
             from calibray.tables.text import render
 
             study = Study.load(study_file).replace(method, seed, engine)
@@ -86,9 +86,9 @@ def _kept(out: Path) -> str:
     """What an interrupted run left, and how to go on."""
     from contextlib import closing
 
-    from calibray import caching
     from calibray.engines import open_ledger
-    from calibray.engines.ledger import LEDGER_FILE
+    from calibray.engines.ledger.ledger import LEDGER_FILE
+    from calibray.support import cache_folder as caching
     from calibray.tracing import cache
 
     parts = []
@@ -103,10 +103,10 @@ def _kept(out: Path) -> str:
 
 def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
     """Write the report beside a result that is safe by now: what goes wrong here is told, and loses nothing."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     try:
-        from calibray.reporting import page
+        from calibray.report import page
 
         folder = out / page.FIGURES if figures else None
         with progress_bars(log()) as progress:

@@ -12,9 +12,9 @@ from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
-    from calibray.progress import Progress
-    from calibray.scenes.footprints import Footprints
-    from calibray.scenes.making import Made, SurfaceMaterial
+    from calibray.scenes.authoring.footprints import Footprints
+    from calibray.scenes.authoring.scene_folder import Made, SurfaceMaterial
+    from calibray.support.progress import Progress
 
 SUMMARY: Final = "Make a scene of an OpenStreetMap extract, of footprints with heights, or of a floor plan."
 
@@ -83,10 +83,10 @@ def osm(
     per_building: PerBuilding = False,
 ) -> None:
     """Make a scene of the buildings of an OpenStreetMap extract."""
-    from calibray.cli.progress import progress_bars
-    from calibray.files import check_folder
-    from calibray.scenes.footprints import HeightRule
-    from calibray.scenes.openstreetmap import read_openstreetmap
+    from calibray.cli.progress_bars import progress_bars
+    from calibray.scenes.authoring.footprints import HeightRule
+    from calibray.scenes.authoring.openstreetmap import read_openstreetmap
+    from calibray.support.output_files import check_folder
 
     check_folder(out)
     with progress_bars(log()) as progress:
@@ -127,10 +127,10 @@ def footprints(
     per_building: PerBuilding = False,
 ) -> None:
     """Make a scene of building footprints with heights."""
-    from calibray.cli.progress import progress_bars
-    from calibray.files import check_folder
-    from calibray.scenes.footprints import HeightRule
-    from calibray.scenes.vectors import read_footprints
+    from calibray.cli.progress_bars import progress_bars
+    from calibray.scenes.authoring.footprints import HeightRule
+    from calibray.scenes.authoring.vector_files import read_footprints
+    from calibray.support.output_files import check_folder
 
     check_folder(out)
     with progress_bars(log()) as progress:
@@ -167,9 +167,9 @@ def plan(
     ] = None,
 ) -> None:
     """Make a scene of a floor plan: one sheet for every wall, door and window."""
-    from calibray.cli.progress import progress_bars
-    from calibray.scenes.plan import read_plan
-    from calibray.scenes.rooms import make_plan_scene
+    from calibray.cli.progress_bars import progress_bars
+    from calibray.scenes.authoring.floor_plan import make_plan_scene
+    from calibray.scenes.authoring.floor_plan_file import read_plan
 
     types = _types(material or [])
     with progress_bars(log()) as progress:
@@ -180,7 +180,7 @@ def plan(
 
 def _tell(made: Made) -> None:
     """Print what was made."""
-    from calibray.reporting import scenes as report
+    from calibray.report import scene_tables as report
     from calibray.tables.text import render
 
     typer.echo(render(report.made(made)))
@@ -203,9 +203,9 @@ def _made(
     """A scene of footprints."""
     import numpy as np
 
-    from calibray.scenes.extrusion import Windows as Division
-    from calibray.scenes.making import Palette, make_scene
-    from calibray.scenes.terrain import lowered, read_terrain
+    from calibray.scenes.authoring.extrusion import Windows as Division
+    from calibray.scenes.authoring.scene_folder import Palette, make_scene
+    from calibray.scenes.authoring.terrain import lowered, read_terrain
 
     palette = Palette(
         wall=_material("walls", wall, 0.3),
@@ -239,7 +239,7 @@ def _frame(origin: str | None, utm: bool) -> Frame | None:
 
 def _types(given: list[str]) -> dict[str, SurfaceMaterial]:
     """Materials by type of wall, from words such as `drywall=plasterboard:0.1`."""
-    from calibray.scenes.rooms import WALL_THICKNESS
+    from calibray.scenes.authoring.floor_plan import WALL_THICKNESS
 
     types = {}
     for words in given:
@@ -259,7 +259,7 @@ def _number_or_column(text: str) -> str | float:
 
 def _material(name: str, text: str, thickness: float) -> SurfaceMaterial:
     """A material from a P.2040 name and, after a colon, a thickness [m]."""
-    from calibray.scenes.making import SurfaceMaterial
+    from calibray.scenes.authoring.scene_folder import SurfaceMaterial
 
     itu, parted, given = text.partition(":")
     try:

@@ -32,15 +32,15 @@ def suggest(
     overwrite: Overwrite = False,
 ) -> None:
     """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.calibration.suggest import shown
-        from calibray.calibration.suggest import suggest as find
-        from calibray.files import check_table, write_table
-        from calibray.inference.prediction import as_links
-        from calibray.measurements.tables import read_table
+        from calibray.measurements.table_files import read_table
+        from calibray.prediction.predict import as_links
+        from calibray.prediction.suggestion import shown
+        from calibray.prediction.suggestion import suggest as find
         from calibray.result import Result
+        from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
         result = Result.load(folder, anyway=anyway)

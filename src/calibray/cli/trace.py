@@ -12,8 +12,8 @@ from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.paths import Paths
-    from calibray.progress import Progress
     from calibray.study import Setup
+    from calibray.support.progress import Progress
     from calibray.tracing.convergence import Convergence
 
 
@@ -35,15 +35,15 @@ def trace(
     overwrite: Overwrite = False,
 ) -> None:
     """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
         from calibray.engines import open_crew
-        from calibray.engines.crew import Here
-        from calibray.engines.traced import given_size, traced_in_blocks
-        from calibray.files import check_file
-        from calibray.reporting import trace as report
+        from calibray.engines.cluster.traced_blocks import given_size, traced_in_blocks
+        from calibray.engines.cluster.workers import Here
+        from calibray.report import trace_tables as report
         from calibray.study import Study
+        from calibray.support.output_files import check_file
         from calibray.tables.text import render
 
         study = Study.load(study_file)
@@ -75,7 +75,7 @@ def _traced(
     from functools import partial
 
     from calibray.fields import path_loss
-    from calibray.progress import staged
+    from calibray.support.progress import staged
     from calibray.tracing import convergence
 
     study, links, tracer = setup.study, setup.links, setup.tracer

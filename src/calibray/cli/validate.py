@@ -43,15 +43,15 @@ def validate(
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate without each block of links in turn, and judge the twin and its rivals by the block left out."""
-    from calibray.cli.progress import progress_bars
+    from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.calibration.validate import validate as judge
         from calibray.engines import open_crew
-        from calibray.files import check_outputs
         from calibray.result.validation import FILE, write_validation
         from calibray.study import Study
+        from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
+        from calibray.validation.validate import validate as judge
 
         study = Study.load(study_file)
         if out is not None:

@@ -18,16 +18,16 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray import optimizers
-from calibray.comparison.arena import Arena
-from calibray.comparison.contender import MOST, Contender, code, recorded, run_contender
-from calibray.comparison.runs import MethodRun, Runs
+from calibray.comparison.contestant import MOST, Contender, code, recorded, run_contender
+from calibray.comparison.problems import Arena
+from calibray.comparison.run_log import MethodRun, Runs
 from calibray.comparison.tables import summary
 from calibray.errors import InputError
-from calibray.files import check_folder
 from calibray.optimizers import METHODS, Optimizer
-from calibray.progress import Progress
-from calibray.spelling import did_you_mean
-from calibray.tables import glance
+from calibray.support.messages import did_you_mean
+from calibray.support.output_files import check_folder
+from calibray.support.progress import Progress
+from calibray.tables import display as glance
 
 CALLS: Final = (30, 60, 225)  # where the excess is tabulated, beside the end
 EXCESSES_DB: Final = (0.05, 0.02, 0.01)  # whose first RT call is tabulated

@@ -14,13 +14,13 @@ from typing import Any, Final
 
 from calibray import engines
 from calibray.calibration import calibrate
-from calibray.comparison.labels import label
-from calibray.comparison.paper import summary
-from calibray.progress import Progress, staged
+from calibray.comparison.paper_tables import summary
+from calibray.optimizers.labels import label
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
-from calibray.tables import glance
+from calibray.support.progress import Progress, staged
+from calibray.tables import display as glance
 
 METHODS: Final = ("gwo", "sgwo-im")
 MAPPING: Final = "space-mapping"

@@ -13,45 +13,45 @@ they are used.
 
 from typing import TYPE_CHECKING
 
-from calibray.lazy import lazily
+from calibray.support.lazy import lazily
 
 if TYPE_CHECKING:
-    from calibray.engines.blocks import Blocks as Blocks
-    from calibray.engines.carriers import ReplayCarriers as ReplayCarriers
-    from calibray.engines.command import Command as Command
-    from calibray.engines.crew import open_crew as open_crew
-    from calibray.engines.ledger import LEDGER_FILE as LEDGER_FILE
-    from calibray.engines.ledger import Ledger as Ledger
-    from calibray.engines.ledger import open_ledger as open_ledger
-    from calibray.engines.making import make as make
-    from calibray.engines.pool import open_executor as open_executor
+    from calibray.engines.cluster.blocks import Blocks as Blocks
+    from calibray.engines.cluster.executors import open_executor as open_executor
+    from calibray.engines.cluster.workers import open_crew as open_crew
+    from calibray.engines.external.command import Command as Command
+    from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
+    from calibray.engines.ledger.ledger import Ledger as Ledger
+    from calibray.engines.ledger.ledger import open_ledger as open_ledger
+    from calibray.engines.ledger.recorded import Recorded as Recorded
+    from calibray.engines.make_engine import make as make
+    from calibray.engines.multi_carrier import ReplayCarriers as ReplayCarriers
     from calibray.engines.protocol import Answer as Answer
     from calibray.engines.protocol import Answering as Answering
     from calibray.engines.protocol import Differentiable as Differentiable
     from calibray.engines.protocol import Engine as Engine
     from calibray.engines.protocol import check_candidates as check_candidates
-    from calibray.engines.recorded import Recorded as Recorded
     from calibray.engines.replay import Replay as Replay
     from calibray.engines.retrace import Retrace as Retrace
 
 _HOMES = {
-    "LEDGER_FILE": "calibray.engines.ledger",
+    "LEDGER_FILE": "calibray.engines.ledger.ledger",
     "Answer": "calibray.engines.protocol",
     "Answering": "calibray.engines.protocol",
-    "Command": "calibray.engines.command",
+    "Command": "calibray.engines.external.command",
     "Differentiable": "calibray.engines.protocol",
     "Engine": "calibray.engines.protocol",
-    "Ledger": "calibray.engines.ledger",
-    "Recorded": "calibray.engines.recorded",
+    "Ledger": "calibray.engines.ledger.ledger",
+    "Recorded": "calibray.engines.ledger.recorded",
     "Replay": "calibray.engines.replay",
-    "Blocks": "calibray.engines.blocks",
-    "ReplayCarriers": "calibray.engines.carriers",
+    "Blocks": "calibray.engines.cluster.blocks",
+    "ReplayCarriers": "calibray.engines.multi_carrier",
     "Retrace": "calibray.engines.retrace",
     "check_candidates": "calibray.engines.protocol",
-    "make": "calibray.engines.making",
-    "open_crew": "calibray.engines.crew",
-    "open_executor": "calibray.engines.pool",
-    "open_ledger": "calibray.engines.ledger",
+    "make": "calibray.engines.make_engine",
+    "open_crew": "calibray.engines.cluster.workers",
+    "open_executor": "calibray.engines.cluster.executors",
+    "open_ledger": "calibray.engines.ledger.ledger",
 }
 
 __all__ = sorted(_HOMES)

@@ -25,7 +25,7 @@ from calibray.errors import InputError
 from calibray.fields import layout, path_losses, path_powers
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 
 TOLERANCE_DB: Final = 0.01
 """Largest error of a link's path loss [dB] unless told otherwise."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
 from calibray.parameters import Parameters
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 
 
 @runtime_checkable

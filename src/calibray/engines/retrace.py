@@ -16,7 +16,7 @@ from calibray.engines.protocol import Answer, check_candidates
 from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 from calibray.tracing.protocol import Tracer
 
 

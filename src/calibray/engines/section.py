@@ -6,12 +6,12 @@ from abc import ABC, abstractmethod
 from concurrent.futures import Executor
 from typing import TYPE_CHECKING, ClassVar
 
-from calibray.closed import Section
 from calibray.engines.protocol import Engine
-from calibray.progress import Progress
+from calibray.support.progress import Progress
+from calibray.support.strict import Section
 
 if TYPE_CHECKING:
-    from calibray.engines.crew import Crew
+    from calibray.engines.cluster.workers import Crew
     from calibray.paths import Paths
     from calibray.study.setup import Setup
 

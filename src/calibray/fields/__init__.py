@@ -11,7 +11,7 @@ jax.config.update("jax_enable_x64", True)
 # share their work out to threads all the same.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 
-from calibray.fields.compiled import keep_compiled  # noqa: E402
+from calibray.fields.xla_cache import keep_compiled  # noqa: E402
 
 keep_compiled()
 

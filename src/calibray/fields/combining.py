@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.fields import slab
-from calibray.fields.circle import circle
+from calibray.fields.trigonometry import circle
 from calibray.paths import Paths
 
 Offsets = jax.Array | NDArray[np.float64] | None

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from scipy.constants import epsilon_0, speed_of_light
 
-from calibray.fields.circle import circle
+from calibray.fields.trigonometry import circle
 
 Pair = tuple[jax.Array, jax.Array]
 Values = TypeVar("Values")

@@ -4,7 +4,7 @@ Positions are metres in the scene's frame once rows are links; `preparation` mak
 """
 
 from calibray.measurements.links import FREQUENCIES, Measurements
-from calibray.measurements.pieces import PiecedTable
+from calibray.measurements.parquet import PiecedTable
 from calibray.measurements.preparation import Averaging, Coordinates, Preparation, Track
 from calibray.measurements.reading import (
     LINK_COLUMNS,
@@ -14,7 +14,7 @@ from calibray.measurements.reading import (
     measured_links,
     read_measurements,
 )
-from calibray.measurements.tables import SourceTable
+from calibray.measurements.table_files import SourceTable
 
 __all__ = [
     "FREQUENCIES",

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.grammar import (
+from calibray.measurements.filter_grammar import (
     ARITHMETIC,
     COMPARISONS,
     FUNCTIONS,
@@ -29,8 +29,8 @@ from calibray.measurements.grammar import (
     as_python,
     parse,
 )
-from calibray.measurements.patterns import check_pattern
-from calibray.spelling import did_you_mean, shortened
+from calibray.measurements.filter_patterns import check_pattern
+from calibray.support.messages import did_you_mean, shortened
 
 _LARGEST: Final = 2**63 - 1
 _Value = pd.Series | bool | int | float | str | None

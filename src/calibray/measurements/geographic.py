@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
-from calibray.measurements.tables import SourceTable
+from calibray.measurements.table_files import SourceTable
 
 Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """Height of the ground [m] over x and y [m], as `Terrain.heights` gives it."""

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.summary import summary
-from calibray.measurements.tables import SourceTable
-from calibray.spelling import shortened
-from calibray.tables import glance
-from calibray.tables.glance import named
+from calibray.measurements.table_files import SourceTable
+from calibray.support.messages import shortened
+from calibray.tables import display as glance
+from calibray.tables.display import named
 
 COINCIDENCE: Final = 1e-3
 """The distance [m] below which transmitter and receiver stand at the same place."""

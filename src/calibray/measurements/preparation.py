@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements.aggregation import Sense, averaged, by_cell, by_distance, by_time
+from calibray.measurements.averaging import Sense, averaged, by_cell, by_distance, by_time
 from calibray.measurements.geographic import Ground, joined_by_time, read_track, with_scene_positions
-from calibray.measurements.powers import long_table, marked_censored, with_transmitters
-from calibray.measurements.tables import SourceTable, read_table
-from calibray.spelling import shortened
+from calibray.measurements.received_power import long_table, marked_censored, with_transmitters
+from calibray.measurements.table_files import SourceTable, read_table
+from calibray.support.messages import shortened
 
 Coordinates = Sequence[float | str]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.measurements.links import Measurements
 from calibray.measurements.preparation import UNHEARD, Coordinates, Preparation, positions, prepare
-from calibray.measurements.tables import SourceTable, read_table
-from calibray.spelling import did_you_mean
+from calibray.measurements.table_files import SourceTable, read_table
+from calibray.support.messages import did_you_mean
 
 Quantity = Literal["path_loss", "path_gain", "received_power", "rsrp"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calibray.tables import Column, Table
-from calibray.tables.glance import hertz, named
+from calibray.tables.display import hertz, named
 
 if TYPE_CHECKING:
     import numpy as np

@@ -5,20 +5,20 @@ Every class is an `Optimizer`, and declares what it uses, how it keeps to a budg
 missed when its class is constructed.
 """
 
-from calibray.optimizers.archive import Best
 from calibray.optimizers.cma_es import CMAES
 from calibray.optimizers.dfo_ls import DFOLS
 from calibray.optimizers.differential_evolution import DifferentialEvolution
+from calibray.optimizers.evaluations import Best
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.methods import METHODS, make, method
+from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
+from calibray.optimizers.multifidelity.vector_surrogate import VectorSurrogate
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.screened import ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
-from calibray.optimizers.space_mapping import SpaceMapping
-from calibray.optimizers.vector_surrogate import VectorSurrogate
 
 __all__ = [
     "CMAES",

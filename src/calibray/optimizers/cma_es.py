@@ -12,10 +12,10 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.inversion import library, limited
+from calibray.optimizers.evaluations import Archive
+from calibray.optimizers.library_adapter import library, limited
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session

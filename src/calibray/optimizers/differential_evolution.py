@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import differential_evolution
 
-from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.inversion import Evaluate, inverted, limited
+from calibray.optimizers.evaluations import Archive
+from calibray.optimizers.library_adapter import Evaluate, inverted, limited
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session

@@ -17,10 +17,10 @@ from scipy.spatial.distance import cdist
 from scipy.special import erfcx
 from scipy.stats import norm
 
-from calibray.optimizers.archive import Archive, merged
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers.evaluations import Archive, merged
+from calibray.optimizers.multifidelity.kriging import Kriging, fit, solve
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import maximin_design
 from calibray.optimizers.schedule import AS_GIVEN, Schedule

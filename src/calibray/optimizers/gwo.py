@@ -24,9 +24,9 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.archive import Archive
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
+from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session

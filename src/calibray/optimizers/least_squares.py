@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive, Evaluations, Objective, root_mean_square
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import Starts, descend, distinct
+from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.recombination import SPACE, recombined
 from calibray.optimizers.sampling import design

@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Objective
-from calibray.optimizers.cheap_model import CheapModel
 from calibray.optimizers.cma_es import CMAES
 from calibray.optimizers.dfo_ls import DFOLS
 from calibray.optimizers.differential_evolution import DifferentialEvolution
+from calibray.optimizers.evaluations import Objective
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
+from calibray.optimizers.multifidelity.cheap_model import CheapModel
+from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
+from calibray.optimizers.multifidelity.vector_surrogate import VectorSurrogate
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.screened import Screen, ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
-from calibray.optimizers.space_mapping import SpaceMapping
-from calibray.optimizers.vector_surrogate import VectorSurrogate
-from calibray.spelling import did_you_mean
+from calibray.support.messages import did_you_mean
 
 METHODS: Final[dict[str, type[Optimizer]]] = {
     "gwo": GWO,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast, final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.optimizers.inversion import library
+from calibray.optimizers.library_adapter import library
 from calibray.optimizers.sgwoim import SGWOIM
 
 if TYPE_CHECKING:

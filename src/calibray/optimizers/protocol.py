@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Best
+from calibray.optimizers.evaluations import Best
 from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Session
 

@@ -21,13 +21,13 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.archive import Archive, Evaluations
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
+from calibray.optimizers.evaluations import Archive, Evaluations
 from calibray.optimizers.gwo import LEADERS, WOLVES, encircle
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.scalar_surrogate import interpolated
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
-from calibray.optimizers.screening import interpolated
 from calibray.optimizers.session import Search, Session
 from calibray.optimizers.sgwoim import ELITES, cosine_decay, memory_weight, remember
 

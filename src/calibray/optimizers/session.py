@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import (
+from calibray.optimizers.box import Box
+from calibray.optimizers.evaluations import (
     Archive,
     Best,
     Evaluations,
@@ -22,7 +23,6 @@ from calibray.optimizers.archive import (
     checked_evaluations,
     root_mean_square,
 )
-from calibray.optimizers.box import Box
 
 Search = Generator[NDArray[np.float64], Evaluations, None]
 """An algorithm: yields candidates [n, d] inside the box, receives their evaluations in the same order."""

@@ -28,13 +28,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.archive import Archive, Evaluations, read_only
 from calibray.optimizers.arguments import choice, real, whole
 from calibray.optimizers.box import Box
+from calibray.optimizers.evaluations import Archive, Evaluations, read_only
 from calibray.optimizers.gwo import LEADERS, LEAST_BUDGET, WOLVES, encircle, linear_decay
 from calibray.optimizers.protocol import Optimizer
+from calibray.optimizers.scalar_surrogate import KERNELS, predict
 from calibray.optimizers.schedule import Schedule
-from calibray.optimizers.screening import KERNELS, predict
 from calibray.optimizers.session import Search, Session
 
 

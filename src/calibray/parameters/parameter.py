@@ -18,7 +18,7 @@ from calibray.materials import (
     itu_material,
 )
 from calibray.parameters.laws import CONSTANT, LAWS, PARAMETER_BOUNDS, steady_law
-from calibray.spelling import did_you_mean
+from calibray.support.messages import did_you_mean
 
 Scale = Literal["linear", "log"]
 

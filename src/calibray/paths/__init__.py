@@ -2,9 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from calibray.lazy import lazily
+from calibray.support.lazy import lazily
 
 if TYPE_CHECKING:
+    from calibray.paths.checksum import seal as seal
+    from calibray.paths.file_format import SCHEMA_VERSION as SCHEMA_VERSION
     from calibray.paths.interactions import Diffraction as Diffraction
     from calibray.paths.interactions import Diffuse as Diffuse
     from calibray.paths.interactions import Kind as Kind
@@ -13,18 +15,16 @@ if TYPE_CHECKING:
     from calibray.paths.program import join_links as join_links
     from calibray.paths.program import take as take
     from calibray.paths.program import take_links as take_links
-    from calibray.paths.schema import SCHEMA_VERSION as SCHEMA_VERSION
-    from calibray.paths.sealing import seal as seal
 
 _HOMES = {
-    "SCHEMA_VERSION": "calibray.paths.schema",
+    "SCHEMA_VERSION": "calibray.paths.file_format",
     "Diffraction": "calibray.paths.interactions",
     "Diffuse": "calibray.paths.interactions",
     "Kind": "calibray.paths.interactions",
     "Paths": "calibray.paths.program",
     "concatenate": "calibray.paths.program",
     "join_links": "calibray.paths.program",
-    "seal": "calibray.paths.sealing",
+    "seal": "calibray.paths.checksum",
     "take": "calibray.paths.program",
     "take_links": "calibray.paths.program",
 }

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import exists
 from calibray.materials import FIELDS, Material
+from calibray.paths.checksum import BLOCK, stamp, verify
+from calibray.paths.file_format import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, VERTEX, Content, read
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
-from calibray.paths.schema import DATASETS, SCHEMA, SCHEMA_VERSION, SETTING, VERTEX, Content, read
-from calibray.paths.sealing import BLOCK, stamp, verify
 from calibray.paths.summary import as_html, as_text
 from calibray.paths.trial import survive
+from calibray.support.output_files import exists
 
 Table = TypeVar("Table", Diffuse, Diffraction)
 

@@ -38,7 +38,7 @@ def survive(path: Path) -> None:
 if __name__ == "__main__":
     import h5py
 
-    from calibray.paths.schema import read
+    from calibray.paths.file_format import read
 
     try:
         with h5py.File(sys.argv[1], "r") as file:

@@ -179,7 +179,7 @@ def _searched(result: Result, name: str) -> NDArray[np.float64]:
 
 
 def _neighbours(result: Result) -> pd.DataFrame:
-    from calibray.inference.diagnostics import variogram
+    from calibray.uncertainty.residuals import variogram
 
     links, left = _used(result)
     ends = _ends(links)

@@ -12,11 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import check_outputs, check_unchanged, write_text
-from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.measurements import Measurements
-from calibray.progress import Progress
 from calibray.result.chosen import Chosen, ChosenTerm
 from calibray.result.residuals import ResidualField
 from calibray.result.rows import COLUMNS, read_rows
@@ -26,12 +23,15 @@ from calibray.result.validation import FILE as VALIDATION_FILE
 from calibray.result.validation import read_validation, write_validation
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.study import Study
-from calibray.tables import glance
+from calibray.support.output_files import check_outputs, check_unchanged, write_text
+from calibray.support.progress import Progress
+from calibray.tables import display as glance
 from calibray.tracing.enclosed import Enclosed
+from calibray.uncertainty.intervals import Interval
 
 if TYPE_CHECKING:
-    from calibray.inference.validation import Validation
     from calibray.paths import Paths
+    from calibray.validation.validation import Validation
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
 """What a result is written to; users have files called links.csv and scene.xml themselves."""
@@ -307,7 +307,7 @@ class Result:
         *,
         anyway: bool = False,
     ) -> NDArray[np.float64]:
-        """Path loss at links that were never measured; see `calibray.inference.prediction.predict`.
+        """Path loss at links that were never measured; see `calibray.prediction.predict.predict`.
 
         Args:
             links: The links, or a table with columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or else with those that
@@ -323,7 +323,7 @@ class Result:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
                 the scene or an antenna changed since the calibration.
         """
-        from calibray.inference.prediction import predict
+        from calibray.prediction.predict import predict
 
         return predict(self, links, progress, anyway=anyway)
 
@@ -335,7 +335,7 @@ class Result:
         *,
         anyway: bool = False,
     ) -> pd.DataFrame:
-        """Path loss with its interval at links that were never measured; see `calibray.inference.prediction`.
+        """Path loss with its interval at links that were never measured; see `calibray.prediction.predict`.
 
         Args:
             links: The links, or a table, as for `predict`; groups need not have been measured.
@@ -351,6 +351,6 @@ class Result:
             InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had
                 too few links to tell the size of errors.
         """
-        from calibray.inference.prediction import predict_interval
+        from calibray.prediction.predict import predict_interval
 
         return predict_interval(self, links, level, progress, anyway=anyway)

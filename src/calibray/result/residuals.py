@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ResidualField:
-    """Errors of which neighbours share a part; see `calibray.inference.residual_field`.
+    """Errors of which neighbours share a part; see `calibray.prediction.residual_field`.
 
     Attributes:
         range_m: Distance at which the shared part has fallen to 1/e [m].

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass as checked
 
-from calibray.closed import CLOSED, Section
 from calibray.errors import InputError
-from calibray.inference.intervals import Interval
 from calibray.materials import Material
 from calibray.result.chosen import Chosen
 from calibray.result.residuals import ResidualField
-from calibray.spelling import shortened
 from calibray.study import Study
-from calibray.study.faults import explain
+from calibray.study.validation_errors import explain
+from calibray.support.messages import shortened
+from calibray.support.strict import CLOSED, Section
+from calibray.uncertainty.intervals import Interval
 
 VERSION = 1
 """The version of `result.json` that is written and read."""

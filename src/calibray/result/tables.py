@@ -10,9 +10,9 @@ from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
 
 if TYPE_CHECKING:
-    from calibray.inference.intervals import Interval
     from calibray.result.record import Result
     from calibray.tracing.enclosed import Enclosed
+    from calibray.uncertainty.intervals import Interval
 
 SHOWN: Final = 3
 """Pieces of an interval that are shown one by one."""

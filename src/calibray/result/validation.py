@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.files import write_text
+from calibray.support.output_files import write_text
 
 if TYPE_CHECKING:
-    from calibray.inference.validation import Validation
+    from calibray.validation.validation import Validation
 
 FILE: Final = "result-validation.json"
 VERSION: Final = 1
@@ -66,7 +66,7 @@ def read_validation(folder: Path, links: int) -> Validation | None:
 
 
 def _read(file: Path, links: int) -> Validation:
-    from calibray.inference.validation import Validation
+    from calibray.validation.validation import Validation
 
     content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     if content["version"] != VERSION:

@@ -10,9 +10,9 @@ from shutil import copyfile
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.files import check_replaceable, replacing, write_text
 from calibray.materials import ITU_MATERIALS, Material
 from calibray.scenes.scene import TRACED, Scene, material_element
+from calibray.support.output_files import check_replaceable, replacing, write_text
 
 MESHES: Final = "meshes"
 """The folder that copies of meshes are put into, beside the scene file."""

@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.files import replacing
+from calibray.support.output_files import replacing
 
 Place = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 """Where corners lie."""

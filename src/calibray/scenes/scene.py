@@ -25,8 +25,8 @@ from calibray.materials import (
     itu_material,
 )
 from calibray.parameters.laws import steady_law
-from calibray.scenes.source import check_files, check_shape, parse, scene_path
-from calibray.spelling import did_you_mean
+from calibray.scenes.scene_file import check_files, check_shape, parse, scene_path
+from calibray.support.messages import did_you_mean
 
 DEFAULT_THICKNESS: Final = 0.1
 """Sionna's default for a material without one [m]."""

@@ -2,19 +2,19 @@
 
 from typing import TYPE_CHECKING
 
-from calibray.lazy import lazily
+from calibray.support.lazy import lazily
 
 if TYPE_CHECKING:
     from calibray.study.model import VERSION as VERSION
     from calibray.study.model import Study as Study
-    from calibray.study.reading import expand as expand
     from calibray.study.setup import Setup as Setup
+    from calibray.study.toml_file import expand as expand
 
 _HOMES = {
     "VERSION": "calibray.study.model",
     "Setup": "calibray.study.setup",
     "Study": "calibray.study.model",
-    "expand": "calibray.study.reading",
+    "expand": "calibray.study.toml_file",
 }
 
 __all__ = sorted(_HOMES)

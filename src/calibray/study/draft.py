@@ -15,15 +15,16 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements, Track, guessing
-from calibray.measurements.guessing import Place, Value
-from calibray.measurements.powers import long_table
+from calibray.measurements import Measurements, Track
+from calibray.measurements import column_names as guessing
+from calibray.measurements.column_names import Place, Value
 from calibray.measurements.preparation import TRACKED, tracked
-from calibray.measurements.tables import SourceTable, read_table
-from calibray.scenes.crossing import crossings
-from calibray.scenes.making import read_frame
-from calibray.scenes.overhead import Overhead
-from calibray.scenes.source import find_scene
+from calibray.measurements.received_power import long_table
+from calibray.measurements.table_files import SourceTable, read_table
+from calibray.scenes.authoring.scene_folder import read_frame
+from calibray.scenes.checks.crossings import crossings
+from calibray.scenes.checks.heights import Overhead
+from calibray.scenes.scene_file import find_scene
 from calibray.study.draft_parameters import calibratable
 from calibray.study.draft_text import toml
 from calibray.study.model import BUNDLED, VERSION, Study
@@ -31,7 +32,7 @@ from calibray.study.model import BUNDLED, VERSION, Study
 RECEIVER_HEIGHT: Final = 1.5
 TRANSMITTER_HEIGHT: Final = 10.0
 WAVELENGTHS: Final = 40
-"""Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.aggregation`)."""
+"""Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.averaging`)."""
 
 _DEPTHS: Final = (3, 5)  # within which walls decide how deep is traced indoors
 _LEVEL: Final = 0.5  # [m], within which the ground counts as the scene's zero

@@ -13,20 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
-from calibray.closed import Section, Text
 from calibray.engines.kinds import AnyEngine, default
 from calibray.errors import InputError
-from calibray.files import exists
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import LINK_COLUMNS, Measurements, links_from_table, measured_links
-from calibray.measurements.tables import SourceTable, read_table
+from calibray.measurements.table_files import SourceTable, read_table
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import steady_law
-from calibray.spelling import shortened
-from calibray.study.engines import part_engine
-from calibray.study.faults import dotted, explain
-from calibray.study.preparing import AS_THEY_ARE, placing, preparation
-from calibray.study.reading import expand, read_content, refuse_unquoted_names
+from calibray.study.engine_keys import part_engine
+from calibray.study.row_steps import AS_THEY_ARE, placing, preparation
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -43,7 +38,12 @@ from calibray.study.sections import (
     TraceSection,
 )
 from calibray.study.summary import summary
-from calibray.tables import glance
+from calibray.study.toml_file import expand, read_content, refuse_unquoted_names
+from calibray.study.validation_errors import dotted, explain
+from calibray.support.messages import shortened
+from calibray.support.output_files import exists
+from calibray.support.strict import Section, Text
+from calibray.tables import display as glance
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:

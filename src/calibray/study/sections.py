@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass as checked
 
-from calibray.closed import CLOSED, Section, Text
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
 from calibray.parameters import Scale, itu_start
-from calibray.study.options import check_options
+from calibray.study.method_options import check_options
+from calibray.support.strict import CLOSED, Section, Text
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _Antenna = checked(Antenna, config=CLOSED, frozen=True)

@@ -17,10 +17,10 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
-from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name, read_scene
-from calibray.scenes.source import content
+from calibray.scenes.scene_file import content
 from calibray.study.model import Study
+from calibray.support.progress import Progress
 from calibray.tracing import cache
 from calibray.tracing.enclosed import Enclosed
 from calibray.tracing.factory import SIONNA

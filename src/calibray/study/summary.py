@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calibray.tables import Column, Table, numbers
-from calibray.tables.glance import hertz
+from calibray.tables.display import hertz
 
 if TYPE_CHECKING:
     from calibray.study.model import Study

@@ -1,7 +1,7 @@
 """Traces kept between runs: the same scene, links, antennas, settings and versions are traced once.
 
-They lie in Calibray's cache folder (`calibray.caching`). An entry that is damaged is dropped with a line in the log,
-which Python writes to stderr unless told otherwise.
+They lie in Calibray's cache folder (`support.cache_folder`). A damaged entry is dropped with a line in the log,
+which Python writes to stderr by default.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.caching import folder
 from calibray.errors import InputError
 from calibray.paths import SCHEMA_VERSION, Paths
 from calibray.scenes import Scene
+from calibray.support.cache_folder import folder
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}\.h5")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.paths import Paths
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
 
 

@@ -10,8 +10,8 @@ from typing import Any, Final, final
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.paths import Paths
-from calibray.progress import Progress
 from calibray.scenes import Scene, read_scene
+from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
 from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
 

@@ -16,7 +16,7 @@ from typing import Final, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.spelling import duration
+from calibray.support.messages import duration
 from calibray.tracing.settings import TraceSettings
 
 LONG: Final = 30.0

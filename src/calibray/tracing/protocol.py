@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.paths import Paths
-from calibray.progress import Progress
 from calibray.scenes import Scene
+from calibray.support.progress import Progress
 from calibray.tracing.launches import Plan
 from calibray.tracing.settings import Antenna, TraceSettings
 

@@ -8,7 +8,7 @@ from math import isfinite
 from typing import Final, Literal
 
 from calibray.errors import InputError
-from calibray.spelling import shortened
+from calibray.support.messages import shortened
 from calibray.tracing.gain_table import is_gain_file, read_gain_table
 
 PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")

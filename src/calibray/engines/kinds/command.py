@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, cast, fina
 
 from pydantic import AfterValidator, Field, model_validator
 
-from calibray.closed import Text
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
-from calibray.progress import Progress
+from calibray.support.progress import Progress
+from calibray.support.strict import Text
 
 if TYPE_CHECKING:
-    from calibray.engines.command import Command
-    from calibray.engines.crew import Crew
+    from calibray.engines.cluster.workers import Crew
+    from calibray.engines.external.command import Command
     from calibray.paths import Paths
     from calibray.study.setup import Setup
 
@@ -72,9 +72,9 @@ class CommandSection(EngineSection):
         executor: Executor | Crew | None,
     ) -> Command:
         """The program over a study's links; see `EngineSection.open`."""
-        from calibray.engines.command import Command
-        from calibray.engines.exchange import Surroundings
-        from calibray.engines.external_program import ExternalProgram
+        from calibray.engines.external.command import Command
+        from calibray.engines.external.exchange import Surroundings
+        from calibray.engines.external.program import ExternalProgram
 
         study, links = setup.study, setup.links
         folder = study.path.resolve().parent

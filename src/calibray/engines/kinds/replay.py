@@ -13,13 +13,13 @@ from pydantic import Field
 
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
-from calibray.progress import Progress
-from calibray.spelling import duration
+from calibray.support.messages import duration
+from calibray.support.progress import Progress
 
 if TYPE_CHECKING:
-    from calibray.engines.blocks import Blocks
-    from calibray.engines.carriers import ReplayCarriers
-    from calibray.engines.crew import Crew
+    from calibray.engines.cluster.blocks import Blocks
+    from calibray.engines.cluster.workers import Crew
+    from calibray.engines.multi_carrier import ReplayCarriers
     from calibray.engines.replay import Replay
     from calibray.materials import Material
     from calibray.paths import Paths
@@ -67,9 +67,9 @@ class ReplaySection(EngineSection):
         # Before anything is traced.
         self._check_compressible(setup)
         if paths is None and (executor is not None or self.block_links is not None):
-            from calibray.engines.blocks import Blocks
-            from calibray.engines.crew import Here
-            from calibray.engines.parts import block_size, cut, seconds_to_trace
+            from calibray.engines.cluster.blocks import Blocks
+            from calibray.engines.cluster.partition import block_size, cut, seconds_to_trace
+            from calibray.engines.cluster.workers import Here
             from calibray.tracing.launches import LONG
 
             crew = Here() if executor is None else cast("Crew", executor)
@@ -112,8 +112,8 @@ def replay(setup: Setup, paths: Paths, compress_db: float | None = None) -> Repl
     Returns:
         The engine; with a program for each carrier where the links have carriers of their own.
     """
-    from calibray.engines.carriers import CarrierPaths, ReplayCarriers
     from calibray.engines.compression import compress
+    from calibray.engines.multi_carrier import CarrierPaths, ReplayCarriers
     from calibray.engines.replay import Replay
     from calibray.paths import take_links
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar, Literal, final
 import numpy as np
 
 from calibray.engines.section import EngineSection
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 
 if TYPE_CHECKING:
-    from calibray.engines.crew import Crew
+    from calibray.engines.cluster.workers import Crew
     from calibray.engines.retrace import Retrace
     from calibray.paths import Paths
     from calibray.study.setup import Setup

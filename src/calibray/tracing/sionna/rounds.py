@@ -24,7 +24,7 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.errors import EngineError
 from calibray.materials import Material
-from calibray.progress import Progress
+from calibray.support.progress import Progress
 from calibray.tracing.launches import Launch, Plan, directions, seed_of
 from calibray.tracing.settings import ROUND
 from calibray.tracing.sionna.arrays import aligned, points

@@ -27,16 +27,16 @@ from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from calibray.errors import EngineError, InputError
-from calibray.interruption import interruptible
 from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
-from calibray.progress import Progress
 from calibray.scenes import Scene, check_material_name
+from calibray.support.interruption import interruptible
+from calibray.support.memory import available
+from calibray.support.progress import Progress
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
 from calibray.tracing.launches import Launch, Plan, directions, paths_that_fit, plan, starts_at_receivers
-from calibray.tracing.memory import available
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of

@@ -1,0 +1,1 @@
+"""Families of planted problems and landscapes in closed form, for judging methods where nobody tuned them."""

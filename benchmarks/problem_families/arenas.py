@@ -1,0 +1,121 @@
+"""Problems with a known minimum that methods are compared on: landscapes in closed form, and planted problems."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.comparison.problems import Arena
+from calibray.fitting.cheap_replay import ReplayedModel, with_constants
+from calibray.fitting.problem import Evaluation
+from problem_families import landscapes
+from problem_families.family import PlantedProblem, problem
+from problem_families.numpy_replay import Direct
+
+
+def landscape_arena(name: str) -> Arena:
+    """A landscape of `problem_families.landscapes`.
+
+    Args:
+        name: The function that makes it.
+
+    Returns:
+        The arena.
+    """
+    land: landscapes.Landscape = getattr(landscapes, name)()
+
+    def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
+        value, residuals, jacobian = land.evaluate(points)
+        return Evaluation(value, residuals, jacobian if derivatives else None, residuals, value)
+
+    known = float(np.nan_to_num(land.minimum, nan=np.inf))
+    middle = 0.5 * (land.lower + land.upper)
+    digest = hashlib.sha256(name.encode())
+    for part in (land.lower, land.upper, *land.evaluate(middle[None])):
+        digest.update(np.round(part, 9).astype("<f8").tobytes())
+    return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)
+
+
+def family_arena(kind: str, seed: int) -> Arena:
+    """A planted problem of `problem_families.family`, whose lowest objective is known.
+
+    Args:
+        kind: "district" or "office".
+        seed: Its seed.
+
+    Returns:
+        The arena.
+
+    Raises:
+        InputError: There is no such family.
+    """
+    planted = problem(seed, kind)
+
+    def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
+        told = planted.told(points, derivatives)
+        return Evaluation(*told, told.residuals, told.value)
+
+    return Arena(
+        f"{kind}-{seed}",
+        planted.fingerprint,
+        planted.lower,
+        planted.upper,
+        planted.parameters.to_search(planted.parameters.start),
+        None,
+        False,
+        planted.minimum_rmse_db,
+        evaluate,
+        planted.cheap_rmse_db,
+        lambda: planted_model(planted),
+        planted.differences.misinformed,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PlantedRows:
+    """The residuals of a planted problem, each transmitter's offset taken out.
+
+    Attributes:
+        planted: The problem.
+    """
+
+    planted: PlantedProblem
+
+    @property
+    def filling(self) -> NDArray[np.float64]:
+        """The measured path loss [L], [dB]."""
+        return self.planted.measured
+
+    def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """See `Rows.known`."""
+        return reached
+
+    def residuals(
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """See `Rows.residuals`."""
+        return self.planted.residuals(path_loss)
+
+    def slopes(
+        self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """See `Rows.slopes`; residuals are linear in what path loss has beyond the measurements."""
+        rows = np.moveaxis(slope, 1, -1)
+        return np.moveaxis(self.planted.residuals(self.planted.measured + rows), -1, 1)
+
+
+def planted_model(planted: PlantedProblem) -> ReplayedModel:
+    """The cheap model of a planted problem, with the constants that it was told.
+
+    Args:
+        planted: The problem.
+
+    Returns:
+        The model.
+    """
+    paths = planted.cheap.paths
+    engine = Direct(paths, with_constants(planted.parameters, paths.materials))
+    return ReplayedModel(engine, len(planted.parameters), PlantedRows(planted))

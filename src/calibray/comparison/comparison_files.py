@@ -1,0 +1,60 @@
+"""What a comparison of methods writes: its tables, and a figure of the excess over RT calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibray.optimizers.labels import label
+from calibray.report.style import COLORS, PALETTE, logarithmic, plain_figure, styled
+from calibray.report.style import write as write_figure
+from calibray.support.output_files import write_table
+
+if TYPE_CHECKING:
+    from calibray.comparison.comparison import Comparison
+
+FILES: Final = ("compare.csv", "runs.csv", "compare.png")
+FLOOR_DB: Final = 1e-4  # drawn in place of less
+
+
+def write(comparison: Comparison, folder: Path) -> None:
+    """Write a comparison's tables and figure.
+
+    Args:
+        comparison: The comparison.
+        folder: Folder to write into, which exists.
+    """
+    write_table(folder / FILES[0], comparison.table())
+    write_table(folder / FILES[1], comparison.history())
+    write_figure(figure(comparison), folder / FILES[2])
+
+
+@styled()
+def figure(comparison: Comparison) -> Figure:
+    """Excess over RT calls: the median of each method and the band between its quartiles.
+
+    Args:
+        comparison: The comparison.
+
+    Returns:
+        The figure.
+    """
+    drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
+    last = max(contender.budget for contender in comparison.contenders)
+    colors = iter(PALETTE * (1 + len(comparison.contenders) // len(PALETTE)))
+    calls = np.arange(1, last + 1)
+    for contender in comparison.contenders:
+        shown = calls if contender.endless else calls[: contender.budget]
+        quartiles = [comparison.quartiles(contender.name, int(call)) for call in shown]
+        low, middle, high = np.maximum(quartiles, FLOOR_DB).T
+        color = COLORS.get(contender.method) or next(colors)
+        dashed = "--" if contender.endless or contender.name != contender.method else "-"
+        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(contender.name))
+        axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
+    logarithmic(axes, "y")
+    axes.set_xlim(0, last)
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return drawing

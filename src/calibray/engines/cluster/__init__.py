@@ -1,0 +1,1 @@
+"""Links in blocks, and the processes and machines that work on them."""

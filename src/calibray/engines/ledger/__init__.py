@@ -1,0 +1,1 @@
+"""The ledger: every RT call that was ever paid for."""

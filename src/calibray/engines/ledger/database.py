@@ -1,0 +1,130 @@
+"""The SQLite file of a ledger: its tables, what makes it no ledger, and what its errors mean."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from calibray.engines.ledger import claims
+from calibray.errors import InputError
+
+VERSION: Final = 2  # the first had neither digests nor claims
+PATIENCE: Final = 60.0  # how long to wait for others to finish writing [s]
+_PROBLEMS: Final = """CREATE TABLE IF NOT EXISTS problems (
+    problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID"""
+_ANSWERS: Final = """CREATE TABLE IF NOT EXISTS answers (
+    id INTEGER PRIMARY KEY, problem TEXT NOT NULL REFERENCES problems, candidate BLOB NOT NULL,
+    path_loss_db BLOB NOT NULL, seconds REAL NOT NULL, failure TEXT NOT NULL, time TEXT NOT NULL,
+    digest BLOB, UNIQUE (problem, candidate))"""
+_COLUMNS: Final = {
+    "problems": ["problem", "engine", "parameters"],
+    "answers": ["id", "problem", "candidate", "path_loss_db", "seconds", "failure", "time", "digest"],
+    "claims": ["problem", "candidate", "run", "owner", "expires"],
+}
+
+
+def set_up(connection: sqlite3.Connection, path: Path) -> None:
+    """Make the tables of a new ledger, and those that an old one lacks; refuse what is no ledger.
+
+    Args:
+        connection: The file.
+        path: Its path, for messages.
+
+    Raises:
+        InputError: The file is a database of something else, or of another version.
+        sqlite3.OperationalError: Others have locked the file for too long, or it cannot be used.
+        sqlite3.DatabaseError: The file is damaged.
+    """
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            _set_up(connection, path)
+        except sqlite3.OperationalError as error:
+            # SQLite does not wait by itself for others that are about to switch to write-ahead logging too.
+            if "locked" not in str(error) or time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+        else:
+            return
+
+
+def _set_up(connection: sqlite3.Connection, path: Path) -> None:
+    run = connection.execute
+    version = run("PRAGMA user_version").fetchone()[0]
+    tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if version not in (0, 1, VERSION):
+        raise InputError(
+            f"{path}: is a ledger of version {version}, this Calibray writes {VERSION}; name another folder"
+        )
+    if version == 0 and tables - set(_COLUMNS):
+        raise InputError(
+            f"{path}: is a database of something else, with a table {min(tables - set(_COLUMNS))!r}; "
+            "name another folder"
+        )
+    if tables and (fault := run("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
+        raise sqlite3.DatabaseError(f"database disk image is malformed: {fault.splitlines()[-1]}")
+    run("PRAGMA journal_mode = WAL")
+    run("PRAGMA synchronous = FULL")  # committed answers survive a loss of power too
+    with transaction(connection):
+        for table in (_PROBLEMS, _ANSWERS, claims.TABLE):
+            run(table)
+        if "digest" not in _columns(connection, "answers"):
+            run("ALTER TABLE answers ADD COLUMN digest BLOB")
+        for table, columns in _COLUMNS.items():
+            if (found := _columns(connection, table)) != columns:
+                raise InputError(
+                    f"{path}: is no ledger, its table {table!r} has the columns {', '.join(found)}, must have "
+                    f"{', '.join(columns)}; name another folder"
+                )
+        if version != VERSION:
+            run(f"PRAGMA user_version = {VERSION}")
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
+    return [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """Several statements that are committed together, or not at all.
+
+    Args:
+        connection: The file.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        with suppress(sqlite3.Error):
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+        raise
+
+
+def explain(error: sqlite3.Error | OSError) -> str:
+    """What went wrong with a ledger, and what to do about it.
+
+    Args:
+        error: The error.
+
+    Returns:
+        Its text and the remedy.
+    """
+    # The lower byte is the kind of error, the others tell it in detail.
+    code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
+    whole = "move it away and start again, or save what is whole with `sqlite3 FILE .recover`"
+    remedy = {
+        sqlite3.SQLITE_FULL: "make room on the disk and start again",
+        sqlite3.SQLITE_IOERR: "make room on the disk, or mend it, and start again",
+        sqlite3.SQLITE_BUSY: f"another program has locked it for {PATIENCE:g} s: end that and start again",
+        sqlite3.SQLITE_LOCKED: "another program has locked it: end that and start again",
+        sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
+        sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",
+        sqlite3.SQLITE_CORRUPT: whole,
+    }.get(code, whole if "malformed" in str(error) else "name another folder")
+    return f"{error}; {remedy}"

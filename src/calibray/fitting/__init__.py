@@ -1,0 +1,1 @@
+"""Fitting: what a calibration minimizes, and the search for its optimum."""

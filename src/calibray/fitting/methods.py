@@ -1,0 +1,112 @@
+"""Which method solves a problem, and with what settings."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from calibray import optimizers
+from calibray.engines.protocol import Differentiable
+from calibray.errors import InputError
+from calibray.fitting.problem import Problem
+from calibray.optimizers import METHODS, Optimizer
+from calibray.optimizers.multifidelity.cheap_model import CheapModel, value_of
+from calibray.parameters import Parameters
+from calibray.study import Setup, Study
+from calibray.support.messages import did_you_mean
+
+AUTO: Final = "auto"
+
+STARTS: Final = (16, 512)
+"""Local searches on the largest and on small programs."""
+
+START_INTERACTIONS: Final = 4_000_000
+"""Local searches times interactions between the two."""
+
+
+def check_method(name: str) -> None:
+    """Refuse a method that does not exist.
+
+    Args:
+        name: The method.
+
+    Raises:
+        InputError: There is no such method.
+    """
+    known = (AUTO, *METHODS)
+    if name not in known:
+        raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, known)}")
+
+
+def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
+    """The optimizer of a study's problem: the one it names, or for "auto" the one that serves it best.
+
+    Args:
+        problem: The problem.
+        model: A cheap model of it, if there is one.
+
+    Returns:
+        The optimizer.
+
+    Raises:
+        InputError: The method needs derivatives that the engine does not give, or its options cannot be used.
+    """
+    engine = problem.engine
+    interactions = engine.interactions if isinstance(engine, Differentiable) else None
+    return _make(problem.setup.study, problem.parameters, problem.differentiable, interactions, model)
+
+
+def check_fit(setup: Setup) -> None:
+    """Refuse a method that cannot run on a study's engine, or its options, before anything is paid or written.
+
+    Args:
+        setup: The study, opened.
+
+    Raises:
+        InputError: The method does not exist, needs derivatives that the engine does not give, or its options cannot
+            be used.
+    """
+    check_method(setup.study.method.name)
+    differentiable = not setup.study.engine.dear
+    _make(setup.study, setup.parameters, differentiable, 1 if differentiable else None)
+
+
+def _make(
+    study: Study,
+    parameters: Parameters,
+    differentiable: bool,
+    interactions: int | None,
+    model: CheapModel | None = None,
+) -> Optimizer:
+    section, name = study.method, study.method.name
+    if name == AUTO:
+        name = "least-squares" if differentiable else "space-mapping"
+    if METHODS[name].needs_derivatives() and not differentiable:
+        raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
+    try:
+        return optimizers.make(
+            name,
+            *parameters.search_bounds,
+            section.seed,
+            start=parameters.to_search(parameters.start),
+            starts=None if interactions is None else local_searches(interactions),
+            screen=None if model is None else partial(value_of, model),
+            model=model,
+            options=section.options,
+        )
+    except InputError as error:
+        raise InputError(f"{study.path}: method.options: {error}") from None
+
+
+def local_searches(interactions: int) -> int:
+    """Starting points of a method that takes them, on paths where they cost what they may.
+
+    Args:
+        interactions: Interactions that a candidate is evaluated at.
+
+    Returns:
+        Their number.
+    """
+    return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))

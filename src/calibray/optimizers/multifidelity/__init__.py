@@ -1,0 +1,1 @@
+"""Methods that learn an expensive model from few calls: space mapping and vector surrogates."""

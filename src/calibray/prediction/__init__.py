@@ -1,0 +1,1 @@
+"""Prediction: path loss where nobody measured, coverage maps, and where to measure next."""

@@ -1,0 +1,186 @@
+"""One restrained style for every figure: colours that colour-blind people tell apart, few lines, units on axes.
+
+The colours of lines are those of Okabe and Ito (2008). A figure in a page takes its ink from the page, so that it is
+read on light and on dark alike.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from calibray.support.output_files import replacing
+
+INK: Final = "#222222"
+FAINT: Final = "#8a8a8a"
+LINE: Final = "#e6e6e6"
+PAPER: Final = "#ffffff"
+BLUE: Final = "#0072b2"
+ORANGE: Final = "#d55e00"
+GREEN: Final = "#009e73"
+PALETTE: Final = (
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#8c5a3c",
+    "#882255",
+    "#6f7f2e",
+    "#5c6bc0",
+    "#777777",
+)
+"""For lines beyond the named ones."""
+
+COLORS: Final = {"gwo": GREEN, "sgwo-im": BLUE, "space-mapping": FAINT, "auto": ORANGE}
+"""The paper's methods, and what Calibray itself does."""
+
+_VARIABLES: Final = {INK: "--ink", FAINT: "--faint", LINE: "--line", PAPER: "--paper", BLUE: "--accent"}
+_SETTINGS: Final[dict[Any, Any]] = {
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    # Names come from files, and a dollar sign in one is a dollar sign.
+    "text.parse_math": False,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "svg.hashsalt": "calibray",
+}
+
+
+@contextmanager
+def styled(text_as: str = "path") -> Iterator[None]:
+    """The style, for as long as the context is open.
+
+    Args:
+        text_as: In SVG, letters as outlines ("path") or as text in the reader's font ("none").
+
+    Yields:
+        Nothing.
+    """
+    with rc_context({**_SETTINGS, "svg.fonttype": text_as}):
+        yield
+
+
+def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tuple[Figure, Axes]:
+    """An empty figure of one panel in the style of all.
+
+    Args:
+        x: What the horizontal axis shows, with its unit.
+        y: What the vertical axis shows, with its unit.
+        width: Width [in].
+        height: Height [in].
+
+    Returns:
+        The figure and its axes.
+    """
+    with styled():
+        figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+        axes = figure.add_subplot()
+    dress(axes, x, y)
+    return figure, axes
+
+
+def residual_figure(x: str) -> tuple[Figure, Axes]:
+    """An empty figure for what is left of links' path loss, with a line where nothing is left.
+
+    Args:
+        x: What the horizontal axis shows, with its unit.
+
+    Returns:
+        The figure and its axes.
+    """
+    figure, axes = plain_figure(x, "Calibrated - measured [dB]")
+    axes.axhline(0, color=INK, lw=0.8)
+    return figure, axes
+
+
+def dress(axes: Axes, x: str, y: str) -> None:
+    """Label axes, and take away what says nothing.
+
+    Args:
+        axes: The axes.
+        x: What the horizontal axis shows, with its unit.
+        y: What the vertical axis shows, with its unit.
+    """
+    axes.set(xlabel=x, ylabel=y)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color=LINE)
+    axes.set_axisbelow(True)
+
+
+def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, its numbers written out: powers would be formulas, which texts here are not.
+
+    Args:
+        axes: The axes, with what they show.
+        direction: Which of them.
+    """
+    axes.set(**{f"{direction}scale": "log"})
+    axis = axes.xaxis if direction == "x" else axes.yaxis
+    low, high = sorted(axis.get_view_interval())
+    if low > 0 and high < 100 * low:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def write(figure: Figure, path: Path) -> Path:
+    """Write a figure.
+
+    Args:
+        figure: The figure.
+        path: File to write, as PNG or, if its name ends so, as SVG.
+
+    Returns:
+        The file.
+    """
+    with styled(), replacing(path) as partial:
+        if path.suffix == ".svg":
+            FigureCanvasSVG(figure).print_svg(partial, metadata={"Date": None})
+        else:
+            FigureCanvasAgg(figure).print_png(partial)
+    return path
+
+
+def inline(figure: Figure, name: str) -> str:
+    """A figure as an SVG element that takes its ink and its font from the page around it.
+
+    Args:
+        figure: The figure.
+        name: What its ids begin with.
+
+    Returns:
+        The element, which refers to nothing outside it.
+    """
+    written = StringIO()
+    figure.patch.set_visible(False)
+    for axes in figure.axes:
+        axes.patch.set_visible(False)
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with styled("none"):
+        FigureCanvasSVG(figure).print_svg(written, metadata=nothing)
+    text = written.getvalue()
+    text = text[text.index("<svg") :]
+    # A style sheet inside would rule the whole page, whose own says the same; HTML knows the names of its parts.
+    text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", text)
+    for side in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?)\s{side}="[^"]*"', r"\1", text, count=1)
+    for color, variable in _VARIABLES.items():
+        text = text.replace(color, f"var({variable})")
+    return text

@@ -1,0 +1,1 @@
+"""Authoring: scenes made of maps, footprints, height models and floor plans."""

@@ -1,0 +1,192 @@
+"""Terrain: the ground as a sheet of triangles, level or from a height model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import distance_transform_edt
+
+from calibray.coordinates import Frame, transformer
+from calibray.errors import InputError
+from calibray.scenes.meshes import Mesh
+from calibray.support.extras import library
+
+MOST_POINTS = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """Heights of the ground over a grid; every cell is two triangles, parted from south-west to north-east.
+
+    Attributes:
+        x: Eastings of the grid, ascending [nx], [m].
+        y: Northings, ascending [ny], [m].
+        z: Heights [ny, nx], [m].
+        repairs: How many heights were filled in, by what was the matter.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    repairs: dict[str, int] = field(default_factory=dict)
+
+    def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """Heights of the triangles' surface.
+
+        Args:
+            x: Eastings [n], [m].
+            y: Northings [n], [m]; beyond the grid its border goes on.
+
+        Returns:
+            Heights [n], [m].
+        """
+        x = np.clip(np.asarray(x, dtype=float), self.x[0], self.x[-1])
+        y = np.clip(np.asarray(y, dtype=float), self.y[0], self.y[-1])
+        column = np.clip(np.searchsorted(self.x, x, side="right") - 1, 0, len(self.x) - 2)
+        row = np.clip(np.searchsorted(self.y, y, side="right") - 1, 0, len(self.y) - 2)
+        u = (x - self.x[column]) / (self.x[column + 1] - self.x[column])
+        v = (y - self.y[row]) / (self.y[row + 1] - self.y[row])
+        here, across = self.z[row, column], self.z[row + 1, column + 1]
+        east, north = self.z[row, column + 1], self.z[row + 1, column]
+        below = here + u * (east - here) + v * (across - east)
+        above = here + v * (north - here) + u * (across - north)
+        return np.where(u >= v, below, above)
+
+    def mesh(self) -> Mesh:
+        """The ground as triangles, seen from above counter-clockwise."""
+        east, north = np.meshgrid(self.x, self.y)
+        columns, rows = len(self.x), len(self.y)
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        across = corner + columns + 1
+        faces = np.stack([[corner, corner + 1, across], [corner, across, corner + columns]]).transpose(
+            2, 0, 1
+        )
+        return Mesh(np.column_stack([east.ravel(), north.ravel(), self.z.ravel()]), faces.reshape(-1, 3))
+
+
+def level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
+    """A level rectangle.
+
+    Args:
+        bounds: West, south, east and north [4], [m].
+        height: Its height [m].
+
+    Returns:
+        The terrain, of two triangles.
+    """
+    west, south, east, north = np.asarray(bounds, dtype=float)
+    return Terrain(np.array([west, east]), np.array([south, north]), np.full((2, 2), float(height)))
+
+
+def lowered(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:
+    """Move the frame's origin down or up so that the lowest ground is less than a metre above z = 0.
+
+    Args:
+        terrain: The ground.
+        frame: The scene's frame.
+
+    Returns:
+        The same ground, and the frame that it is in now.
+    """
+    lowest = float(np.floor(terrain.z.min()))
+    return replace(terrain, z=terrain.z - lowest), replace(frame, height=frame.height + lowest)
+
+
+def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: float | None = None) -> Terrain:
+    """Read the ground from a height model.
+
+    Args:
+        path: A GeoTIFF, or another raster with a reference system that GDAL reads; heights in metres.
+        frame: The scene's frame.
+        bounds: What the ground has to cover: west, south, east and north [4], [m], in the frame.
+        spacing: Width of the grid's cells [m]; that of the model if none is given.
+
+    Returns:
+        The terrain, interpolated linearly between the middles of the model's cells. Where the model has no height,
+        as on water, the nearest one is taken and counted.
+
+    Raises:
+        InputError: The file does not exist, cannot be read, has no reference system, does not cover the bounds, has
+            no height in them, or the grid would be too fine.
+    """
+    path = Path(path)
+    rasterio = library("rasterio", "scenes")
+    if not path.is_file():
+        raise InputError(f"height model {path}: does not exist; check the path")
+    try:
+        with rasterio.open(path) as model:
+            if model.crs is None:
+                raise InputError(
+                    f"height model {path}: has no reference system; give a GeoTIFF that states it"
+                )
+            crs, affine = model.crs.to_wkt(), model.transform
+            west, south, east, north = np.asarray(bounds, dtype=float)
+            along = np.linspace(0, 1, 21)
+            rim_x, rim_y = np.meshgrid(west + (east - west) * along, south + (north - south) * along)
+            column, row = _pixels(rim_x, rim_y, frame, crs, affine)
+            # One cell more on each side, for the interpolation.
+            first = np.floor([row.min() - 1, column.min() - 1]).astype(int)
+            last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
+            if (
+                column.min() < 0
+                or row.min() < 0
+                or column.max() > model.width - 1
+                or row.max() > model.height - 1
+            ):
+                raise InputError(
+                    f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
+                    f"around {frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2].round(5).tolist()}; "
+                    "give a larger one, or lower the margin"
+                )
+            first, last = np.maximum(first, 0), np.minimum(last, [model.height - 1, model.width - 1])
+            window = rasterio.windows.Window.from_slices((first[0], last[0] + 1), (first[1], last[1] + 1))
+            heights = model.read(1, window=window, masked=True).astype(float)
+    except rasterio.errors.RasterioIOError as error:
+        raise InputError(f"height model {path}: cannot be read ({error}); give a GeoTIFF") from None
+    filled, repairs = _filled(path, heights)
+    if spacing is None:
+        spacing = max(float(np.ptp(rim_x) / np.ptp(column)), 1.0)
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise InputError(f"spacing = {spacing!r}: must be a finite number of metres greater than 0")
+    columns, rows = (max(2, int(np.ceil(length / spacing)) + 1) for length in (east - west, north - south))
+    if columns * rows > MOST_POINTS:
+        raise InputError(
+            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MOST_POINTS}; "
+            "give a wider one"
+        )
+    x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
+    grid_x, grid_y = np.meshgrid(x, y)
+    column, row = _pixels(grid_x, grid_y, frame, crs, affine)
+    axes = tuple(np.arange(low, high + 1, dtype=float) for low, high in zip(first, last, strict=True))
+    at = np.stack(
+        [np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1
+    )
+    return Terrain(x, y, RegularGridInterpolator(axes, filled)(at) - frame.height, repairs)
+
+
+def _pixels(
+    x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, crs: str, affine: object
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Column and row of a raster, whole numbers in the middles of its cells."""
+    east, north = transformer(frame.crs, crs).transform(x + frame.easting, y + frame.northing)
+    inverse = ~affine  # type: ignore[operator]
+    column = inverse.a * east + inverse.b * north + inverse.c
+    row = inverse.d * east + inverse.e * north + inverse.f
+    return column - 0.5, row - 0.5
+
+
+def _filled(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], dict[str, int]]:
+    """Heights without gaps: each has that of the nearest cell with one."""
+    missing = np.ma.getmaskarray(heights) | ~np.isfinite(heights.filled(np.nan))
+    if missing.all():
+        raise InputError(f"height model {path}: has no height within the scene; give one that covers it")
+    if not missing.any():
+        return heights.filled(np.nan), {}
+    nearest = np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
+    return heights.filled(np.nan)[tuple(nearest)], {
+        "heights missing, taken from the nearest": int(missing.sum())
+    }

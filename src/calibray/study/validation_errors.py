@@ -1,0 +1,160 @@
+"""Faults that Pydantic finds, in the words of the file they stand in."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, Final, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from calibray.errors import InputError
+from calibray.support.messages import did_you_mean, shortened
+
+MOST_FAULTS: Final = 20
+"""The number of faults beyond which the others are only counted."""
+
+_UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
+
+_WORDS: Final[Mapping[str, str]] = {
+    "missing": "is required",
+    "greater_than_equal": "must be at least {ge:g}",
+    "greater_than": "must be greater than {gt:g}",
+    "less_than_equal": "must be at most {le:g}",
+    "literal_error": "must be one of {expected}",
+    "union_tag_invalid": "must be one of {expected_tags}",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text in quotes",
+    "string_too_short": "must not be empty",
+    "tuple_type": "must be a list",
+    "too_long": "must have {max_length} entries, has {actual_length}",
+    "model_type": "must be a table",
+    "dict_type": "must be a table",
+    "dataclass_type": "must be a table",
+}
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    content: Mapping[str, Any],
+    source: str,
+    tagged: Sequence[str] = (),
+) -> InputError:
+    """One message for all faults, a line each: file, dotted key, value, bound.
+
+    Args:
+        error: What Pydantic found.
+        model: The model that the content was validated against; its keys are offered for misspelled ones.
+        content: The content.
+        source: Name of the file, for the message.
+        tagged: Tables of which there are several kinds, told apart by their `name`.
+
+    Returns:
+        The error to raise.
+    """
+    lines: dict[str, str] = {}
+    for fault in error.errors():
+        location = fault["loc"]
+        if location[:1] and location[0] in tagged:
+            # The kind stands behind the table's name, which is no key.
+            location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
+        path = _path(location, content, fault["type"] == "missing")
+        key = dotted(path)
+        if fault["type"] in _UNKNOWN:
+            line = f"{key}: unknown key; {did_you_mean(str(path[-1]), _keys(model, path[:-1]))}"
+        elif fault["type"] == "missing":
+            line = f"{key}: {_WORDS['missing']}"
+        else:
+            text = words(fault)
+            # A message about a whole table names the key itself.
+            line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
+        # A value that fits none of several types has one fault per type; the first says enough.
+        lines.setdefault(key, line)
+    told = list(lines.values())[:MOST_FAULTS]
+    if more := len(lines) - len(told):
+        told.append(f"and {more} more like these; correct them first")
+    return InputError("\n".join(f"{source}: {line}" for line in told))
+
+
+def words(fault: Mapping[str, Any]) -> str:
+    """What is wrong with a value, without the value.
+
+    Args:
+        fault: One of the errors that Pydantic lists.
+
+    Returns:
+        The message.
+    """
+    context = fault.get("ctx") or {}
+    if isinstance(cause := context.get("error"), InputError):
+        return str(cause)
+    template = _WORDS.get(fault["type"])
+    return fault["msg"] if template is None else template.format(**context)
+
+
+def dotted(path: Sequence[str | int]) -> str:
+    """A key as it is written in TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = shortened(f'"{part}"' if "." in part else part)
+            text += f".{name}" if text else name
+    return text
+
+
+def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
+    """Pydantic's location without the parts that name a type instead of a key; only a missing key is in no table."""
+    path: list[str | int] = []
+    for index, part in enumerate(location):
+        last = index == len(location) - 1
+        if isinstance(content, Mapping):
+            if part not in content and not (missing and last):
+                break
+            content = content.get(part)
+        elif isinstance(content, list) and isinstance(part, int):
+            content = content[part] if part < len(content) else None
+        else:
+            break
+        path.append(part)
+    return tuple(path)
+
+
+def _shown(path: Sequence[str | int], content: Any) -> str:
+    """The value at a path, if it is short enough to help."""
+    for part in path:
+        content = content[part]
+    return "" if isinstance(content, Mapping) else f" = {shortened(repr(content))}"
+
+
+def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
+    """The keys that a model knows at a path, of whichever kind it may be there."""
+    models = [model]
+    for part in path:
+        models = [
+            table
+            for each in models
+            for table in _tables(
+                _annotations(each).get(str(part)) if _annotations(each) else get_args(each)[1]
+            )
+        ]
+    return list(dict.fromkeys(key for each in models for key in _annotations(each)))
+
+
+def _annotations(model: Any) -> dict[str, Any]:
+    if isinstance(model, type) and issubclass(model, BaseModel):
+        return {name: field.annotation for name, field in model.model_fields.items()}
+    return {field.name: field.type for field in fields(model)} if is_dataclass(model) else {}
+
+
+def _tables(annotation: Any) -> list[Any]:
+    """The tables among the types that a key may have."""
+    options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
+    return [option for option in options if option is not type(None)]

@@ -1,0 +1,1 @@
+"""Support: what knows nothing of radio: caches, output files, messages, progress, interruption."""

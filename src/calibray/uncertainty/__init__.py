@@ -1,0 +1,1 @@
+"""Uncertainty: how far the calibrated values can be trusted."""

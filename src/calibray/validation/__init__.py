@@ -1,0 +1,1 @@
+"""Validation: models judged on links that they were not fitted to."""

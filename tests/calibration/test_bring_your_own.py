@@ -1,0 +1,79 @@
+"""The example town, from a map and a phones' log to the planted walls, by the functions that a study will use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+
+from calibray.fields import path_loss
+from calibray.measurements.averaging import averaged
+from calibray.measurements.geographic import with_scene_positions
+from calibray.measurements.received_power import with_transmitters
+from calibray.scenes.authoring.openstreetmap import read_openstreetmap
+from calibray.scenes.authoring.outlines import led_outside, outlines
+from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.tracing.factory import trace
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "bring_your_own"
+
+
+def test_planted_walls_and_phones_are_found_from_a_map_and_a_log(tmp_path):
+    truth = json.loads((EXAMPLE / "truth.json").read_text())
+    footprints, frame = read_openstreetmap(EXAMPLE / "town.osm")
+    assert len(footprints) == 11
+    assert footprints.guessed() == {"levels": ["way-3", "way-6", "way-11"], "default": ["way-8"]}
+    made = make_scene(footprints, tmp_path, frame)
+
+    log = pd.read_csv(EXAMPLE / "rsrp.csv").dropna(subset=["rsrp_dbm"])
+    placed = with_scene_positions(log, "rx", frame, "longitude", "latitude", 1.5)
+    stop = placed.groupby(["longitude", "latitude"], sort=False).ngroup().to_numpy()
+    links = averaged(placed, "rsrp_dbm", stop, "power", keep=["cell", "device"])
+    # Where fewer than all samples were heard, those heard are the strong ones.
+    links = links[links["count"] == 10]
+    cells = with_scene_positions(
+        pd.read_csv(EXAMPLE / "cells.csv"), "tx", frame, "longitude", "latitude", 6.0
+    )[["cell", "tx_x", "tx_y", "tx_z"]]
+    links = with_transmitters(links, cells, "cell")
+    rx, moved = led_outside(links[["rx_x", "rx_y", "rx_z"]], outlines(made.path))
+    assert len(links) > 100
+    assert moved.max() == 0
+
+    ends = SimpleNamespace(tx=links[["tx_x", "tx_y", "tx_z"]].to_numpy(), rx=rx)
+    antenna = {"pattern": "iso", "polarization": "V"}
+    paths = trace(
+        made.path, ends, frequency=truth["frequency"], max_depth=3, samples=100_000, tx_antenna=antenna,
+        rx_antenna=antenna,
+    )  # fmt: skip
+    group = pd.factorize(links["cell"] + " " + links["device"])
+    design = np.eye(len(group[1]))[group[0]]
+
+    def fitted(permittivity: float) -> tuple[float, np.ndarray]:
+        """RMSE [dB] and offset of every cell and phone [dBm] for walls of a permittivity."""
+        materials = {
+            "walls": replace(
+                paths.materials["walls"], **truth["walls"] | {"relative_permittivity": permittivity}
+            ),
+            "ground": replace(paths.materials["ground"], **truth["ground"]),
+        }
+        power = links["rsrp_dbm"] + path_loss(paths, materials)
+        there = np.isfinite(power)
+        offsets = np.linalg.lstsq(design[there], power[there])[0]
+        return float(np.sqrt(np.mean((power - design @ offsets)[there] ** 2))), offsets
+
+    grid = np.arange(2.0, 14.1, 0.2)
+    errors = [fitted(permittivity)[0] for permittivity in grid]
+    found = grid[int(np.argmin(errors))]
+    planted = truth["walls"]["relative_permittivity"]
+    # The likelihood ratio of Gaussian errors of unknown spread, against the 99 % point of chi squared.
+    doubt = 2 * len(links) * np.log(np.array([fitted(planted)[0], fitted(planted / 2)[0]]) / min(errors))
+    assert doubt[0] < 6.63 < doubt[1]
+    assert abs(found - planted) < 2.0
+    offsets = dict(zip(group[1], fitted(found)[1], strict=True))
+    for name, offset in offsets.items():
+        cell, device = name.split()
+        assert abs(offset - truth["eirp_dbm"][cell] - truth["phone_db"][device]) < 1.0

@@ -1,0 +1,66 @@
+"""Commands that trace nothing work where the ray tracer cannot: its libLLVM is unusable."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import closing
+
+import numpy as np
+import pytest
+from test_cli_run import write_study
+
+import programs
+from calibray.engines import Ledger
+from calibray.engines.ledger.entry import LedgerEntry, key
+from calibray.result import Result
+from calibray.tracing.llvm import PATH_VARIABLE
+
+
+@pytest.fixture
+def calibray(tmp_path):
+    """Run a command in a process of its own, for which a text file stands in for libLLVM."""
+    (tmp_path / "libLLVM.so.19.1").write_text("no library\n")
+    environment = {
+        **os.environ,
+        PATH_VARIABLE: str(tmp_path / "libLLVM.so.19.1"),
+        "CUDA_VISIBLE_DEVICES": "",
+        "CALIBRAY_CACHE": "",
+    }
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "calibray", *map(str, arguments)]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+    return run
+
+
+def test_the_ledger_is_listed(calibray, tmp_path):
+    with closing(Ledger(tmp_path / "ledger.sqlite")) as ledger:
+        ledger.describe("p", "command", ("walls.thickness",))
+        ledger.commit("p", key(np.array([0.25])), LedgerEntry(np.array([80.0, np.inf]), 1.5))
+    listed = calibray("ledger", tmp_path)
+    assert (listed.returncode, listed.stderr) == (0, "")
+    assert "0.25" in listed.stdout
+
+
+def test_an_external_program_is_calibrated(calibray, tmp_path):
+    method = {"name": "auto", "options": {"budget": 18}}
+    write_study(tmp_path, programs.content(tmp_path) | {"method": method})
+    ran = calibray("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", 2)
+    assert ran.returncode == 0, ran.stderr
+    assert list(Result.load(tmp_path / "out").parameters.values()) == pytest.approx(programs.TRUTH, abs=0.5)
+
+
+def test_what_traces_says_why_it_cannot(calibray, tmp_path):
+    """The negative control: the library is unusable indeed, and a command that needs it ends in one message."""
+    content = programs.content(tmp_path)
+    del content["engine"]
+    write_study(tmp_path, content)
+    refused = calibray("trace", tmp_path / "study.toml", "-o", tmp_path / "paths.h5")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    # A busy machine tells first that it is still starting.
+    message = refused.stderr.splitlines()[-1]
+    assert message.startswith("Error: ")
+    assert PATH_VARIABLE in message

@@ -1,0 +1,321 @@
+"""Methods side by side: equal budgets, what is written of them, and going on after a kill."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import planted
+from calibray.calibration import calibrate
+from calibray.cli.app import app
+from calibray.comparison import comparison as module
+from calibray.comparison.comparison import compare
+from calibray.comparison.comparison_files import FILES, FLOOR_DB, figure
+from calibray.comparison.contestant import Contender
+from calibray.comparison.problems import study_arena
+from calibray.comparison.run_log import MethodRun, Runs
+from calibray.comparison.tables import table as shown
+from calibray.errors import InputError
+from calibray.optimizers import GWO, METHODS, SGWOIM, RandomSearch
+from calibray.study import Study
+from calibray.tables import markdown
+from problem_families.arenas import landscape_arena
+
+STREET = partial(landscape_arena, "street")
+BOUNDS = [1.5, 12.0]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A comparison of cheap methods, and the folder that it was run in."""
+    out = tmp_path_factory.mktemp("small")
+    return compare(STREET, ["random", "gwo@60", "sgwo-im", "least-squares"], seeds=3, budget=45, out=out), out
+
+
+@pytest.fixture
+def study(tmp_path):
+    table = planted.campaign(noise_db=1.0)
+    parameters = {name: {"bounds": BOUNDS} for name in planted.TRUTH}
+    parameters["wood.conductivity"] = {"bounds": [1e-3, 0.3], "scale": "log"}
+    plan = planted.study(tmp_path, table, parameters=parameters)
+    lines = ["version = 1", '[scene]\nfile = "sionna:simple_street_canyon"\nfrequency = 3.5e9', "[links]"]
+    lines += ['file = "links.csv"', f"tx = {list(planted.COLUMNS[:3])}", f"rx = {list(planted.COLUMNS[3:])}"]
+    lines += ['value = "path_loss_db"', "[trace]\nmax_depth = 2\nsamples = 20000\nline_of_sight = false"]
+    lines += ["[parameters]", *(f'"{name}" = {{ bounds = {BOUNDS} }}' for name in planted.TRUTH)]
+    lines += ['"wood.conductivity" = { bounds = [1e-3, 0.3], scale = "log" }']
+    plan.path.write_text("\n".join(lines) + "\n")
+    return plan.path
+
+
+def test_the_papers_methods_keep_to_any_budget():
+    arena = STREET()
+    for budget in range(24, 700):
+        for name, full in (("gwo", 30), ("sgwo-im", 5)):
+            used = Contender.parse(name, budget).optimizer(arena, 0).budget
+            assert budget - full < used <= budget
+    assert SGWOIM.within(225) == {"population": 30, "elites": 5, "iterations": 20}
+    assert (
+        Contender.parse("sgwo-im", 225).optimizer(arena, 0).budget == SGWOIM(arena.lower, arena.upper).budget
+    )
+    assert GWO.within(600) == {"population": 30, "iterations": 20}
+
+
+@pytest.mark.parametrize("name", sorted(set(METHODS) - {"least-squares"}))
+def test_every_method_takes_a_budget(name):
+    optimizer = Contender.parse(name, 50).optimizer(STREET(), 0)
+    assert 45 <= optimizer.budget <= 50
+
+
+def test_a_run_is_what_the_optimizer_does_when_driven_by_hand(small):
+    land, optimizer = STREET(), RandomSearch([1.5] * 3, [15.0] * 3, seed=2, budget=45)
+    y = []
+    while not optimizer.done:
+        x = optimizer.ask()
+        told = land.evaluate(x, False)
+        optimizer.tell(x, told.value, told.residuals)
+        y += told.value.tolist()
+    best = np.minimum.accumulate(y)
+    run = small[0].runs["random"][2]
+    assert [run.at(call) for call in range(1, 46)] == best.tolist()
+    assert run.at(0) == np.inf
+    assert run.first(best[20]) == 1 + np.flatnonzero(best <= best[20])[0]
+    assert run.first(0.0) == np.inf
+
+
+def test_excess_is_measured_from_the_global_optimum(small):
+    finished = small[0]
+    assert finished.optimum == pytest.approx(2.97426794, abs=1e-7)
+    assert finished.found_by == "many-start least squares"
+    assert (finished.excess("random", 45) > 0.01).all()
+    assert np.abs(finished.excess("least-squares", 10**6)).max() < 1e-8
+
+
+def test_the_table_says_what_the_runs_did(small):
+    finished = small[0]
+    table = finished.table().set_index("method")
+    assert list(table.index) == ["random", "gwo@60", "sgwo-im", "least-squares"]
+    assert list(table["uses"]) == ["value"] * 3 + ["value+residuals+jacobian"]
+    assert list(table["rt_calls"][:3]) == [45, 60, 45]
+    end = finished.excess("sgwo-im", 45)
+    row = table.loc["sgwo-im"]
+    assert row["median_excess_db_end"] == pytest.approx(np.median(end))
+    assert row["q25_excess_db_end"] == pytest.approx(np.quantile(end, 0.25))
+    assert row["worst_excess_db_end"] == end.max()
+    assert row["median_excess_db_30"] == pytest.approx(np.median(finished.excess("sgwo-im", 30)))
+    assert np.isnan(row["median_excess_db_60"])  # beyond its budget
+    assert np.isfinite(table.loc["gwo@60", "median_excess_db_60"])
+    assert row["reached_0.05_db"] == (end <= 0.05).sum()
+    assert (table["failed"] == 0).all()
+    assert table.loc["least-squares", "reached_0.01_db"] == 3
+    calls = table.loc["least-squares", "calls_to_0.01_db"]
+    assert np.median(finished.calls_to("least-squares", 0.01)) == calls
+
+
+def test_what_half_of_the_runs_never_reached_has_no_median():
+    runs = tuple(
+        MethodRun("random", 30, seed, 30, (1,), (value,), 0.1)
+        for seed, value in enumerate([1.0, 1.0, 3.0, 3.0])
+    )
+    finished = module.Comparison(
+        "x", (Contender.parse("random", 30),), {"random": runs}, 1.0, "random, seed 0"
+    )
+    row = finished.table().iloc[0]
+    assert row["reached_0.05_db"] == 2
+    assert np.isnan(row["calls_to_0.05_db"])
+    cells = shown(finished)
+    assert cells.rows[0][cells.headings.index("calls to 0.05 dB")] == "- (2/4)"
+
+
+def test_finished_runs_are_not_run_again(small, monkeypatch):
+    finished, out = small
+    text = (out / "runs.jsonl").read_text()
+
+    def refuse(*_):
+        raise AssertionError("ran again")
+
+    monkeypatch.setattr(module, "run_contender", refuse)
+    monkeypatch.setattr(module, "_optimum", refuse)
+    again = compare(STREET, ["random", "sgwo-im"], seeds=2, budget=45, out=out)
+    assert again.runs == {name: finished.runs[name][:2] for name in ("random", "sgwo-im")}
+    assert (out / "runs.jsonl").read_text() == text
+
+
+def test_a_killed_comparison_goes_on_after_its_last_whole_line(small, tmp_path):
+    lines = (small[1] / "runs.jsonl").read_text().splitlines(keepends=True)
+    torn = "".join(lines[:5]) + lines[5][: len(lines[5]) // 2]
+    (tmp_path / "runs.jsonl").write_text(torn)
+    steps = []
+    methods = ["random", "gwo@60", "sgwo-im", "least-squares"]
+    again = compare(
+        STREET, methods, seeds=3, budget=45, out=tmp_path, progress=lambda *step: steps.append(step)
+    )
+    assert steps == [("comparing", done, 12) for done in range(6, 13)]
+    assert pd.DataFrame(again.history()).equals(small[0].history())
+
+
+def test_runs_of_another_problem_do_not_count(small):
+    path = small[1] / "runs.jsonl"
+    problem = json.loads(path.read_text().splitlines()[0])["problem"]
+    assert Runs(path, problem).find("random", 45, 0) is not None
+    assert Runs(path, problem + "x").find("random", 45, 0) is None
+    assert landscape_arena("hall").fingerprint != STREET().fingerprint
+
+
+def test_several_workers_find_the_same(small, tmp_path):
+    methods = ["random", "gwo@60"]
+    spread = compare(STREET, methods, seeds=2, budget=45, out=tmp_path, workers=2)
+    mine = {name: small[0].runs[name][:2] for name in methods}
+    assert {name: [run.best for run in runs] for name, runs in spread.runs.items()} == {
+        name: [run.best for run in runs] for name, runs in mine.items()
+    }
+
+
+def test_a_run_that_fails_is_kept_and_stays_where_it_was(tmp_path, monkeypatch):
+    class Broken:
+        uses, schedule, takes_starts = RandomSearch.uses, RandomSearch.schedule, False
+        within, needs_derivatives = RandomSearch.within, RandomSearch.needs_derivatives
+
+        def __init__(self, lower, upper, *, seed, budget):
+            if seed == 1:
+                raise ZeroDivisionError("at once")
+            self._inner = RandomSearch(lower, upper, seed=seed, budget=budget)
+            self._left = 1
+
+        done = property(lambda self: self._inner.done)
+
+        def ask(self):
+            return self._inner.ask()[:10]
+
+        def tell(self, *told, **more):
+            if not self._left:
+                raise RuntimeError("singular")
+            self._left -= 1
+            self._inner.tell(*told, **more)
+
+    monkeypatch.setitem(METHODS, "broken", Broken)
+    finished = compare(STREET, ["broken", "random"], seeds=2, budget=30, out=tmp_path)
+    late, early = finished.runs["broken"]
+    assert finished.failures() == [
+        ("broken", 0, "RuntimeError: singular"),
+        ("broken", 1, "ZeroDivisionError: at once"),
+    ]
+    assert late.evaluations == 10
+    assert late.at(30) == late.at(10) == min(late.best)
+    assert early.at(30) == np.inf
+    row = finished.table().iloc[0]
+    assert (row["failed"], row["worst_excess_db_end"]) == (2, np.inf)
+    assert figure(finished).axes
+    assert "none" in shown(finished).rows[0]
+
+
+def test_a_lower_minimum_known_beforehand_is_the_optimum(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_optimum", lambda arena: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
+    finished = compare(STREET, ["random"], seeds=1, budget=30, out=tmp_path)
+    assert (finished.optimum, finished.found_by) == (2.97426794, "earlier searches")
+
+
+def test_a_run_below_the_optimum_becomes_the_optimum(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_optimum", lambda arena: MethodRun("optimum", 0, 0, 1, (1,), (99.0,), 0.0))
+    finished = compare(
+        lambda: replace(STREET(), minimum=np.inf), ["random"], seeds=2, budget=30, out=tmp_path
+    )
+    lowest = [run.at(30) for run in finished.runs["random"]]
+    assert finished.optimum == min(lowest)
+    assert finished.found_by == f"random, seed {int(np.argmin(lowest))}"
+    assert finished.excess("random", 30).min() == 0.0
+
+
+def test_the_figure_shows_medians_and_quartiles_within_each_budget(small):
+    (axes,) = figure(small[0]).axes
+    by_name = {line.get_label(): line for line in axes.lines}
+    assert list(by_name) == ["random", "GWO, 60 calls", "SGWO-IM", "least-squares"]
+    assert axes.get_yscale() == "log"
+    middle = by_name["SGWO-IM"]
+    assert middle.get_xdata()[-1] == 45
+    assert middle.get_ydata()[29] == pytest.approx(np.median(small[0].excess("sgwo-im", 30)))
+    assert by_name["least-squares"].get_ydata().min() >= FLOOR_DB
+    assert len(axes.collections) == 4
+
+
+def test_markdown_has_a_row_for_each_method(small):
+    lines = markdown.render(shown(small[0])).splitlines()
+    assert len(lines) == 2 + 4
+    assert len({line.count("|") for line in lines}) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"methods": ["gwoo"]}, "method 'gwoo': there is no such method; did you mean 'gwo'"),
+        (
+            {"methods": ["gwo@x"]},
+            "'gwo@x': a budget of x RT calls; it must be a whole number of 24 to 1,000,000",
+        ),
+        ({"methods": ["gwo@-60"]}, "a budget of -60"),
+        ({"methods": ["gwo"], "budget": 10}, "a budget of 10 RT calls"),
+        ({"methods": []}, "none is named"),
+        ({"methods": ["gwo"], "seeds": 0}, "seeds = 0; it must be 1 to 10,000"),
+        ({"methods": ["gwo"], "workers": 0}, "workers = 0"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(arguments, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        compare(STREET, **arguments, out=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("method", "calls"), [("sgwo-im", 225), ("vector-surrogate", 24)])
+def test_a_study_is_searched_as_calibrate_searches_it(method, calls, study):
+    options = f"{{ budget = {calls} }}" if method == "vector-surrogate" else "{}"
+    study.write_text(f'{study.read_text()}[method]\nname = "{method}"\nseed = 1\noptions = {options}\n')
+    result = calibrate(Study.load(study))
+    run = module.run_contender(study_arena(study), Contender.parse(method, calls), 1)
+    assert run.failure == ""
+    assert run.at(calls) == result.rmse_db
+    assert [run.at(call) for call in range(1, calls + 1)] == result.history["best_db"].tolist()
+
+
+def test_the_derivatives_of_a_study_are_those_of_its_search_space(study):
+    arena = study_arena(study)
+    x = 0.4 * arena.lower + 0.6 * arena.upper
+    jacobian = arena.evaluate(x[None], True).jacobian
+    for k in range(len(x)):
+        step = 1e-5 * np.eye(len(x))[k]
+        (up, down) = arena.evaluate(np.array([x + step, x - step]), False)[1]
+        assert jacobian[0, :, k] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-6)
+
+
+def test_what_was_measured_is_part_of_the_problem(study, tmp_path):
+    first = study_arena(study).fingerprint
+    assert study_arena(study).fingerprint == first
+    links = study.with_name("links.csv")
+    table = pd.read_csv(links)
+    table.loc[0, "path_loss_db"] += 0.5
+    table.to_csv(links, index=False)
+    assert study_arena(study).fingerprint != first
+
+
+def test_the_command_writes_tables_and_figure(study, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["compare", str(study), "--out", str(out), "--seeds", "2", "--budget", "24"]
+    done = CliRunner().invoke(app, [*arguments, "--methods", "random, sgwo-im,least-squares"])
+    assert done.exit_code == 0, done.output
+    assert "SGWO-IM" in done.stdout
+    assert "found by" in done.stdout
+    table, runs = (pd.read_csv(out / name) for name in FILES[:2])
+    assert list(table["method"]) == ["random", "sgwo-im", "least-squares"]
+    assert set(runs["seed"]) == {0, 1}
+    assert runs.groupby(["method", "seed"])["best_db"].apply(lambda best: best.is_monotonic_decreasing).all()
+    assert (out / FILES[2]).read_bytes()[:4] == b"\x89PNG"
+    refused = CliRunner().invoke(app, [*arguments, "--methods", "nothing"])
+    assert refused.exit_code == 2
+
+
+def test_an_external_program_is_not_compared_on(study):
+    study.write_text(study.read_text() + '[engine]\nname = "command"\ncommand = ["true"]\n')
+    with pytest.raises(InputError, match="engine 'command' is too dear"):
+        study_arena(study)

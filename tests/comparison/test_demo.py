@@ -1,0 +1,118 @@
+"""The paper's experiment in the embedded district: RT calls, the global optimum, files and figures."""
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from scipy.optimize import minimize
+from typer.testing import CliRunner
+
+from calibray import engines
+from calibray.cli.app import app
+from calibray.comparison import experiment
+from calibray.comparison.demo_files import FIGURES, write
+from calibray.comparison.experiment import MAPPING, METHODS, run_demo
+from calibray.comparison.paper_tables import tables, trust
+from calibray.fitting.problem import Problem
+from calibray.scenarios import demo_study_path
+from calibray.study import Study
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "MAPPED", 1)  # each is a trace
+        finished = run_demo()
+    write(finished, out)
+    return finished, out
+
+
+@pytest.fixture(scope="module")
+def problem():
+    setup = Study.load(demo_study_path()).opened()
+    return Problem.of(setup, engines.make(setup, "replay"))
+
+
+def test_rt_calls_are_the_papers(demo):
+    finished, _ = demo
+    assert {method: finished.results[method].rt_calls for method in METHODS} == {"gwo": 600, "sgwo-im": 225}
+    assert [len(finished.results[method].history) for method in METHODS] == [600, 225]
+
+
+def test_auto_reaches_the_global_optimum_of_an_exhaustive_scan(demo, problem):
+    engine = problem.engine
+    axes = [
+        np.linspace(low, high, 24)
+        for low, high in zip(engine.parameters.lower, engine.parameters.upper, strict=True)
+    ]
+    grid = np.array(list(product(*axes)))
+    rmse = problem.objective.rmse(engine.path_loss(grid))
+    best = demo[0].results["auto"].rmse_db
+
+    def objective(point):
+        return float(problem.objective.rmse(engine.path_loss(point[None]))[0])
+
+    bounds = list(zip(engine.parameters.lower, engine.parameters.upper, strict=True))
+    polished = [
+        minimize(objective, grid[k], bounds=bounds, method="Nelder-Mead").fun for k in np.argsort(rmse)[:8]
+    ]
+    assert best <= min(polished) + 1e-3
+    assert min(polished) <= best + 1e-2  # the scan finds the same valley
+    assert np.median(rmse) > best + 0.5  # and a random guess does not
+
+
+def test_methods_of_the_paper_improve_on_the_start_and_not_on_the_optimum(demo):
+    finished, _ = demo
+    for method in METHODS:
+        result = finished.results[method]
+        assert finished.optimum_db - 1e-9 <= result.rmse_db < result.initial_rmse_db - 1
+
+
+def test_space_mapping_runs_on_the_ray_tracer_itself(demo):
+    finished, _ = demo
+    mapped = finished.results[MAPPING]
+    assert mapped.rt_calls == 1
+    assert mapped.cheap_calls > 100
+    assert finished.optimum_db - 1e-3 < mapped.rmse_db < mapped.initial_rmse_db
+
+
+def test_soil_is_called_not_identifiable_and_concrete_is(demo):
+    intervals = demo[0].results["auto"].intervals
+    assert intervals["soil.relative_permittivity"].verdict == "not identifiable"
+    assert "over its whole range" in intervals["soil.relative_permittivity"].reason
+    concrete = intervals["concrete.relative_permittivity"]
+    assert concrete.verdict in ("identified", "weakly identified")
+    assert concrete.upper - concrete.lower < 0.5 * (concrete.upper + concrete.lower)
+
+
+def test_every_piece_of_an_interval_is_shown(demo):
+    """What lies between two ranges is no part of either."""
+    found = demo[0].results["auto"].intervals["glass.relative_permittivity"]
+    assert len(found.pieces) == 2
+    (row,) = [row for row in trust(demo[0]).rows if row[0].startswith("glass")]
+    for low, high in found.pieces:
+        assert f"{low:.4g} to {high:.4g}" in row[2]
+    assert "apart from them lies" in found.reason
+
+
+def test_files_exist_and_open(demo):
+    finished, out = demo
+    for name in FIGURES:
+        assert imread(out / name).shape[0] > 400
+    content = json.loads((out / "result.json").read_text())
+    assert content["methods"]["gwo"]["rt_calls"] == 600
+    assert content["methods"]["auto"]["excess_rmse_db"] == 0
+    for method in finished.results:
+        assert (out / method / "result-scene.xml").is_file()
+    assert [len(table.rows) for table in tables(finished)] == [4, 3, 4, 3]
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("calibray.comparison.experiment.run_demo", lambda *_: pytest.fail("it was run"))
+    outcome = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "file" / "demo")])
+    assert outcome.exit_code == 2
+    assert "output folder" in outcome.stderr

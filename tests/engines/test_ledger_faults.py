@@ -1,0 +1,436 @@
+"""A ledger that is damaged, full, locked, taken away, or shared: no answer is lost, made up, or paid for twice."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import shutil
+import sqlite3
+import threading
+import time
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import planted
+import programs
+from calibray import engines
+from calibray.calibration import calibrate
+from calibray.engines import Answer, Ledger, Recorded
+from calibray.engines.ledger import claims, rescue
+from calibray.engines.ledger import database as schema
+from calibray.engines.ledger.entry import LedgerEntry, key
+from calibray.engines.ledger.owner import Owner
+from calibray.errors import EngineError, InputError
+from calibray.parameters import Parameter, Parameters
+from calibray.study import Study
+
+CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [7.0, 7.0, 7.0]])
+LOSSES = [[72.0, np.inf], [72.5, np.inf], [81.0, np.inf]]
+PARAMETERS = Parameters(tuple(Parameter(name, 1.0, 12.0, 5.0) for name in planted.TRUTH))
+FIRST_VERSION = """
+CREATE TABLE problems (problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE answers (
+    id INTEGER PRIMARY KEY, problem TEXT NOT NULL REFERENCES problems, candidate BLOB NOT NULL,
+    path_loss_db BLOB NOT NULL, seconds REAL NOT NULL, failure TEXT NOT NULL, time TEXT NOT NULL,
+    UNIQUE (problem, candidate));
+PRAGMA user_version = 1;
+PRAGMA journal_mode = WAL;
+"""
+
+
+class Summing:
+    """An engine that answers 60 dB and the sum of a candidate on one link, none on the other."""
+
+    def __init__(self, between=lambda index: None) -> None:
+        self.parameters, self.materials, self.num_links = PARAMETERS, {}, 2
+        self.asked, self.between = [], between
+
+    @property
+    def calls(self) -> int:
+        return len(self.asked)
+
+    def answers(self, candidates, stop=None):
+        for index, candidate in enumerate(candidates):
+            if stop is not None and stop.is_set():
+                return
+            self.asked.append(tuple(candidate))
+            self.between(index)
+            yield Answer(index, np.array([60 + candidate.sum(), np.inf]), 0.5)
+
+    def path_loss(self, candidates):
+        raise NotImplementedError
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path, monkeypatch):
+    """The user's folder for state."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return tmp_path / "state" / "calibray"
+
+
+@pytest.fixture
+def path(tmp_path):
+    """Where a ledger lies that holds two answers."""
+    file = tmp_path / "out" / "ledger.sqlite"
+    with closing(Ledger(file)) as ledger:
+        Recorded(Summing(), ledger, "p", "command").path_loss(CANDIDATES[:2])
+    return file
+
+
+def resumed(path, candidates=CANDIDATES) -> int:
+    """The calls that a new run needs for all candidates, having found that it answers rightly."""
+    with closing(Ledger(path)) as ledger:
+        engine = Recorded(Summing(), ledger, "p", "command")
+        assert engine.path_loss(candidates).tolist() == LOSSES[: len(candidates)]
+        return engine.calls
+
+
+def doubles(*values: float) -> bytes:
+    return np.array(values, "<f8").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("path_loss_db", doubles(70)), "8 bytes of path loss for 2 links"),
+        (("path_loss_db", b"1234567"), "7 bytes of path loss"),
+        (("path_loss_db", b""), "0 bytes of path loss"),
+        (("path_loss_db", doubles(72, 71)), "another checksum"),
+        (("path_loss_db", "72"), "a value of another type"),
+        (("failure", "it failed"), "another checksum"),
+        (("failure", 7.0), "another checksum"),
+        (("seconds", 0.25), "another checksum"),
+        (("digest", b"0" * 32), "another checksum"),
+        (("digest", "text"), "another checksum"),
+    ],
+)
+def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, change, message):
+    with closing(sqlite3.connect(path)) as file, file:
+        file.execute(f"UPDATE answers SET {change[0]} = ? WHERE id = 2", (change[1],))
+    assert resumed(path) == 2  # the damaged one, and one that was never run
+    (record,) = caplog.records
+    assert record.message.startswith(f"{path}: call 2 is damaged ({message}")
+    assert record.message.endswith("; dropped, and run again")
+    assert resumed(path) == 0
+
+
+@pytest.fixture
+def first_version(path):
+    """The ledger as the first version wrote it, without digests and claims."""
+    with closing(sqlite3.connect(path)) as file:
+        problems = file.execute("SELECT * FROM problems").fetchall()
+        answers = [row[:-1] for row in file.execute("SELECT * FROM answers").fetchall()]
+    path.unlink()
+    with closing(sqlite3.connect(path)) as file, file:
+        file.executescript(FIRST_VERSION)
+        file.executemany("INSERT INTO problems VALUES (?, ?, ?)", problems)
+        file.executemany("INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?, ?)", answers)
+    return path
+
+
+def test_a_ledger_of_the_first_version_answers_and_takes_more(first_version):
+    assert resumed(first_version) == 1
+    assert resumed(first_version) == 0
+    with closing(Ledger(first_version)) as ledger:
+        assert ledger.table(path_loss=True).link_1.tolist() == [72.0, 72.5, 81.0]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((70.0,), "8 bytes of path loss for 2 links"),
+        ((-500.0, 70.0), "path loss -500 dB"),
+        ((np.nan, 70.0), "path loss nan dB"),
+        ((70.0, -np.inf), "path loss -inf dB"),
+        ((70.0, 1e300), r"path loss 1e+300 dB"),
+    ],
+)
+def test_entries_without_a_checksum_are_held_to_length_and_range(first_version, caplog, values, message):
+    with closing(sqlite3.connect(first_version)) as file, file:
+        file.execute("UPDATE answers SET path_loss_db = ? WHERE id = 1", (doubles(*values),))
+    assert resumed(first_version) == 2
+    assert f"call 1 is damaged ({message}); dropped, and run again" in caplog.text
+
+
+def test_damaged_entries_are_left_out_of_the_table(path, caplog):
+    with closing(sqlite3.connect(path)) as file, file:
+        file.execute("UPDATE answers SET candidate = ? WHERE id = 1", (b"short",))
+    with closing(Ledger(path)) as ledger:
+        assert len(ledger.table(path_loss=True)) == 1
+    assert "call 1 is damaged" in caplog.text
+    assert resumed(path) == 2
+
+
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        ("CREATE TABLE bookmarks (url TEXT)", "database of something else, with a table 'bookmarks'"),
+        (
+            "CREATE TABLE answers (id, text)",
+            "its table 'answers' has the columns id, text, digest, must have",
+        ),
+        ("CREATE TABLE claims (who)", "its table 'claims' has the columns who, must have"),
+        ("PRAGMA user_version = 3", "ledger of version 3, this Calibray writes 2"),
+    ],
+)
+def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message):
+    file = tmp_path / "file"
+    with closing(sqlite3.connect(file)) as database:
+        database.executescript(script)
+    before = file.read_bytes()
+    with pytest.raises(InputError, match=message):
+        Ledger(file)
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("PRAGMA journal_mode = DELETE")
+    assert len(file.read_bytes()) == len(before)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_malformed_pages_are_refused_with_place_and_remedy(path, seed):
+    with closing(Ledger(path)) as ledger:
+        for number in range(60):
+            ledger.commit("p", key(np.full(3, float(number))), LedgerEntry(np.full(200, 70.0), 0.0))
+        ledger._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    content = bytearray(path.read_bytes())
+    rng = np.random.default_rng(seed)
+    for page in rng.integers(1, len(content) // 4096, 3):
+        content[page * 4096 : page * 4096 + 64] = rng.bytes(64)
+    path.write_bytes(content)
+    with pytest.raises(
+        InputError, match=r"ledger.sqlite: cannot be used.*(malformed|disk image).*move it away"
+    ):
+        Ledger(path)
+
+
+def test_a_lock_that_is_held_for_long_costs_nothing(path, monkeypatch):
+    monkeypatch.setattr(schema, "PATIENCE", 0.2)
+    with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path, isolation_level=None)) as other:
+        engine = Recorded(Summing(), ledger, "p", "command")
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(
+            EngineError, match=r"ledger.sqlite: the ledger cannot be used \(database is locked; another"
+        ):
+            engine.path_loss(CANDIDATES)
+        assert engine.calls == 0
+        with pytest.raises(InputError, match=r"has locked it for 0.2 s: end that"):
+            Ledger(path)
+        other.execute("ROLLBACK")
+        assert engine.path_loss(CANDIDATES).tolist() == LOSSES
+        assert engine.calls == 1
+
+
+def fill(ledger: Ledger) -> None:
+    """Let a ledger's disk be full."""
+    run = ledger._connection.execute
+    run("PRAGMA max_page_count = 1")  # as few as there are
+    for size in (1000, 100, 10, 1):
+        with contextlib.suppress(sqlite3.OperationalError):
+            for number in range(200):
+                run(
+                    "INSERT INTO answers VALUES (NULL, 'r', ?, ?, 0.0, 'x', '', NULL)",
+                    (f"{size} {number}", b"x" * size),
+                )
+
+
+@pytest.mark.parametrize("fault", ["lock", "full"])
+def test_an_answer_that_was_paid_for_is_kept_beside_the_ledger_and_taken_up(path, monkeypatch, caplog, fault):
+    """The ledger fails after the first of three calls; what is not in it is in a file, and not run again."""
+    caplog.set_level(logging.WARNING)
+    monkeypatch.setattr(schema, "PATIENCE", 0.1)
+    with closing(sqlite3.connect(path, isolation_level=None)) as other, closing(Ledger(path)) as ledger:
+        faults = {"lock": lambda: other.execute("BEGIN IMMEDIATE"), "full": lambda: fill(ledger)}
+        engine = Recorded(
+            Summing(lambda index: faults[fault]() if index == 1 else None), ledger, "r", "command"
+        )
+        with pytest.raises(
+            EngineError, match=r"\. 1 answer is kept in .*ledger-rescue-\w+.jsonl, and taken up when"
+        ):
+            engine.path_loss(CANDIDATES)
+        assert engine.calls == 2
+        if fault == "lock":
+            other.execute("ROLLBACK")
+    assert len(list(path.parent.glob("ledger-rescue-*.jsonl"))) == 1
+    with closing(Ledger(path)) as ledger:
+        again = Recorded(Summing(), ledger, "r", "command")
+        assert again.path_loss(CANDIDATES).tolist() == LOSSES
+    assert again.calls == 1
+    assert "1 answers taken up from" in caplog.text
+    assert list(path.parent.glob("ledger-rescue-*")) == []
+
+
+def test_answers_that_arrive_while_the_ledger_fails_are_kept_too(tmp_path, monkeypatch):
+    """Three programs at once; the ledger is locked when the first answers, and the others have answered by then."""
+    monkeypatch.setattr(schema, "PATIENCE", 1.5)
+    out = tmp_path / "out"
+    with engines.open_executor(workers=3) as executor:
+        study = programs.study(tmp_path, "import time; time.sleep(0.5)")
+        engine = engines.make(study, ledger=out / "ledger.sqlite", executor=executor)
+        with closing(sqlite3.connect(out / "ledger.sqlite", isolation_level=None)) as other:
+            original = Ledger.commit
+
+            def commit(ledger, *arguments):
+                if not other.in_transaction:
+                    other.execute("BEGIN IMMEDIATE")
+                return original(ledger, *arguments)
+
+            monkeypatch.setattr(Ledger, "commit", commit)
+            with pytest.raises(EngineError, match=r"locked.* 3 answers are kept in"):
+                engine.path_loss(CANDIDATES)
+    monkeypatch.undo()
+    engine = engines.make(study, ledger=out / "ledger.sqlite")
+    assert engine.path_loss(CANDIDATES) == pytest.approx(programs.expected(CANDIDATES, planted.links()))
+    assert (engine.calls, len(programs.calls(tmp_path))) == (0, 3)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_folder_that_is_removed_in_mid_run_is_noticed_and_nothing_is_lost(path, state, again):
+    """Removed after the third of three calls, and made again by somebody else or not."""
+    before = path.parent / "ledger.sqlite"
+
+    def remove(index: int) -> None:
+        shutil.rmtree(before.parent)
+        if again:
+            before.parent.mkdir()
+
+    with closing(Ledger(path)) as ledger:
+        engine = Recorded(Summing(remove), ledger, "p", "command")
+        with pytest.raises(
+            EngineError, match=r"was removed or replaced while the run went on; 3 answers are kept in"
+        ):
+            engine.path_loss(CANDIDATES)
+        calls = engine.calls
+        with pytest.raises(EngineError, match="was removed or replaced"):
+            engine.path_loss(CANDIDATES + 1)
+        assert engine.calls == calls == 1  # nothing is paid for after that
+    assert bool(list(state.glob("*"))) == (not again)
+    assert resumed(path) == 0
+    assert list(path.parent.glob("*rescue*")) == []
+    assert not state.exists() or list(state.iterdir()) == []
+
+
+def test_rescued_lines_that_were_changed_are_told_and_kept_aside(path, caplog):
+    entry = LedgerEntry(np.array([81.0, np.inf]), 0.5)
+    good = rescue.Rescued.of("p", "command", PARAMETERS.names, key(CANDIDATES[2]), entry).line()
+    bad = good.replace("81.0", "82.0")
+    for lines in (bad, "[" * 100_000, "{}", "null", good):
+        (path.parent / f"ledger-rescue-{len(lines)}-{lines[:1] == '{'}.jsonl").write_text(lines)
+    (path.parent / "ledger-rescue-bad.jsonl").write_text(bad)
+    assert resumed(path) == 0
+    assert caplog.text.count("1 of 1 lines are damaged") == 4
+    assert len(list(path.parent.glob("*.jsonl.damaged"))) == 4
+    assert list(path.parent.glob("*.jsonl")) == []
+
+
+def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):
+    before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    monkeypatch.setattr("calibray.engines.ledger.ledger.os.access", lambda *_: False)
+    assert resumed(path, CANDIDATES[:2]) == 0
+    with closing(Ledger(path)) as ledger:
+        assert len(ledger.table()) == 2
+        engine = Recorded(Summing(), ledger, "p", "command")
+        with pytest.raises(
+            InputError, match="cannot be written, and 1 candidates are not in it; make it and its"
+        ):
+            engine.path_loss(CANDIDATES)
+        assert engine.calls == 0
+        with pytest.raises(InputError, match="cannot be written"):
+            ledger.forget_failures()
+    assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
+
+
+def test_two_runs_at_once_pay_for_each_candidate_once(path):
+    """Two threads with an engine each ask for forty candidates in different orders, some of them both at once."""
+    rng = np.random.default_rng(0)
+    candidates = rng.uniform(1.0, 12.0, (40, 3))
+    asked, losses = [], {}
+
+    def run(name: str, order: np.ndarray) -> None:
+        with closing(Ledger(path)) as ledger:
+            engine = Recorded(Summing(lambda _: time.sleep(0.002)), ledger, "p", "command")
+            found = [engine.path_loss(candidates[order[k : k + 8]]) for k in range(0, 40, 8)]
+            asked.extend(engine._engine.asked)
+            losses[name] = np.concatenate(found)[np.argsort(order)]
+            assert engine.calls + engine.hits == 40
+
+    threads = [threading.Thread(target=run, args=(str(k), rng.permutation(40))) for k in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert sorted(asked) == sorted(map(tuple, candidates))
+    assert np.array_equal(losses["0"], losses["1"])
+    assert np.array_equal(losses["0"], losses["2"])
+
+
+HERE = Owner.here()
+
+
+@pytest.mark.parametrize(
+    ("owner", "expires", "waits"),
+    [
+        (HERE, 100.0, True),
+        (HERE, -1.0, False),  # it gave no sign of life
+        (HERE, 1e9, False),  # no clock of ours wrote that
+        (replace(HERE, started="1"), 100.0, False),  # its number belongs to another process now
+        (replace(HERE, pid=2**22 + 1), 100.0, False),
+        (replace(HERE, boot="earlier"), 100.0, False),
+        (replace(HERE, namespace="a container"), 100.0, True),
+        (replace(HERE, host="elsewhere", pid=2**22 + 1), 100.0, True),
+        (None, 100.0, False),
+    ],
+)
+def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, owner, expires, waits):
+    monkeypatch.setattr(claims, "_at_work", {"another run"})
+    text = "no owner" if owner is None else json.dumps(owner.record())
+    with closing(Ledger(path)) as ledger:
+        with closing(sqlite3.connect(path)) as file, file:
+            row = ("p", key(CANDIDATES[2]), "another run", text, time.time() + expires)
+            file.execute("INSERT INTO claims VALUES (?, ?, ?, ?, ?)", row)
+        claimed = ledger.claim("p", [key(each) for each in CANDIDATES], 2)
+    assert claimed == ([] if waits else [key(CANDIDATES[2])])
+
+
+def test_a_sign_of_life_renews_a_claim_and_the_end_of_work_gives_it_up(path, monkeypatch):
+    monkeypatch.setattr(claims, "BEAT", 0.01)
+    with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path)) as file:
+        ledger.claim("p", [key(CANDIDATES[2])], 2)
+        (before,) = file.execute("SELECT expires FROM claims").fetchone()
+        with ledger.working():
+            time.sleep(0.3)
+            (after,) = file.execute("SELECT expires FROM claims").fetchone()
+            assert after > before
+        assert file.execute("SELECT * FROM claims").fetchall() == []
+
+
+def test_an_interrupted_run_gives_up_its_claims(path):
+    def interrupt(index: int) -> None:
+        raise KeyboardInterrupt
+
+    with closing(Ledger(path)) as ledger:
+        engine = Recorded(Summing(interrupt), ledger, "p", "command")
+        with pytest.raises(KeyboardInterrupt):
+            engine.path_loss(CANDIDATES)
+        assert resumed(path) == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("random", {"budgett": 6}, "budgett"),
+        ("random", {"budget": -1}, "budget"),
+        ("sgwo-im", {"population": "many"}, "population"),
+        ("least-squares", {}, "needs derivatives"),
+        ("no-such", {}, "no such method"),
+    ],
+)
+def test_nothing_is_paid_or_written_before_the_method_was_checked(tmp_path, method, options, message):
+    content = programs.content(tmp_path) | {"method": {"name": method, "options": options}}
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=message):
+        calibrate(Study.from_content(content, tmp_path / "study.toml"), out=out)
+    assert programs.calls(tmp_path) == []
+    assert not out.exists()

@@ -1,0 +1,169 @@
+"""The replay of a study's own scene as the cheap model of an engine that can only be called."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import planted
+import programs
+from calibray.calibration import calibrate
+from calibray.engines import Replay
+from calibray.errors import InputError
+from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, aid, with_constants
+from calibray.fitting.methods import choose
+from calibray.fitting.nuisance import Nuisance
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import rounds
+from calibray.materials import Material
+from calibray.optimizers import LeastSquares
+from calibray.parameters import Parameter, Parameters
+from calibray.paths.program import take
+from calibray.result.tables import costs
+from calibray.study import Setup, Study
+from calibray.tables.text import render
+
+PRIOR = {"prior": {"value": 4.0, "spread": 0.3}}
+
+
+class Calls:
+    """The planted paths as an engine that can only be called."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.parameters, self.materials = planted.engine().parameters, planted.engine().materials
+
+    def path_loss(self, candidates: np.ndarray) -> np.ndarray:
+        self.calls += len(candidates)
+        return planted.engine().path_loss(candidates) + 1.5  # what a cable takes
+
+
+PRIORS = {
+    name: {"bounds": planted.BOUNDS, **(PRIOR if k == 0 else {})} for k, name in enumerate(planted.TRUTH)
+}
+
+
+def problem(folder: Path, **sections) -> Problem:
+    """A problem on these calls; the study's own engine traces anew for every candidate."""
+    table = planted.campaign(noise_db=1.0)
+    sections = {"engine": {"name": "retrace"}, **sections}
+    return Problem.of(Setup.open(planted.study(folder, table, **sections)), Calls())
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory) -> Problem:
+    """A problem with offsets, priors and all."""
+    sections = {"offset": {"per": "half", "prior_db": 3.0}, "noise": {"std_db": 1.0}, "parameters": PRIORS}
+    return problem(tmp_path_factory.mktemp("asked"), **sections)
+
+
+@pytest.fixture(scope="module")
+def model(asked) -> ReplayedModel:
+    """Its cheap model."""
+    found = aid(asked).model
+    assert found is not None
+    return found
+
+
+def test_the_replay_of_the_own_scene_finds_the_optimum_in_a_few_calls(asked, model):
+    optimizer, calls = choose(asked, model), asked.engine.calls
+    values = []
+    for _, told in islice(rounds(optimizer, asked.evaluate), 4):
+        values += told.value.tolist()
+    assert asked.engine.calls - calls == 4
+    exact = replace(
+        asked, engine=planted.engine()
+    )  # offsets take up what the cable takes, but for their prior
+    best = LeastSquares(*exact.parameters.search_bounds, starts=16)
+    for _ in rounds(best, exact.evaluate):
+        pass
+    assert min(values) - best.best.y < 0.05 < 1.0 < values[0] - best.best.y + 1.0
+    assert min(values) < 1.01 * asked.evaluate(best.best.x[None]).value[0]
+
+
+def test_derivatives_of_the_cheap_model_are_those_of_its_residuals(asked, model):
+    given = model.constants
+    point = asked.parameters.to_search(asked.parameters.start)[None] + 0.3
+    told = model.answer(point, given.centre[None] + 0.1)
+    assert told.residuals == pytest.approx(model.residuals(point, given.centre[None] + 0.1))
+    assert told.residuals.shape[1] == len(model.known) == planted.LINKS + 3
+    assert model.known.sum() == planted.LINKS
+    size = len(given.centre)
+    for k in range(3 + size):
+        move = 1e-5 * np.eye(3 + size)[k]
+        there, here = (
+            model.residuals(point + sign * move[:3], given.centre[None] + 0.1 + sign * move[3:])
+            for sign in (1, -1)
+        )
+        slope = told.by_point[0, :, k] if k < 3 else told.by_constant[0, :, k - 3]
+        assert slope == pytest.approx((there - here)[0] / 2e-5, rel=1e-3, abs=1e-4)
+
+
+def test_links_that_only_the_engine_reaches_are_left_to_the_correction(asked):
+    paths = planted.engine().paths
+    kept = paths.link != 3
+
+    fewer = Replay(take(paths, np.flatnonzero(kept)), with_constants(asked.parameters, paths.materials))
+    plain = replace(asked, objective=replace(asked.objective, nuisance=Nuisance(planted.LINKS)))
+    model = ReplayedModel(fewer, 3, ProblemRows(plain))
+    assert np.flatnonzero(~model.known).tolist() == [3, planted.LINKS]
+    point = asked.parameters.to_search(asked.parameters.start)[None]
+    told = model.answer(point, model.constants.centre[None])
+    assert np.isfinite(told.residuals).all()
+    assert told.residuals[0, 3] == 0.0
+    assert not told.by_point[0, 3].any()
+
+
+def test_constants_are_those_that_nothing_else_sets():
+    wall = Parameter("walls.relative_permittivity", 1.5, 12.0, 5.0)
+    materials = {
+        "walls": Material(5.0, 0.1, 0.3),
+        "metal": Material(1.0, 1e7, 0.01),
+        "air": Material(1.1, 0.0, 0.1),
+    }
+    names = with_constants(Parameters((wall,)), materials).names
+    assert names == ("walls.relative_permittivity", "walls.thickness", "walls.conductivity", "air.thickness")
+    assert with_constants(Parameters((wall,)), materials, one_carrier=False).names[1:] == (
+        "walls.thickness",
+        "air.thickness",
+    )
+
+
+def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, monkeypatch):
+    def missing(*_, **__):
+        raise InputError("no libLLVM was found")
+
+    content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 9}}}
+    study = Study.from_content(content, tmp_path / "study.toml")
+    monkeypatch.setattr(Setup, "trace", missing)
+    result = calibrate(study)
+    assert result.cheap_calls == 0
+    assert result.remarks[0] == "No cheap model, as the scene cannot be traced here (no libLLVM was found)."
+    named = calibrate(study.replace(method="vector-surrogate"), seed=0)
+    assert not any("cheap model" in remark for remark in named.remarks)
+
+
+@pytest.mark.parametrize("method", [{"model": "none"}, {"name": "random"}])
+def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch, method):
+    asked = problem(tmp_path, method=method)
+    monkeypatch.setattr(Setup, "trace", lambda *_, **__: pytest.fail("traced"))
+    assert aid(asked).model is None
+    assert aid(asked).remark == ""
+
+
+def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
+    """The program answers otherwise than the scene: what is asked depends on the answers, and repeats."""
+    content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 7}}}
+    study = Study.from_content(content, tmp_path / "study.toml")
+    first = calibrate(study, out=tmp_path / "out")
+    again = calibrate(study, out=tmp_path / "out", overwrite=True)
+    assert (first.rt_calls, first.ledger_hits) == (7, 0)
+    assert first.cheap_calls > 100
+    assert f"{first.cheap_calls:,} in" in render(costs(first))
+    assert (again.rt_calls, again.ledger_hits) == (7, 7)
+    assert again.history.rmse_db.tolist() == first.history.rmse_db.tolist()
+    assert again.parameters == first.parameters

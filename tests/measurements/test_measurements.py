@@ -1,0 +1,307 @@
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibray.errors import InputError
+from calibray.measurements import Measurements, links_from_frame, links_from_table, read_measurements
+from calibray.measurements.table_files import read_table
+
+TABLE = """\
+x,y,z,loss,set,spread
+10,0,1.5,80.5,LOS,1
+20,0,1.5,86.5,LOS,2
+0,30,1.5,101.25,NLOS,4
+0,40,1.5,110,NLOS,4
+"""
+
+
+def table_file(folder, text, name="links.csv"):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read(folder, text=TABLE, **changes):
+    arguments = {"tx": [0, 0, 10.0], "rx": ["x", "y", "z"], "value": "loss"} | changes
+    return read_measurements(table_file(folder, text), **arguments)
+
+
+def test_columns_and_constants_become_positions(tmp_path):
+    links = read(tmp_path, rx=["x", "y", 1.75])
+    np.testing.assert_array_equal(links.tx, np.tile([0, 0, 10.0], (4, 1)))
+    np.testing.assert_array_equal(links.rx, [[10, 0, 1.75], [20, 0, 1.75], [0, 30, 1.75], [0, 40, 1.75]])
+    np.testing.assert_array_equal(links.path_loss_db, [80.5, 86.5, 101.25, 110])
+    np.testing.assert_array_equal(links.weight, 1)
+    np.testing.assert_array_equal(links.row, [2, 3, 4, 5])
+    np.testing.assert_allclose(links.distance[2], np.hypot(30, 8.25))
+    assert links.measured
+    assert links.group is None
+    assert (links.group_names, links.group_index.tolist()) == (("",), [0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("quantity", ["path_gain", "received_power"])
+def test_every_quantity_describes_the_same_links(tmp_path, quantity):
+    frame = pd.read_csv(table_file(tmp_path, TABLE))
+    frame["power"] = [30.0, 31.0, 32.0, 33.0]
+    frame["measured"] = -frame["loss"] if quantity == "path_gain" else frame["power"] - frame["loss"]
+    options = {"tx_power_dbm": "power"} if quantity == "received_power" else {}
+    links = read(tmp_path, frame.to_csv(index=False), value="measured", quantity=quantity, **options)
+    np.testing.assert_allclose(links.path_loss_db, frame["loss"], rtol=1e-15)
+
+
+def test_constant_transmitter_power(tmp_path):
+    frame = pd.read_csv(table_file(tmp_path, TABLE)).assign(loss=lambda frame: 20 - frame["loss"])
+    links = read(tmp_path, frame.to_csv(index=False), quantity="received_power", tx_power_dbm=20)
+    np.testing.assert_allclose(links.path_loss_db, [80.5, 86.5, 101.25, 110])
+
+
+def test_weights_and_standard_deviations(tmp_path):
+    np.testing.assert_array_equal(read(tmp_path, weight="spread").weight, [1, 2, 4, 4])
+    np.testing.assert_array_equal(read(tmp_path, std="spread").weight, [1, 1 / 4, 1 / 16, 1 / 16])
+    np.testing.assert_array_equal(read(tmp_path, std=2.0).weight, 1 / 4)
+
+
+def test_groups_are_sorted_labels_and_indices(tmp_path):
+    links = read(tmp_path, group="spread")
+    assert links.group_names == ("1", "2", "4")
+    assert links.group_index.tolist() == [0, 1, 2, 2]
+    assert read(tmp_path, group="set").group_names == ("LOS", "NLOS")
+
+
+def test_a_gap_elsewhere_does_not_rename_numeric_groups(tmp_path):
+    text = TABLE + "0,50,1.5,111,NLOS,\n"
+    assert read(tmp_path, text, group="spread", where="y < 45").group_names == ("1", "2", "4")
+
+
+def test_filters_see_all_columns_and_keep_the_lines(tmp_path):
+    links = read(tmp_path, where="set == 'NLOS' and spread > 3")
+    assert links.row.tolist() == [4, 5]
+    assert links.frame["loss"].tolist() == [101.25, 110]
+    assert links.where("y == 40").tolist() == [False, True]
+
+
+def test_rows_left_out_by_the_filter_may_be_faulty(tmp_path):
+    text = TABLE + "0,50,1.5,broken,BAD,1\n"
+    assert len(read(tmp_path, text, where="set != 'BAD'")) == 4
+    with pytest.raises(InputError, match="row 6"):
+        read(tmp_path, text)
+
+
+def test_split_parts_the_links_and_refuses_an_empty_part(tmp_path):
+    links = read(tmp_path, group="set", weight="spread")
+    kept, held_out = links.split("x > 15 or y > 35")
+    assert (kept.row.tolist(), held_out.row.tolist()) == ([2, 4], [3, 5])
+    assert (kept.group.tolist(), held_out.weight.tolist()) == (["LOS", "NLOS"], [2, 4])
+    with pytest.raises(InputError, match="no link for the hold-out"):
+        links.split("x > 1000")
+    with pytest.raises(InputError, match="no link for calibration"):
+        links.split("x < 1000")
+
+
+@given(st.lists(st.booleans(), min_size=5, max_size=5).filter(any))
+def test_selection_keeps_links_whole(mask):
+    rng = np.random.default_rng(1)
+    links = Measurements(
+        rng.normal(size=(5, 3)), 9 + rng.normal(size=(5, 3)), np.arange(60, 65.0), group=list("abcab")
+    )
+    chosen = links.select(mask)
+    places = np.flatnonzero(mask)
+    assert len(chosen) == len(places)
+    for name in ("tx", "rx", "path_loss_db", "weight", "group", "row", "distance"):
+        np.testing.assert_array_equal(getattr(chosen, name), getattr(links, name)[places])
+
+
+def test_arrays_cannot_be_changed_from_either_side():
+    losses = np.array([80.0])
+    links = Measurements([[0, 0, 1]], [[9, 0, 1]], losses)
+    losses[0] = 90.0
+    assert links.path_loss_db[0] == 80.0
+    with pytest.raises(ValueError, match="read-only"):
+        links.path_loss_db[0] = 90.0
+
+
+def test_parquet_reads_like_csv(tmp_path):
+    from_csv = read(tmp_path, group="set")
+    path = tmp_path / "links.parquet"
+    from_csv.frame.to_parquet(path)
+    links = read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss", group="set")
+    for name in ("tx", "rx", "path_loss_db", "group"):
+        np.testing.assert_array_equal(getattr(links, name), getattr(from_csv, name))
+    assert links.row.tolist() == [1, 2, 3, 4]
+    path.write_bytes(b"not parquet")
+    with pytest.raises(InputError, match="not a Parquet file"):
+        read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
+
+
+def test_a_row_for_which_a_filter_has_no_answer_does_not_pass(tmp_path):
+    frame = pd.read_csv(table_file(tmp_path, TABLE)).assign(mode=pd.array([4, None, 4, 1], dtype="Int64"))
+    frame.to_parquet(tmp_path / "links.parquet")
+    arguments = (tmp_path / "links.parquet", [0, 0, 10.0], ["x", "y", "z"], "loss")
+    assert read_measurements(*arguments, where="mode == 4").row.tolist() == [1, 3]
+
+
+def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
+    path = tmp_path / "links.parquet"
+    path.write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"pip install calibray\[parquet\]"):
+        read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
+
+
+def test_blank_lines_and_line_breaks_in_quotes_do_not_shift_the_lines(tmp_path):
+    text = 'x,y,z,loss,note\n\n10,0,1.5,80.5,"two\nlines"\n   \n20,0,1.5,86.5,\n0,30,1.5,bad,\n'
+    with pytest.raises(InputError, match=r"links\.csv, row 7, column 'loss': 'bad' is not a number"):
+        read(tmp_path, text)
+    assert read(tmp_path, text, where="x > 0").row.tolist() == [3, 6]
+
+
+def test_a_byte_order_mark_and_spaces_after_commas_are_read_over(tmp_path):
+    text = "\ufeff" + TABLE.replace(",", ", ")
+    np.testing.assert_array_equal(read(tmp_path, text, group="set").path_loss_db, [80.5, 86.5, 101.25, 110])
+
+
+LATER = TABLE.splitlines()[1:]
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "message"),
+    [
+        # The file
+        ("", {}, "holds no rows"),
+        ("x,y,z,loss\n", {}, "holds no rows"),
+        (TABLE + "1,2,3\n", {}, "row 6: 3 cells, the header has 6"),
+        (TABLE + "1,2,3,99,LOS,1,\n", {}, "row 6: 7 cells, the header has 6"),
+        (TABLE.replace(",", ";"), {}, "row 1: columns are parted by ';'"),
+        (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' stands twice"),
+        # Columns
+        (TABLE, {"value": "los"}, "no column 'los'; did you mean 'loss'"),
+        (TABLE, {"rx": ["x", "y", "hight"]}, "no column 'hight'; there are: x, y, z, loss"),
+        (TABLE, {"group": "sets"}, "no column 'sets'; did you mean 'set'"),
+        (TABLE, {"weight": "wait"}, "no column 'wait'"),
+        (TABLE, {"rx": ["x", "y"]}, r"rx = \['x', 'y'\]: must be x, y and z"),
+        (TABLE, {"tx": "x"}, "tx = 'x': must be x, y and z"),
+        (TABLE, {"tx": [0, 0, float("nan")]}, "nan must be a finite number"),
+        (TABLE.replace("x,y", "rx_lon,rx_lat"), {"rx": ["rx_lon", "rx_lat", "z"]}, "looks like degrees"),
+        # Values
+        (TABLE + "0,50,1.5,,LOS,1\n", {}, r"'loss' is missing or not finite in 1 of 5 rows \(row 6\)"),
+        (TABLE + "0,50,1.5,inf,LOS,1\n0,60,1.5,nan,LOS,1\n", {}, r"in 2 of 6 rows \(row 6, 7\)"),
+        (TABLE + "0,50,1.5,n.m.,LOS,1\n", {}, "row 6, column 'loss': 'n.m.' is not a number"),
+        (
+            TABLE + "0,50,1.5,-90,LOS,1\n",
+            {},
+            "row 6, column 'loss': -90 means a path loss of -90 dB.*path_gain",
+        ),
+        (
+            TABLE + "0,50,1.5,12,LOS,1\n",
+            {},
+            r"12 means a path loss of 12 dB, must be 20 to 250 dB \(1 of 5 rows\)",
+        ),
+        (TABLE + "0,50,1.5,251,LOS,1\n", {}, "251 means a path loss of 251 dB"),
+        (TABLE, {"quantity": "path_gain"}, "row 2, .* means a path loss of -80.5 dB.*path_loss"),
+        (TABLE, {"quantity": "pathloss"}, "did you mean 'path_loss'"),
+        (TABLE, {"quantity": "received_power"}, "'received_power' needs tx_power_dbm"),
+        (TABLE, {"tx_power_dbm": 30}, "'path_loss' takes no tx_power_dbm"),
+        (TABLE, {"quantity": "received_power", "tx_power_dbm": 30}, "row 2, .* check tx_power_dbm"),
+        (TABLE, {"quantity": "received_power", "tx_power_dbm": float("inf")}, "inf must be a finite number"),
+        (TABLE, {"value": "set"}, "row 2, column 'set': 'LOS' is not a number"),
+        (TABLE + "0,50,1.5,90,,1\n", {"group": "set"}, "row 6, column 'set': the label is missing"),
+        (
+            TABLE.replace("NLOS,4", "NLOS,0"),
+            {"weight": "spread"},
+            "row 4, column 'spread': 0 must be greater than 0",
+        ),
+        (TABLE.replace("NLOS,4", "NLOS,-4"), {"std": "spread"}, "row 4, column 'spread': -4 must be greater"),
+        (TABLE, {"std": 0}, "std: 0 must be greater than 0"),
+        (TABLE, {"std": 1, "weight": "spread"}, "give one of them"),
+        # Links
+        (TABLE, {"tx": [20, 0, 1.5]}, "row 3: transmitter and receiver stand at the same place"),
+        (TABLE + LATER[1] + "\n", {}, "row 6: duplicate link, same positions and value as row 3"),
+        # Filters
+        (TABLE, {"where": "x > 1000"}, "lets none of 4 rows pass"),
+        (TABLE, {"where": "sett == 'LOS'"}, "no column 'sett'; did you mean 'set'"),
+        (TABLE, {"where": "x >"}, "not a valid filter .*the columns are x, y, z, loss, set, spread"),
+        (TABLE, {"where": "x < 'a'"}, "not a valid filter"),
+        (TABLE, {"where": "x"}, "must be true or false for each row"),
+        (TABLE, {"where": "x = 3"}, "not a valid filter .*compare as in"),
+        (TABLE, {"where": "x == @tmp_path"}, "not a valid filter"),
+        (TABLE, {"where": "x.to_csv('out.csv')"}, r"to_csv\(\) is not allowed"),
+    ],
+)
+def test_faults_are_refused_with_their_place(tmp_path, text, changes, message):
+    with pytest.raises(InputError, match=rf"(?s){message}"):
+        read(tmp_path, text, **changes)
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere\.csv: no such file"):
+        read_measurements(tmp_path / "nowhere.csv", [0, 0, 1], [1, 1, 1], "loss")
+    with pytest.raises(InputError, match=r"cannot read a \.ods table"):
+        read_measurements(table_file(tmp_path, TABLE, "links.ods"), [0, 0, 1], [1, 1, 1], "loss")
+    latin = tmp_path / "latin.csv"
+    latin.write_bytes("stra\u00dfe,loss\n".encode("latin-1"))
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        read_measurements(latin, [0, 0, 1], [1, 1, 1], "loss")
+
+
+def test_repeated_measurements_of_one_link_are_kept_and_groups_tell_links_apart(tmp_path):
+    again = TABLE + LATER[1].replace("86.5", "87.0") + "\n"
+    assert len(read(tmp_path, again)) == 5
+    other_group = TABLE + LATER[1].replace("LOS", "NLOS") + "\n"
+    assert len(read(tmp_path, other_group, group="set")) == 5
+    with pytest.raises(InputError, match="duplicate link"):
+        read(tmp_path, other_group)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tx": [[0, 0]]}, r"tx: shape \(1, 2\), must be \(1, 3\)"),
+        ({"path_loss_db": []}, r"path_loss_db: shape \(0,\)"),
+        ({"path_loss_db": 80.0}, r"path_loss_db: shape \(\)"),
+        ({"path_loss_db": [np.inf]}, "path loss is infinite"),
+        ({"tx": [[0, 0, np.nan]]}, "transmitter's position is not finite"),
+        ({"rx": [[np.inf, 0, 0]]}, "receiver's position is not finite"),
+        ({"weight": [0.0]}, "weight must be greater than 0"),
+        ({"weight": [np.nan]}, "weight must be greater than 0"),
+        ({"weight": [np.inf]}, "weight must be finite"),
+        ({"group": ["a", "b"]}, r"group: shape \(2,\)"),
+    ],
+)
+def test_a_record_of_impossible_links_is_refused(changes, message):
+    arguments = {"tx": [[0, 0, 1]], "rx": [[9, 0, 1]], "path_loss_db": [80.0]} | changes
+    with pytest.raises(InputError, match=message):
+        Measurements(**arguments)
+
+
+def test_half_measured_links_and_bad_masks_are_refused():
+    tx, rx = np.zeros((2, 3)), np.ones((2, 3))
+    with pytest.raises(InputError, match="only some links have a path loss"):
+        Measurements(tx, rx, [80.0, np.nan])
+    links = Measurements(tx, rx, [80.0, 90.0])
+    for mask in ([0, 1], [True], [[True, True]]):
+        with pytest.raises(InputError, match="mask: "):
+            links.select(mask)
+    with pytest.raises(InputError, match="leaves none of 2 links"):
+        links.select([False, False])
+
+
+def test_links_to_predict_at_have_no_values(tmp_path):
+    frame = pd.DataFrame(
+        {"tx_x": [0, 0], "tx_y": 0, "tx_z": 10, "rx_x": [5, 6], "rx_y": 1, "rx_z": 1.5, "set": ["b", "a"]},
+        index=[7, 9],
+    )
+    links = links_from_frame(frame, group="set")
+    assert not links.measured
+    assert np.isnan(links.path_loss_db).all()
+    assert links.group.tolist() == ["b", "a"]
+    np.testing.assert_array_equal(links.rx, [[5, 1, 1.5], [6, 1, 1.5]])
+    frame.to_csv(tmp_path / "links.csv", index=False)
+    np.testing.assert_array_equal(links_from_table(read_table(tmp_path / "links.csv")).rx, links.rx)
+    with pytest.raises(InputError, match="no column 'rx_z'"):
+        links_from_frame(frame.drop(columns="rx_z"))
+    with pytest.raises(InputError, match="holds no rows"):
+        links_from_frame(frame.iloc[:0])

@@ -1,0 +1,215 @@
+"""Rows as phones write them become links: each step against what it must give, each loss counted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibray.coordinates import Frame
+from calibray.errors import InputError
+from calibray.measurements import LINK_COLUMNS
+from calibray.measurements.preparation import Averaging, Preparation, prepare
+from calibray.measurements.table_files import SourceTable
+from calibray.scenes.authoring.footprints import Footprints
+from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.study import Study
+from calibray.study import row_steps as preparing
+
+FRAME = Frame.local(9.99, 50.01)
+SITES = {"a": (0.0, 0.0, 20.0), "b": (60.0, 0.0, 15.0)}
+STUDY: dict = {
+    "version": 1,
+    "scene": {"file": "scene.xml", "frequency": 3.5e9},
+    "links": {
+        "file": "log.csv",
+        "tx": ["site_lon", "site_lat", "height"],
+        "rx": ["lon", "lat", 1.5],
+        "value": "rsrp",
+        "quantity": "rsrp",
+        "position": "geographic",
+        "transmitters": "sites.csv",
+        "transmitter": "site",
+    },
+    "parameters": {"walls.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    "offset": {"per": ["site", "phone"]},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene of one house, 20 m wide, about (30, 0), and a log around it."""
+    import shapely
+
+    target = tmp_path_factory.mktemp("prepared")
+    box = np.array([shapely.box(20, -10, 40, 10)])
+    make_scene(
+        Footprints(box, np.zeros(1), np.full(1, 9.0), ("house",), ("height",), np.zeros(1, bool), {}),
+        target,
+        FRAME,
+    )
+    places = {
+        (x, y): FRAME.to_geographic([(x, y, 0.0)])[0] for x, y in [(5, 20), (8, 22), (38.5, 0), (50, 20)]
+    }
+    rows = [
+        (phone, f"{lon:.8f}", f"{lat:.8f}", site, -80.0 - x / 10 - (site == "b") - 3 * (phone == "p2"))
+        for (x, _), (lon, lat, _) in places.items()
+        for site in SITES
+        for phone in ("p1", "p2")
+    ]
+    log = pd.DataFrame(rows, columns=["phone", "lon", "lat", "site", "rsrp"])
+    log.to_csv(target / "log.csv", index=False)
+    sites = pd.DataFrame(
+        [(name, *FRAME.to_geographic([place])[0]) for name, place in SITES.items()],
+        columns=["site", "lon", "lat", "height"],
+    )
+    sites.to_csv(target / "sites.csv", index=False, float_format="%.8f")
+    return target
+
+
+def study(folder, **links) -> Study:
+    content = json.loads(json.dumps(STUDY))
+    content["links"] |= links
+    return Study.from_content(content, folder / "study.toml")
+
+
+def test_positions_on_the_globe_become_the_scenes_metres(folder):
+    links = study(folder).measurements()
+    assert len(links) == 16
+    assert links.rx[0] == pytest.approx([5, 20, 1.5], abs=0.01)
+    assert links.tx[2] == pytest.approx([60, 0, 15], abs=0.01)
+    assert links.group_names == ("a p1", "a p2", "b p1", "b p2")
+    # What was transmitted is the offset's: a loss is less the power.
+    assert links.path_loss_db[:2].tolist() == [80.5, 83.5]
+    assert links.prepared == {}
+
+
+def test_the_studys_frame_counts_before_the_scene_files(folder):
+    content = json.loads(json.dumps(STUDY))
+    east = FRAME.to_geographic([(10.0, 0.0, 0.0)])[0]
+    content["scene"]["origin"] = east[:2].tolist()
+    moved = Study.from_content(content, folder / "study.toml").measurements()
+    assert moved.rx[0] == pytest.approx([-5, 20, 1.5], abs=0.01)
+    content["scene"]["crs"] = "EPSG:32632"
+    in_zone = Study.from_content(content, folder / "study.toml").measurements()
+    # The zone's scale and convergence: centimetres and fractions of a degree so near its meridian.
+    assert in_zone.rx[0] == pytest.approx([-5, 20, 1.5], abs=0.3)
+
+
+def test_places_to_predict_at_are_read_as_measured_ones_were(folder, monkeypatch):
+    """The same columns mean the same, with nothing measured, and no row is left out."""
+    monkeypatch.setattr(preparing, "_ground", lambda _: lambda x, y: 0.1 * x + 2.0 * y)
+    plan = study(folder, heights="ground", where="site == 'a'", inside="drop")
+    measured, log = plan.measurements(), pd.read_csv(folder / "log.csv").drop(columns="rsrp")
+    links = plan.places(SourceTable(log, source="new.csv"))
+    assert len(links) == len(log) == 16
+    kept = (log.site == "a").to_numpy() & (np.abs(links.rx[:, 0] - 38.5) > 0.4)
+    assert links.rx[kept] == pytest.approx(measured.rx)
+    assert links.tx[kept] == pytest.approx(measured.tx)
+    assert links.rx[0, 2] == pytest.approx(1.5 + 0.5 + 40.0, abs=0.01)
+    assert links.group is not None
+    assert links.group[:3].tolist() == ["a p1", "a p2", "b p1"]
+    assert not links.measured
+    # Metres in the scene's frame, where a table gives them, are those.
+    metres = log.assign(**{name: k + 1.0 for k, name in enumerate(LINK_COLUMNS)})
+    assert plan.places(SourceTable(metres)).rx[3].tolist() == [4.0, 5.0, 6.0]
+    with pytest.raises(InputError, match=r"new\.csv.*no column 'site'"):
+        plan.places(SourceTable(log.drop(columns="site"), source="new.csv"))
+    with pytest.raises(InputError, match="no column 'tx_x'"):
+        plan.places(SourceTable(log[["phone"]], source="new.csv"))
+
+
+@pytest.mark.parametrize(
+    ("inside", "left", "counts"),
+    [
+        ("keep", 16, {}),
+        ("drop", 12, {"receivers inside buildings, left out": 4}),
+        ("move", 16, {"receivers inside buildings, moved out": 4}),
+    ],
+)
+def test_receivers_inside_buildings(folder, inside, left, counts):
+    links = study(folder, inside=inside).measurements()
+    assert (len(links), links.prepared) == (left, counts)
+    if inside == "move":
+        assert links.rx[8] == pytest.approx([41, 0, 1.5], abs=0.01)
+
+
+def test_averages_stay_within_transmitter_and_group(folder):
+    links = study(folder, average={"by": "cell", "size": 25.0}).measurements()
+    # (5, 20) and (8, 22) share a cell.
+    assert len(links) == 12
+    assert links.prepared == {"samples averaged": 16}
+    first = links.frame.iloc[0]
+    assert first["count"] == 2
+    assert links.rx[0] == pytest.approx([6.5, 21, 1.5], abs=0.01)
+    mean = 10 * np.log10((10**-8.05 + 10**-8.08) / 2)
+    assert links.path_loss_db[0] == pytest.approx(-mean)
+    assert first["std_db"] == pytest.approx(np.std([80.5, 80.8], ddof=1))
+
+
+def test_samples_below_the_floor_bound_an_average_or_leave_it_out():
+    """Of ten samples one is not heard: what it may add is between nothing and the floor."""
+    strong, weak = [-80.0] * 9, [-118.0] * 5
+    table = SourceTable(
+        pd.DataFrame(
+            {"x": [0.0] * 10 + [50.0] * 10, "p": [*strong, np.nan, *weak, *[np.nan] * 5], "y": 0.0, "z": 1.5}
+        )
+    )
+    steps = Preparation(noise_floor_dbm=-120.0, averaging=Averaging("cell", 5.0))
+    made = prepare(table, steps, [9.0, 9.0, 9.0], ["x", "y", "z"], "p")
+    assert len(made.table) == 1
+    assert made.table.frame["p"].iloc[0] == pytest.approx(10 * np.log10(0.9e-8 + 0.05e-12))
+    assert made.counts == {
+        "samples averaged": 20,
+        "of them at or below the noise floor": 6,
+        "averages too near the noise floor, left out": 1,
+    }
+    alone = prepare(table, Preparation(noise_floor_dbm=-120.0), [9.0, 9.0, 9.0], ["x", "y", "z"], "p")
+    assert (len(alone.table), alone.counts) == (14, {"at or below the noise floor, left out": 6})
+
+
+def test_a_wide_table_keeps_its_lines():
+    wide = SourceTable(
+        pd.DataFrame({"x": [1.0, 2.0], "y": 0.0, "ap1": [-40.0, -50.0], "ap2": [np.nan, -60.0]}),
+        np.array([2, 3]),
+        "rss.csv",
+    )
+    made = prepare(wide, Preparation({"ap1": "A", "ap2": "B"}), [0, 0, 2], ["x", "y", 1.5], "rss")
+    assert made.table.row.tolist() == [2, 3, 3]
+    assert made.table.frame["rss"].tolist() == [-40.0, -50.0, -60.0]
+    assert made.counts == {"cells without a value": 1}
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        ({"transmitter": "phone"}, "no column 'phone'"),
+        ({"noise_floor_dbm": -10.0}, "all of 16 rows"),
+        ({"quantity": "path_loss", "noise_floor_dbm": -100.0}, "is a received power"),
+        ({"average": {"by": "time", "size": 3.0}}, "needs time"),
+        ({"quantity": "received_power"}, "say quantity = 'rsrp' and give an \\[offset\\]"),
+        ({"position": "scene"}, "say position = 'geographic'"),
+        ({"transmitters": "nowhere.csv"}, "no such file"),
+    ],
+)
+def test_what_cannot_be_prepared_is_named(folder, links, message):
+    with pytest.raises(InputError, match=message):
+        study(folder, **links).measurements()
+
+
+def test_an_unknown_transmit_power_needs_an_offset(folder):
+    content = {key: value for key, value in STUDY.items() if key != "offset"}
+    with pytest.raises(InputError, match=r"links\.quantity = 'rsrp' needs \[offset\]"):
+        Study.from_content(content, folder / "study.toml")
+
+
+def test_a_scene_without_a_place_on_the_globe(folder):
+    (folder / "bare.xml").write_text("".join(
+        line for line in (folder / "scene.xml").read_text().splitlines(True) if "calibray frame" not in line
+    ))  # fmt: skip
+    content = json.loads(json.dumps(STUDY))
+    content["scene"]["file"] = "bare.xml"
+    with pytest.raises(InputError, match=r"scene\.origin = \[longitude, latitude\]"):
+        Study.from_content(content, folder / "study.toml").measurements()

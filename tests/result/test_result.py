@@ -1,0 +1,255 @@
+"""A result's files hold all of it, predict where it was fitted, and are never half-written."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import planted
+from calibray.calibration import calibrate
+from calibray.errors import InputError
+from calibray.result import FILES, Result
+from calibray.scenes import read_scene
+from calibray.study import Study
+from calibray.support.output_files import SIGNATURES
+from small_scenes import write_scene
+
+OFFSETS = {"west": -3.0, "east": 6.0}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_cache():
+    """Nothing is taken from, or left in, the user's cache of traces."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", "")
+        yield
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory) -> Result:
+    """A calibration with noise, one offset per half, and a hold-out."""
+    table = planted.campaign(noise_db=0.3)
+    study = planted.study(
+        tmp_path_factory.mktemp("study"),
+        table.assign(path_loss_db=table.path_loss_db + table.half.map(OFFSETS)),
+        offset={"per": "half"},
+        holdout={"where": "rx_x > 15"},
+        method={"name": "auto", "options": {"starts": 16}},
+    )
+    return calibrate(study, engine=planted.engine())
+
+
+@pytest.fixture
+def folder(result, tmp_path):
+    """The folder it was saved into."""
+    result.save(tmp_path / "new" / "out")
+    return tmp_path / "new" / "out"
+
+
+def test_what_is_saved_is_what_is_loaded(result, folder):
+    loaded = Result.load(folder)
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, SIGNATURES])
+    assert loaded.content() == result.content()
+    assert loaded.materials == result.materials
+    assert loaded.intervals == result.intervals
+    assert loaded.study.digest() == result.study.digest()
+    pd.testing.assert_frame_equal(loaded.links, result.links, rtol=1e-5)
+    pd.testing.assert_frame_equal(loaded.history, result.history, rtol=1e-8)
+    assert len(loaded.history) == result.rt_calls
+
+
+def test_the_file_is_strict_json(folder):
+    def refuse(constant: str) -> None:
+        raise ValueError(constant)
+
+    content = json.loads((folder / "result.json").read_text(), parse_constant=refuse)
+    assert content["version"] == 1
+    assert content["parameters"].keys() == planted.TRUTH.keys()
+
+
+def test_prediction_at_the_measured_links_is_what_was_fitted(result, folder):
+    fitted = result.links.after_db.to_numpy()
+    for source in (result, Result.load(folder)):
+        assert source.predict(result.study.measurements()) == pytest.approx(fitted, abs=1e-6)
+    assert result.predict(planted.links()) == pytest.approx(fitted, abs=1e-6)
+    assert result.links.before_db.to_numpy() != pytest.approx(fitted, abs=0.5)
+
+
+def test_prediction_adds_the_offset_of_the_group(result):
+    links = planted.links().iloc[[2, 2]].assign(half=["west", "east"])
+    west, east = result.predict(links)
+    assert east - west == pytest.approx(result.offsets_db["east"] - result.offsets_db["west"])
+    assert east - west > 5
+
+
+def test_prediction_where_no_path_leads_is_infinite(result):
+    predicted = result.predict(planted.links(blocked=True))
+    assert np.flatnonzero(np.isinf(predicted)).tolist() == [planted.INSIDE]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda links: links.assign(half="north"),
+            "group 'north' has no calibrated offset; known: east, west",
+        ),
+        (lambda links: links.drop(columns="half"), "no column 'half'"),
+        (lambda links: links.drop(columns="rx_z"), "no column 'rx_z'"),
+        (lambda links: links.assign(rx_y=np.nan), "rx_y"),
+        (lambda links: links.iloc[:0], "no rows"),
+    ],
+)
+def test_links_that_cannot_be_predicted_are_refused(result, change, message):
+    with pytest.raises(InputError, match=message):
+        result.predict(change(planted.links()))
+
+
+def test_the_scene_written_is_the_calibrated_one(result, folder):
+    scene = read_scene(folder / "result-scene.xml", result.study.scene.frequency)
+    original = read_scene(result.study.scene_source, result.study.scene.frequency)
+    written = {entry.name: scene.materials[entry.material] for entry in scene.objects}
+    assert written == {entry.name: result.materials[entry.material] for entry in original.objects}
+    changed = {
+        entry.material
+        for entry in original.objects
+        if written[entry.name] != original.materials[entry.material]
+    }
+    assert changed == {"concrete", "marble", "wood"}
+
+
+@pytest.mark.parametrize("failing", FILES)
+def test_a_file_that_could_not_be_written_leaves_nothing_half_written(result, tmp_path, failing):
+    (tmp_path / failing / "in the way").mkdir(parents=True)
+    with pytest.raises(InputError, match=f"output file {tmp_path / failing}: is a folder"):
+        result.save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
+
+
+def test_a_crash_while_saving_leaves_the_older_files(result, folder, monkeypatch):
+    before = {path.name: path.read_text() for path in folder.iterdir()}
+
+    def crash(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pd.DataFrame, "to_csv", crash)
+    with pytest.raises(KeyboardInterrupt):
+        result.save(folder)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == before
+
+
+def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
+    with pytest.raises(InputError, match="is no result of `calibray run`"):
+        Result.load(tmp_path)
+    text = (folder / "result.json").read_text()
+    (folder / "result.json").write_text(text[:100])
+    with pytest.raises(InputError, match="is no result"):
+        Result.load(folder)
+    (folder / "result.json").write_text(text.replace('"version": 1,', '"version": 99,', 1))
+    with pytest.raises(InputError, match="version 99, need 1; run the study again"):
+        Result.load(folder)
+
+
+def edited(folder, **changes):
+    """The folder with values of its `result.json` replaced; keys are dotted, and "" takes one out."""
+    file = folder / "result.json"
+    content = json.loads(file.read_text())
+    for path, value in changes.items():
+        *tables, key = path.split("__")
+        table = content
+        for name in tables:
+            table = table[name]
+        if value == "":
+            del table[key]
+        else:
+            table[key] = value
+    file.write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"materials": {}}, "materials: 'concrete' is calibrated and missing"),
+        ({"offsets_db": {}}, "offsets_db: are missing"),
+        ({"rmse_db": float("nan")}, r"rmse_db = nan: must be a finite number"),
+        ({"rmse_db": "1.5"}, r"rmse_db = '1.5': must be a number"),
+        ({"rmse_db": -1.0}, r"rmse_db = -1.0: must be at least 0"),
+        ({"rmse_db": ""}, "rmse_db: is required"),
+        ({"surprise": 1}, "surprise: unknown key"),
+        ({"parameters": {}}, "parameters: '.*' is missing"),
+        ({"parameters__marble.relative_permittivity": 99.0}, "materials.marble.relative_permittivity = "),
+        ({"materials__marble__thickness": -1.0}, "thickness"),
+        ({"materials__marble__thickness": float("inf")}, "thickness"),
+        ({"offsets_db__west": 1e9}, "offsets_db.west = 1000000000.0: must be at most 500"),
+        ({"offsets_db__west": None}, "offsets_db.west = None: must be a number"),
+        (
+            {"intervals__iron.thickness": {"standard_error": 1, "lower": 1, "upper": 2, "verdict": "x"}},
+            "iron",
+        ),
+        ({"version": 2}, "has version 2, need 1"),
+        ({"study__version": 7}, "reads version 1"),
+    ],
+)
+def test_a_damaged_result_is_refused(folder, changes, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        Result.load(edited(folder, **changes))
+    assert "result.json" in str(refusal.value) or "study.toml" in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("result-links.csv", "measured_db", "measured", "no column 'measured_db'"),
+        ("result-links.csv", "True", "maybe", "column 'has_path' holds something else"),
+        ("result-history.csv", "\n1,", "\nx,", "column 'call' holds something else"),
+        ("result-history.csv", "\n1,1,", "\n1,1,,,\n1,1,", "not finite|something else"),
+    ],
+)
+def test_a_damaged_table_of_a_result_is_refused(folder, name, old, new, message):
+    file = folder / name
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        Result.load(folder)
+
+
+def test_a_scene_that_changed_since_is_noticed_before_anything_is_predicted(tmp_path):
+    scene = write_scene(tmp_path, {"floor": [[(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)]]})
+    links = planted.links().head(6).assign(path_loss_db=80.0)
+    content = planted.content("links.csv", parameters={"stone.relative_permittivity": {"bounds": [1.5, 12]}})
+    content["scene"] = {"file": scene.name, "frequency": 3.5e9}
+    content["trace"] = {"max_depth": 1, "samples": 1000}
+    links.to_csv(tmp_path / "links.csv", index=False)
+    result = calibrate(Study.from_content(content, tmp_path / "study.toml"), out=tmp_path / "out")
+    loaded = Result.load(tmp_path / "out")
+    assert loaded.predict(links) == pytest.approx(result.predict(links))
+    mesh = next(tmp_path.rglob("*.ply"))
+    scene.write_text(scene.read_text() + "\n<!-- moved -->\n")
+    with pytest.raises(InputError, match=rf"{scene.name} changed since the calibration.*--anyway"):
+        loaded.predict(links)
+    assert loaded.predict(links, anyway=True) == pytest.approx(result.predict(links, anyway=True))
+    mesh.write_bytes(mesh.read_bytes().replace(b"comment", b"Comment") + b" ")
+    with pytest.raises(InputError, match=mesh.name):
+        loaded.predict(links)
+
+
+def test_a_result_never_takes_the_place_of_the_users_files(result, tmp_path):
+    mine = tmp_path / "result-links.csv"
+    mine.write_text("mine\n")
+    with pytest.raises(InputError, match=r"result-links\.csv: was not written by Calibray.*--overwrite"):
+        result.save(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["result-links.csv"]
+    assert mine.read_text() == "mine\n"
+    result.save(tmp_path, overwrite=True)
+    result.save(tmp_path)
+    assert Result.load(tmp_path).rmse_db == result.rmse_db
+    # Into the study's own folder its files are left alone.
+    home = result.study.path.parent
+    before = (home / "links.csv").read_bytes()
+    result.save(home)
+    assert (home / "links.csv").read_bytes() == before

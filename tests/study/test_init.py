@@ -1,0 +1,199 @@
+"""`calibray init`: what it assumes of a scene and a table is right, and what cannot be told is asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+from typer.testing import CliRunner
+
+from calibray.cli.app import app
+from calibray.coordinates import Frame
+from calibray.errors import InputError
+from calibray.measurements import column_names as guessing
+from calibray.measurements.table_files import SourceTable
+from calibray.scenes.authoring.floor_plan import make_plan_scene
+from calibray.scenes.authoring.floor_plan_file import read_plan
+from calibray.scenes.authoring.footprints import Footprints
+from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring.terrain import Terrain
+from calibray.scenes.checks.heights import Overhead
+from calibray.study import Study
+from calibray.study.draft import draft
+from calibray.study.schema import schema_text
+
+REPOSITORY = Path(__file__).parents[2]
+TOWN = REPOSITORY / "examples" / "bring_your_own"
+FRAME = Frame.local(9.99, 50.01)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """One house 20 m wide."""
+    box = np.array([shapely.box(20, -10, 40, 10)])
+    house = Footprints(box, np.zeros(1), np.full(1, 9.0), ("house",), ("height",), np.zeros(1, bool), {})
+    return str(make_scene(house, tmp_path / "town", FRAME).path)
+
+
+def table(folder: Path, **columns: object) -> Path:
+    file = folder / "links.csv"
+    pd.DataFrame(columns).to_csv(file, index=False)
+    return file
+
+
+def typed(*words: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, list(map(str, words)))
+    return result.exit_code, result.stdout, result.stderr
+
+
+def assumed(found) -> dict[str, str]:
+    return {each.what: each.value for each in found.assumptions}
+
+
+def test_a_phones_log_becomes_a_study_that_reads(scene, tmp_path):
+    file = tmp_path / "study.toml"
+    words = ("init", scene, TOWN / "rsrp.csv", "--transmitters", TOWN / "cells.csv", "--frequency", "3.6e9")
+    picture = tmp_path / "antennas.svg"
+    status, out, err = typed(*words, "-o", file, "--plot", picture)
+    assert status == 0, err
+    assert "1253 values are missing, and none is lower" in out
+    assert picture.exists()
+    study = Study.load(file)
+    assert study.links.quantity == "rsrp"
+    assert study.links.position == "geographic"
+    assert study.links.tx == ("cell_longitude", "cell_latitude", "height")
+    assert study.links.noise_floor_dbm == -118.0
+    assert study.offset.per == ("cell", "device")
+    assert study.links.average.size == 3.3
+    assert list(study.parameters) == ["roofs.relative_permittivity", "walls.relative_permittivity",
+                                      "ground.relative_permittivity"]  # fmt: skip
+    assert study.measurements().prepared["samples averaged"] == 3440
+    text = file.read_text()
+    assert text.startswith("#:schema study.schema.json\n")
+    assert json.loads((tmp_path / "study.schema.json").read_text())["title"] == "Calibray study"
+    # Never overwritten.
+    status, _, err = typed(*words, "-o", file)
+    assert (status, "is there already" in err, file.read_text()) == (2, True, text)
+
+
+def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path):
+    rx = np.array([(x, y, 1.6) for x in range(-40, 16, 8) for y in (-20.0, 15.0)])
+    far = np.sqrt(((rx - [0, 0, 12.0]) ** 2).sum(axis=1))
+    file = table(tmp_path, rx_x_m=rx[:, 0], rx_y_m=rx[:, 1], rx_h_m=rx[:, 2], tx_h_m=12.0, dist_m=far, freq_mhz=3500.0,
+                 pl_db=100.0, rx_lat=50.0, rx_lon=9.9, pl_std_db=1.0)  # fmt: skip
+    found = draft(scene, file, tmp_path / "study.toml")
+    assert found.study.links.tx == (0.0, 0.0, 12.0)
+    assert found.study.links.rx == ("rx_x_m", "rx_y_m", "rx_h_m")
+    assert (found.study.links.value, found.study.scene.frequency) == ("pl_db", 3.5e9)
+    # A distance that says otherwise: nothing is assumed.
+    file = table(
+        tmp_path, rx_x_m=rx[:, 0], rx_y_m=rx[:, 1], tx_h_m=12.0, dist_m=far + 3, freq_mhz=3500.0, pl_db=100.0
+    )
+    with pytest.raises(InputError, match="--tx X,Y,Z"):
+        draft(scene, file, tmp_path / "study.toml")
+    given = draft(scene, file, tmp_path / "study.toml", tx=[1.0, 2.0, 3.0])
+    assert given.study.links.tx == (1.0, 2.0, 3.0)
+
+
+def test_a_wide_table_indoors(tmp_path):
+    plan = tmp_path / "plan.csv"
+    plan.write_text(
+        "x0,y0,x1,y1,type\n0,0,12,0,brick\n12,0,12,8,brick\n12,8,0,8,brick\n0,8,0,0,brick\n6,0,6,8,plasterboard\n"
+    )
+    scene = make_plan_scene(read_plan(plan), tmp_path / "flat", {})
+    (tmp_path / "aps.csv").write_text("name,x,y,z\nap1,1,1,2.5\nap2,11,7,2.5\n")
+    file = table(tmp_path, x=[2.0, 4.0, 8.0], y=[3.0, 4.0, 5.0], rss_ap1=[-40.0, -45.0, -60.0],
+                 rss_ap2=[-65.0, np.nan, -45.0])  # fmt: skip
+    found = draft(str(scene.path), file, tmp_path / "study.toml", tmp_path / "aps.csv", 2.4e9)
+    links = found.study.measurements()
+    assert len(links) == 5
+    assert links.group_names == ("ap1", "ap2")
+    assert links.tx[0].tolist() == [1.0, 1.0, 2.5]
+    assert found.study.trace.refraction
+    # The line from ap1 to (8, 5) crosses one wall; no fewer than three interactions.
+    assert found.study.trace.max_depth == 3
+    assert assumed(found)["trace"] == "through walls"
+    assert "brick_wall.conductivity" in found.study.parameters
+
+
+def test_a_track_and_a_hill(tmp_path):
+    """A house on a slope of 1 in 10, a walk of 40 m past it: each row at its time, each antenna above its ground."""
+    rows, columns = np.mgrid[0:2, 0:2]
+    terrain = Terrain(
+        np.array([-50.0, 50.0]), np.array([-50.0, 50.0]), 5.0 + 0.1 * (100.0 * columns + 0.0 * rows)
+    )
+    box = np.array([shapely.box(20, -10, 40, 10)])
+    house = Footprints(box, np.zeros(1), np.full(1, 9.0), ("house",), ("height",), np.zeros(1, bool), {})
+    scene = str(make_scene(house, tmp_path / "hill", FRAME, terrain).path)
+    east = FRAME.to_geographic([(-20.0, 20.0, 0.0), (20.0, 20.0, 0.0), (0.0, -30.0, 0.0)])
+    points = "".join(
+        f'<trkpt lat="{east[k][1]:.8f}" lon="{east[k][0]:.8f}"><time>2026-05-04T09:00:{8 * k:02d}Z</time></trkpt>'
+        for k in range(2)
+    )
+    (tmp_path / "walk.gpx").write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
+    clock = [f"2026-05-04T09:00:{second:02d}Z" for second in (0, 2, 4, 6, 8, 30)]
+    file = table(tmp_path, time=clock, mast="a", rsrp_dbm=np.linspace(-80.0, -90.0, 6))
+    sites = tmp_path / "sites.csv"
+    sites.write_text(f"mast,longitude,latitude,height\na,{east[2][0]:.8f},{east[2][1]:.8f},12\n")
+    found = draft(scene, file, tmp_path / "study.toml", sites, 3.5e9, track=tmp_path / "walk.gpx")
+    links = found.study.measurements()
+    assert links.rx[:, 0] == pytest.approx([-20, -10, 0, 10, 20], abs=0.01)
+    assert links.rx[:, 2] == pytest.approx(5.0 + 0.1 * (links.rx[:, 0] + 50) + 1.5, abs=0.01)
+    assert links.tx[0] == pytest.approx([0, -30, 22.0], abs=0.01)
+    assert links.prepared == {"rows at no time of the track, left out": 1, "samples averaged": 5}
+    assert found.study.files()[2:4] == (tmp_path / "sites.csv", tmp_path / "walk.gpx")
+    assert assumed(found)["links.heights"] == "ground"
+    assert assumed(found)["links.track"] == "walk.gpx by time"
+    with pytest.raises(InputError, match="joined by"):
+        draft(scene, table(tmp_path, rsrp_dbm=[-80.0]), tmp_path / "study.toml", sites, 3.5e9,
+              track=tmp_path / "walk.gpx")  # fmt: skip
+    # Beyond the scene there is no ground to count from.
+    far = links.frame.assign(time=clock[:5])
+    with pytest.raises(InputError, match=r"no ground at 5 of 5 places"):
+        Overhead.of(scene).ground(far["rx_x"] + 500.0, far["rx_y"])
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "kind"),
+    [
+        ("pl_total_db", 110.0, "path_loss"),
+        ("path_gain_db", -80.0, "path_gain"),
+        ("path_loss_db", -80.0, "path_gain"),
+        ("RSRP [dBm]", -95.0, "rsrp"),
+        ("rssi", -70.0, "rsrp"),
+    ],
+)
+def test_quantities_are_told_by_name_and_sign(column, values, kind):
+    links = SourceTable(pd.DataFrame({column: [values] * 3, "sample_std_db": 3.0, "rx_level": 8}))
+    found = guessing.measured(links, "links.csv")
+    assert (found.column, found.quantity) == (column, kind)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"x": [1.0], "y": [2.0], "temperature": [20.0]}, "no column looks like path loss"),
+        ({"a": [1.0], "pl_db": [90.0]}, "no columns look like the receivers' positions"),
+        ({"x": [1.0], "y": [2.0], "pl_db": [90.0]}, "--tx X,Y,Z"),
+        ({"lon": [9.99], "lat": [50.01], "tx_x": [0.0], "tx_y": [0.0], "pl_db": [90.0]}, "in other units"),
+    ],
+)
+def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
+    with pytest.raises(InputError, match=message):
+        draft(scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=3.5e9)
+    with pytest.raises(InputError, match="give --frequency"):
+        draft(scene, table(tmp_path, **columns), tmp_path / "study.toml")
+
+
+def test_the_schema_is_that_of_the_model():
+    status, out, _ = typed("schema")
+    assert (status, out) == (0, schema_text())
+    committed = (REPOSITORY / "docs" / "study.schema.json").read_text(encoding="utf-8")
+    assert committed == out, "run: calibray schema > docs/study.schema.json"
+    content = json.loads(out)
+    assert content["additionalProperties"] is False
+    assert set(content["required"]) == {"version", "scene", "links", "parameters"}

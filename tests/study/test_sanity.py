@@ -1,0 +1,135 @@
+"""Each classic mistake, planted, is named; the same links without it raise no suspicion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+from typer.testing import CliRunner
+
+from calibray.cli.app import app
+from calibray.errors import InputError
+from calibray.scenes.authoring.footprints import Footprints
+from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.study import Study
+from calibray.study.link_checks import examine
+
+MAST = np.array([-5.0, 3.0, 25.0])
+BEARING = np.radians(30.0)  # where the mast's sector looks, clockwise from north
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory) -> Path:
+    """Four blocks along a street from west to east, none of them symmetric to another."""
+    folder = tmp_path_factory.mktemp("town")
+    blocks = [(-80, 10, -45, 60), (-35, 10, 60, 30), (-80, -70, -20, -10), (-10, -40, 75, -10)]
+    polygon = np.array([shapely.box(*block) for block in blocks])
+    names = tuple(f"house-{k}" for k in range(4))
+    heights = ("height",) * 4
+    houses = Footprints(polygon, np.zeros(4), np.full(4, 12.0), names, heights, np.zeros(4, bool), {})
+    made = make_scene(
+        houses,
+        folder,
+        margin=20.0,
+    )
+    return made.path.parent
+
+
+def links(seed: int = 0) -> pd.DataFrame:
+    """Receivers along the street and a side street to the north, with a sector towards 30 degrees."""
+    rng = np.random.default_rng(seed)
+    rx = np.column_stack([rng.uniform(-78, 75, 60), rng.uniform(-9, 9, 60), np.full(60, 1.5)])
+    rx[40:, :2] = np.column_stack([rng.uniform(-44, -36, 20), rng.uniform(12, 58, 20)])
+    away = rx - MAST
+    distance = np.linalg.norm(away, axis=1)
+    azimuth = np.arctan2(away[:, 1], away[:, 0])
+    off = (azimuth - (np.pi / 2 - BEARING) + np.pi) % (2 * np.pi) - np.pi
+    gain = 8 - np.minimum(12 * (np.degrees(off) / 65) ** 2, 30)
+    loss = 20 * np.log10(4 * np.pi * distance * 3.5e9 / 299792458) + 4 + rng.normal(0, 2, 60) - gain
+    return pd.DataFrame({"x": rx[:, 0], "y": rx[:, 1], "z": rx[:, 2], "loss": loss})
+
+
+def suspicions(town: Path, frame: pd.DataFrame, **changes: object) -> str:
+    name = f"links-{abs(hash(frame.to_csv()))}.csv"
+    frame.to_csv(town / name, index=False)
+    yaw = float(np.pi / 2 - BEARING)
+    content = {
+        "version": 1,
+        "scene": {"file": "scene.xml", "frequency": 3.5e9},
+        "links": {"file": name, "tx": MAST.tolist(), "rx": ["x", "y", "z"], "value": "loss"},
+        "antennas": {"tx": {"pattern": "tr38901", "polarization": "V", "orientation": [yaw, 0, 0]}},
+        "parameters": {"walls.relative_permittivity": {"bounds": [1.5, 12.0]}},
+    }
+    content["links"] |= changes.pop("links", {})
+    content["antennas"]["tx"] |= changes.pop("antenna", {})
+    study = Study.from_content(content | changes, town / "study.toml")
+    return "\n".join(finding.problem for finding in examine(study, study.measurements()))
+
+
+def test_sound_links_raise_no_suspicion(town):
+    assert suspicions(town, links()) == ""
+
+
+@pytest.mark.parametrize(
+    ("mistake", "named"),
+    [
+        (lambda t: t.assign(x=t.y, y=t.x), "if x and y are swapped"),
+        (lambda t: t.assign(x=-t.y, y=t.x), "if they are turned by 90 degrees"),
+        (lambda t: t.assign(x=t.x + 200), "lie beyond the scene; their middle is"),
+        (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers lie under the ground"),
+        (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
+         "5 of 60 receivers stand inside buildings"),
+        (lambda t: t.assign(loss=t.loss - 30), "path losses lie below free space, by"),
+    ],
+    ids=["swapped", "turned", "origin", "underground", "indoors", "watts"],
+)  # fmt: skip
+def test_a_planted_mistake_of_links_is_named(town, mistake, named):
+    assert named in suspicions(town, mistake(links()))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"links": {"tx": [10.0, 20.0, 5.0]}}, "1 of 1 transmitters stand inside buildings"),
+        ({"links": {"tx": [*MAST[:2].tolist(), -3.0]}}, "1 of 1 transmitters lie under the ground"),
+        ({"antenna": {"orientation": [float(BEARING), 0, 0]}}, "fit antennas.tx better turned to 1.05 rad"),
+        ({"antenna": {"orientation": [60.0, 0, 0]}}, "is more than a whole turn"),
+    ],
+    ids=["walls", "underground", "compass", "degrees"],
+)
+def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
+    assert named in suspicions(town, links(), **changes)
+
+
+@pytest.mark.parametrize(
+    ("column", "quantity", "named"),
+    [
+        ("rsrp_dbm", "path_gain", "is called like a received power"),
+        ("path_gain_db", "rsrp", "is called like a loss or gain"),
+    ],
+)
+def test_decibels_taken_for_others(town, column, quantity, named):
+    frame = links().rename(columns={"loss": column}).assign(**{column: -links()["loss"]})
+    offset = {"offset": {}} if quantity == "rsrp" else {}
+    assert named in suspicions(town, frame, links={"value": column, "quantity": quantity}, **offset)
+
+
+def test_links_of_another_town_are_refused(town):
+    with pytest.raises(InputError, match="all receivers lie more than"):
+        suspicions(town, links().assign(x=links().x + 690_000))
+
+
+def test_run_warns_before_it_traces(town):
+    links().assign(z=-4.0).to_csv(town / "sunk.csv", index=False)
+    (town / "sunk.toml").write_text(
+        'version = 1\n[scene]\nfile = "scene.xml"\nfrequency = 3.5e9\n[links]\nfile = "sunk.csv"\n'
+        'tx = [-5.0, 3.0, 25.0]\nrx = ["x", "y", "z"]\nvalue = "loss"\n[trace]\nsamples = 1000\nmax_depth = 0\n'
+        '[parameters]\n"walls.relative_permittivity" = { bounds = [1.5, 12.0] }\n'
+    )
+    result = CliRunner().invoke(app, ["run", str(town / "sunk.toml"), "--out", str(town / "out")])
+    assert "Warning: " in result.stderr
+    assert "60 of 60 receivers lie under the ground; check heights and their datum" in result.stderr
+    assert result.exit_code == 2  # and no path leads there

@@ -1,0 +1,33 @@
+"""One thread for the linear algebra, and as many as before afterwards."""
+
+import pytest
+from threadpoolctl import threadpool_info
+
+from calibray.support import threads
+
+
+def _numbers():
+    return [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
+
+
+def test_threads_are_as_before_afterwards():
+    before = _numbers()
+    with threads.one_thread():
+        assert set(_numbers()) == {1}
+        with threads.one_thread(wanted=False):
+            assert set(_numbers()) == {1}
+    assert _numbers() == before
+
+
+def test_nothing_is_changed_where_it_is_not_wanted():
+    before = _numbers()
+    with threads.one_thread(wanted=False):
+        assert _numbers() == before
+
+
+def test_libraries_are_looked_up_once(monkeypatch):
+    with threads.one_thread():
+        pass
+    monkeypatch.setattr(threads, "ThreadpoolController", lambda: pytest.fail("looked up again"))
+    with threads.one_thread():
+        assert set(_numbers()) == {1}

@@ -1,0 +1,63 @@
+"""Kept traces: given back as they were kept; a damaged one is dropped with a line and never becomes a number."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synthetic
+from calibray.support import cache_folder as caching
+from calibray.tracing import cache
+
+
+@pytest.fixture
+def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A kept trace with the fingerprint "d"."""
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
+    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
+    return tmp_path / "d.h5"
+
+
+def test_what_was_kept_is_found(entry: Path, caplog: pytest.LogCaptureFixture) -> None:
+    found = cache.find("d")
+    np.testing.assert_array_equal(found.tx_field, synthetic.program(synthetic.EVERY_KIND).tx_field)
+    assert cache.find("other") is None
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("damage", ["flipped", "cut", "emptied", "foreign", "a folder"])
+def test_a_damaged_entry_is_dropped_with_a_line(
+    entry: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = bytearray(entry.read_bytes())
+    if damage == "flipped":
+        # A field's bits in place of another number: nothing but the checksum tells.
+        whole[whole.rindex(np.float64(synthetic.program(synthetic.EVERY_KIND).delay[0]).tobytes())] ^= 1
+    contents = {"flipped": bytes(whole), "cut": bytes(whole[:-9]), "emptied": b"", "foreign": b"x,y\n1,2\n"}
+    if damage == "a folder":
+        entry.unlink()
+        entry.mkdir()
+        assert cache.find("d") is None
+        return
+    entry.write_bytes(contents[damage])
+    with caplog.at_level(logging.WARNING):
+        assert cache.find("d") is None
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "d.h5: is damaged" in caplog.text
+    assert "tracing again" in caplog.text
+    assert not entry.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_done_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "file"))
+    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
+    assert cache.find("d") is None
+    monkeypatch.setenv(caching.VARIABLE, "")
+    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
+    assert cache.find("d") is None

@@ -1,0 +1,155 @@
+"""Sharing a trace out over launches: every ray and receiver once, within bounds; repeats are found, samples kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibray.support import memory
+from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
+from calibray.tracing.settings import TraceSettings
+
+MASTS = np.repeat([[0.0, 0, 10], [50, 0, 10]], [7, 4], axis=0)[[0, 7, 1, 8, 2, 9, 3, 10, 4, 5, 6]]
+
+
+@pytest.mark.parametrize("samples", [1, 10, 999, 16_000_000])
+@pytest.mark.parametrize("depth", [0, 1, 5])
+@pytest.mark.parametrize("lanes", [100, 20_000, 10**9])
+def test_every_ray_goes_to_every_receiver_once(samples, depth, lanes):
+    if samples // lanes > 1000:
+        lanes = 20_000_000
+    settings = TraceSettings(samples=samples, max_depth=depth, seed=5)
+    found = plan(MASTS, settings, lanes, 1000)
+    sent = np.zeros(len(MASTS), dtype=np.int64)
+    for launch in found.launches:
+        assert (MASTS[launch.links] == launch.source).all()
+        assert (sent[launch.links] == launch.first).all()
+        sent[launch.links] += launch.rays
+        assert launch.last == (launch.first + launch.rays == samples)
+        assert launch.rays * max(depth, 1) * len(launch.links) <= max(lanes, max(depth, 1)) or depth == 0
+        assert (launch.seed == 5) == (launch.first == 0)
+    assert (sent == samples).all()
+    assert found.lanes <= max(lanes, depth)
+    assert found.memory >= found.lanes * LANE_BYTES
+
+
+def test_more_launches_than_could_be_kept_are_counted_and_made_one_by_one():
+    """10^12 rays to 10,000 receivers: 1.5 thousand million launches."""
+    tx = np.tile([[0.0, 0, 10]], (10_000, 1))
+    found = plan(tx, TraceSettings(samples=10**12, max_depth=3), 20_000_000, 1_000_000)
+    assert len(found.launches) == 10_000 * 150_000
+    assert found.lanes <= 20_000_001
+    assert found.memory < 2**31
+    for piece in (0, 1, 77_777, 149_999):
+        launch = found.launches[piece]
+        assert (launch.links.tolist(), launch.last) == ([0], piece == 149_999)
+        assert launch.first == 10**12 * piece // 150_000
+        assert launch.first + launch.rays == 10**12 * (piece + 1) // 150_000
+    assert found.launches[-1].links.tolist() == [9999]
+    assert [launch.first for launch in found.launches[150_000:150_002]] == [0, 6_666_666]
+    with pytest.raises(IndexError):
+        found.launches[len(found.launches)]
+
+
+def test_rays_are_shared_out_only_where_one_receiver_is_too_much():
+    settings = TraceSettings(samples=16_000_000, max_depth=3)
+    assert [launch.rays for launch in plan(MASTS[:1], settings, 20_000_000, 1).launches] == [
+        5_333_333, 5_333_333, 5_333_334,
+    ]  # fmt: skip
+    few = plan(MASTS, TraceSettings(samples=100, max_depth=3), 700, 1).launches
+    assert all(launch.rays == 100 and launch.last for launch in few)
+    assert sorted(len(launch.links) for launch in few) == [1, 2, 2, 2, 2, 2]
+
+
+def test_launches_of_one_receiver_have_seeds_of_their_own():
+    seeds = [
+        [launch.seed for launch in plan(MASTS[:1], TraceSettings(samples=100, seed=s), 30, 1).launches]
+        for s in (1, 2)
+    ]
+    assert len(seeds[0]) == 10
+    assert len({*seeds[0], *seeds[1]}) == 20
+
+
+def test_directions_cover_the_square_evenly():
+    """Every strip and every column of the square holds its share of the points."""
+    whole = np.hstack([directions(first, 500, 2000) for first in range(0, 2000, 500)])
+    for axis in whole:
+        np.testing.assert_allclose(np.histogram(axis, 20, (0, 1))[0], 100, atol=3)
+    np.testing.assert_array_equal(whole, directions(0, 2000, 2000))
+
+
+def rows(paths):
+    """`repeated` for (piece, link, kinds, shapes, vertices, drawn) of each path."""
+    piece, link, kind, shape, vertex, drawn = (np.array(column) for column in zip(*paths, strict=True))
+    return repeated(piece, link, kind, shape, vertex.astype(float), drawn).tolist()
+
+
+def test_repeats_are_paths_through_the_same_points_of_the_same_objects():
+    near, far = [[1.0, 2, 3], [4, 5, 6]], [[1.0, 2, 3.2], [4, 5, 6]]
+    edge = [[1.0 - 1e-4, 2 + 1e-4, 3 - 1e-4], [4, 5, 6]]  # on the other side of a line of one grid
+    first = (0, 7, [1, 4], [3, 8], near, False)
+    assert rows([first, (1, 7, [1, 4], [3, 8], near, False)]) == [False, True]
+    assert rows([first, (1, 7, [1, 4], [3, 8], edge, False)]) == [False, True]
+    for other in (
+        (1, 6, [1, 4], [3, 8], near, False),  # another link
+        (1, 7, [4, 4], [3, 8], near, False),  # another kind
+        (1, 7, [1, 4], [3, 9], near, False),  # another object
+        (1, 7, [1, 4], [3, 8], far, False),  # another point
+        (1, 7, [1, 4], [3, 8], near, True),  # a sample
+        (0, 7, [1, 4], [3, 8], near, False),  # the same launch, where the tracer has seen to it
+    ):
+        assert rows([first, other]) == [False, False]
+
+
+def test_what_stands_beyond_the_last_interaction_does_not_count():
+    one = (0, 7, [1, 0], [3, 8], [[1, 2, 3], [4, 5, 6]], False)
+    assert rows([one, (1, 7, [1, 0], [3, 9], [[1, 2, 3], [0, 0, 0]], False)]) == [False, True]
+
+
+def test_direct_paths_are_found_once():
+    direct = [(piece, 0, [0], [0], [[0, 0, 0]], False) for piece in range(3)]
+    assert rows(direct) == [False, True, True]
+
+
+def test_paths_that_fit_grow_with_memory_and_shrink_with_depth():
+    assert paths_that_fit(10**9, 2) > paths_that_fit(10**9, 5) > paths_that_fit(10**8, 5) > 0
+    assert paths_that_fit(0, 3) == 0
+
+
+def test_memory_is_the_least_that_system_and_container_have_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "SYSTEM", tmp_path / "meminfo")
+    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    whole = memory.available()
+    assert whole > 2**20  # half of what is built in, as nothing tells more
+    (tmp_path / "meminfo").write_text("MemTotal:  9 kB\nMemFree: 1 kB\nMemAvailable:   5000 kB\n")
+    assert memory.available() == 5000 * 1024
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.stat").write_text("anon 1000\nfile 400\n")
+    assert memory.available() == 5000 * 1024
+    (tmp_path / "memory.max").write_text("3000\n")
+    assert memory.available() == 2000
+    (tmp_path / "memory.max").write_text("500\n")
+    assert memory.available() == 0
+
+
+def test_long_traces_are_announced():
+    short = plan(MASTS[:1], TraceSettings(samples=1000, max_depth=2), 20_000_000, 1_000_000)
+    assert short.announcement(1) == ""
+    long = plan(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
+    assert long.announcement(11) == (
+        "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
+        "about 0.9 GiB of memory, besides that of the scene and the paths found, "
+        "and 7 seconds on two cores"
+    )
+    # Ten thousand times the rays take ten thousand times as long.
+    longer = plan(MASTS, TraceSettings(samples=40_000_000_000, max_depth=5), 20_000_000, 1_000_000)
+    assert longer.announcement(11).endswith("and 20 hours on two cores")
+
+
+def test_rays_added_in_rounds_take_a_launch_for_every_position():
+    found = plan(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
+    assert sorted(len(launch.links) for launch in found.launches) == [4, 7]
+    assert found.announcement(11) == (
+        "Tracing 11 links from 2 positions, rays added until path loss stands still; about 6 seconds on two cores, "
+        "longer where rays still find paths"
+    )

@@ -1,0 +1,114 @@
+"""Links that were not heard count with the probability that they were not: fits lean towards no lucky ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibray.uncertainty.censoring import joint, log_evidence, log_survival
+from calibray.uncertainty.noise_models import GAUSSIAN, HEAVY, Marginal, NoiseModel, noise_models
+
+SLOPE, OFFSET_DB, SPREAD_DB, LIMIT_DB = 5.0, 80.0, 4.0, 105.0
+WAY = np.tile(np.linspace(0.0, 10.0, 40), 3)
+SLOPES = np.linspace(2.0, 8.0, 241)
+GAUSS = NoiseModel(GAUSSIAN, 1.0)
+STUDENT = NoiseModel(HEAVY, 1.0, freedom=4.0)
+
+
+def test_the_integral_is_that_by_quadrature():
+    random = np.random.default_rng(1)
+    gap = 1.5 + 3.0 * random.standard_normal((1, 25))
+    unheard = gap[0] > 2.5
+    gap = np.where(unheard, 2.5, gap)
+    design, ridge = np.ones((25, 1)), np.array([1 / 10.0])
+    offsets, logs = np.meshgrid(np.linspace(-15, 25, 201), np.linspace(-1.5, 4.0, 141), indexing="ij")
+    scale, prior = np.exp(logs), np.exp(-0.5 * (ridge * offsets) ** 2) * ridge / np.sqrt(2 * np.pi)
+    for freedom in (np.inf, 4.0):
+        log_density = np.zeros_like(offsets)
+        for value, missing in zip(gap[0], unheard, strict=True):
+            error = (value - offsets) / scale
+            if missing:
+                log_density += log_survival(error, freedom)
+            else:
+                # The density is what the survival loses over a short way.
+                step = 1e-4
+                lost = np.exp(log_survival(error - step, freedom)) - np.exp(
+                    log_survival(error + step, freedom)
+                )
+                log_density += np.log(np.maximum(lost / (2 * step), 1e-200)) - logs
+        area = (40 / 200) * (5.5 / 140)
+        exact = np.log(np.sum(np.exp(log_density) * prior) * area)
+        assert log_evidence(gap, unheard, design, ridge, freedom)[0] == pytest.approx(exact, abs=0.1)
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 2.0, 4.0])
+def test_derivatives_are_those_of_finite_differences(freedom):
+    random = np.random.default_rng(2)
+    unheard = np.arange(30) % 3 == 0
+    left, columns = 3 * random.standard_normal((4, 30)), random.standard_normal((4, 30, 2))
+    point = np.column_stack([random.standard_normal((4, 2)), random.uniform(0.5, 1.5, 4)])
+    given = left, unheard, columns, np.array([0.3, 0.0]), freedom
+    _, slope, curvature = joint(point, *given)
+    for k in range(3):
+        step = 1e-5 * np.eye(3)[k]
+        (above, up, _), (below, down, _) = joint(point + step, *given), joint(point - step, *given)
+        assert slope[:, k] == pytest.approx((above - below) / 2e-5, rel=1e-6, abs=1e-6)
+        assert curvature[:, k] == pytest.approx((down - up) / 2e-5, rel=1e-5, abs=1e-5)
+
+
+def test_where_all_were_heard_it_is_what_it_was():
+    random = np.random.default_rng(3)
+    gap, way = 3 * random.standard_normal((3, 60)), random.standard_normal(60)
+    design, ridge = np.column_stack([np.ones(60), way]), np.zeros(2)
+    models = (GAUSS, STUDENT)
+    known = Marginal.of(design, ridge, np.ones(60), np.zeros((60, 3)), 3.0, models).densities(gap)
+    heard = np.zeros(60, dtype=bool)
+    for column, model in enumerate(models):
+        found = log_evidence(gap, heard, design, ridge, model.freedom)
+        assert found == pytest.approx(known[:, column], abs=0.2)
+
+
+@pytest.mark.parametrize("model", [GAUSS, STUDENT])
+def test_half_the_links_unheard_bias_nothing(model):
+    """A way along which path loss rises; from the middle on it is mostly beyond the floor."""
+    told: dict[str, list[float]] = {"censored": [], "left out": [], "at the floor": []}
+    for seed in range(25):
+        random = np.random.default_rng([seed, 7])
+        noise = (
+            random.standard_t(4, len(WAY)) / np.sqrt(2)
+            if model is STUDENT
+            else random.standard_normal(len(WAY))
+        )
+        loss = OFFSET_DB + SLOPE * WAY + SPREAD_DB * noise
+        unheard = loss >= LIMIT_DB
+        assert 0.35 < unheard.mean() < 0.65
+        measured, every = np.where(unheard, LIMIT_DB, loss), np.zeros(len(WAY), dtype=bool)
+        told["censored"].append(likeliest(measured, WAY, unheard, model))
+        told["left out"].append(likeliest(loss[~unheard], WAY[~unheard], every[~unheard], model))
+        told["at the floor"].append(likeliest(measured, WAY, every, model))
+    error = {name: np.std(values, ddof=1) / np.sqrt(25) for name, values in told.items()}
+    assert abs(np.mean(told["censored"]) - SLOPE) < 3 * error["censored"]
+    assert np.mean(told["left out"]) < SLOPE - 5 * error["left out"]
+    assert np.mean(told["at the floor"]) < SLOPE - 5 * error["at the floor"]
+
+
+def likeliest(measured: np.ndarray, way: np.ndarray, unheard: np.ndarray, model: NoiseModel) -> float:
+    """The slope of the largest density, offset and scale integrated out."""
+    one = np.ones(len(way))
+    marginal = Marginal.of(
+        one[:, None], np.zeros(1), one, np.zeros((len(way), 3)), SPREAD_DB, [model], unheard
+    )
+    found = marginal.densities(measured - SLOPES[:, None] * way)[:, 0]
+    return float(SLOPES[np.argmax(found)])
+
+
+def test_a_link_that_the_model_does_not_hear_either_agrees_with_it():
+    gap = np.array(
+        [[1.0, -2.0, 0.5, 3.0, -np.inf], [1.0, -2.0, 0.5, 3.0, -500.0], [1.0, -2.0, 0.5, -np.inf, -3.0]]
+    )
+    unheard = np.array([False, False, False, False, True])
+    models = noise_models(np.zeros((5, 3)), range_m=0.0, spread=0.0)
+    marginal = Marginal.of(np.ones((5, 1)), np.zeros(1), np.ones(5), np.zeros((5, 3)), 2.0, models, unheard)
+    found = marginal.densities(gap)
+    assert found[0] == pytest.approx(found[1], abs=1e-4)
+    assert (found[2] == -np.inf).all()

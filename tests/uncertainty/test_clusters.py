@@ -1,0 +1,215 @@
+"""Buildings that differ: what estimates owe to them, by closed forms and by planted buildings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from calibray.uncertainty.importance_sampling import Draws
+from calibray.uncertainty.indirect_inference import Leaning, following, means_behind, overstated, spreads
+from calibray.uncertainty.noise_models import DIFFERING, NoiseModel, noise_models
+from calibray.uncertainty.verdicts import verdicts
+
+COUNTS = np.array([30, 6, 3, 1])
+"""Links that lean on each of four buildings."""
+
+LINK_BUILDING = np.repeat(np.arange(4), COUNTS)
+NONE = np.zeros((len(LINK_BUILDING), 0))
+HALF = 0.5
+"""What the links tell as if all buildings were alike, in the unit cube."""
+
+
+def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray = NONE, prior: float = 0.0):
+    """Means that give `HALF` where buildings have so much of their own [n, 4] and path loss is linear [n]."""
+    effect = np.broadcast_to(effect, len(LINK_BUILDING))
+    slope = np.broadcast_to(effect[:, None], (len(own), len(effect), 1))
+    precision = np.full((len(own), 1 + design.shape[1]), 0.0)
+    precision[:, 0] = prior
+
+    def change(x, portion):
+        return effect * (x - HALF + portion * own[:, LINK_BUILDING])
+
+    return means_behind(
+        Leaning(np.full((len(own), 1), HALF), slope, design, precision), change, np.zeros((len(own), 1))
+    )[:, 0]
+
+
+def drawn(spread: float, count: int = 2000) -> np.ndarray:
+    """What buildings have of their own [n, 4]."""
+    return spread * np.random.default_rng(4).standard_normal((count, 4))
+
+
+def test_many_links_on_one_building_are_one():
+    own, share = drawn(0.05), COUNTS / COUNTS.sum()
+    assert behind(own) == pytest.approx(HALF - own @ share)
+
+
+def test_what_buildings_have_is_told_beside_an_offset():
+    """Least squares with an offset beside, to what the means found give, ends where the links said."""
+    own, effect = drawn(0.05, 50), np.random.default_rng(4).uniform(2.0, 20.0, len(LINK_BUILDING))
+    found = behind(own, effect, np.ones((len(effect), 1)))
+    design = np.column_stack([effect, np.ones(len(effect))])
+    answers = effect * (found[:, None] + own[:, LINK_BUILDING])
+    assert np.linalg.lstsq(design, answers.T, rcond=None)[0][0] == pytest.approx(HALF)
+    assert np.abs(behind(own, effect) - found).max() > 0.01
+
+
+def test_straight_lines_are_followed_so_far():
+    """With an offset fitted beside; as if every link had a building of its own, it would be said to be far less."""
+    random, own, place = np.random.default_rng(4), drawn(0.15, 4000), np.arange(4)
+    effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
+    design = np.column_stack([effect, np.ones(len(effect))])
+    estimate = np.linalg.lstsq(design, (effect * own[:, LINK_BUILDING]).T, rcond=None)[0][0]
+    slope = ((LINK_BUILDING[:, None] == place) * effect[:, None])[None]
+    found = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.zeros(2))
+    assert own @ found[0] == pytest.approx(estimate)
+    assert found.sum() == pytest.approx(1.0)
+    held = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.array([1e9, 0.0]))
+    assert np.abs(held).max() < 1e-3
+
+
+def test_what_cannot_be_followed_is_taken_straight():
+    """A step of path loss at the estimate: no place near it gives the estimate once buildings differ."""
+    leaning = Leaning(np.full((1, 1), HALF), np.ones((1, 3, 1)), np.zeros((3, 0)), np.zeros((1, 1)))
+    found = means_behind(leaning, lambda x, portion: np.full((1, 3), 4.0), np.full((1, 1), 0.6))
+    assert found.tolist() == [[0.6]]
+
+
+def test_a_prior_holds_what_buildings_could_move():
+    assert np.abs(behind(drawn(0.05), prior=1e6) - HALF).max() < 1e-4
+
+
+def test_waves_that_buildings_smear_do_not_look_like_loss():
+    """A damped wave for each of many buildings: fitted as one wave it looks more damped than it is for any of them."""
+    random, wave, spread = np.random.default_rng(1), 25.0, 0.05
+    link = random.uniform(0.5, 1.5, (1, 60))
+    own = spread * random.standard_normal((200, 60))
+
+    def response(damping, phase):
+        return 10.0 * np.exp(-3.0 * damping * link) * np.sin(wave * phase + 6.0 * link)
+
+    truth = np.full((200, 2), [0.3, 0.5])
+    told = response(truth[:, :1], truth[:, 1:] + own)
+
+    def residuals(x, answer):
+        return response(x[0], x[1])[0] - answer
+
+    estimate = np.array([
+        least_squares(residuals, [0.3, 0.5], args=(answer,), bounds=([0, 0], [1, 1])).x for answer in told
+    ])  # fmt: skip
+    assert np.median(estimate[:, 0]) > 0.4
+    step = 1e-6
+    slope = np.stack(
+        [
+            (response(*(estimate + step * unit).T[..., None]) - response(*estimate.T[..., None])) / step
+            for unit in np.eye(2)
+        ],
+        axis=2,
+    )
+    others = spread * random.standard_normal((200, 60))
+
+    def change(x, portion):
+        return response(x[:, :1], x[:, 1:] + portion * others) - response(*estimate.T[..., None])
+
+    leaning = Leaning(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6))
+    found = means_behind(leaning, change, np.full((200, 2), 0.9))
+    assert (found == 0.9).mean() < 0.2  # that cannot be followed
+    assert np.median(found[:, 0]) == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_density_is_too_sure_which_place_it_is():
+    """Of two places, by the variance of the logarithm of their ratio, over that which noise alone gives it."""
+    random = np.random.default_rng(4)
+    effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
+    other = np.where(LINK_BUILDING == 0, random.standard_normal(len(effect)), 0.0)
+    columns = np.column_stack([effect, np.ones(len(effect))])
+
+    def followed(gap: np.ndarray) -> np.ndarray:
+        return gap - (columns @ np.linalg.lstsq(columns, gap.T, rcond=None)[0]).T
+
+    own = random.standard_normal((2000, 1)) * other + drawn(0.3)[:, LINK_BUILDING]
+    noise = random.standard_normal(own.shape)
+    ratio, plain = (
+        0.5 * (np.sum(followed(gap) ** 2, axis=1) - np.sum(followed(gap - other) ** 2, axis=1))
+        for gap in (own + noise, noise)
+    )
+    leaning = Leaning(
+        np.full((len(own), 1), HALF), np.broadcast_to(effect[:, None], (len(own), len(effect), 1)),
+        np.ones((len(effect), 1)), np.zeros((len(own), 2)),
+    )  # fmt: skip
+    others = np.broadcast_to(other, (len(own), 1, len(effect)))
+    found = overstated(leaning, own, others)
+    # The square of a normal number is 1 on the mean and 0.45 in the middle.
+    assert 1.0 + (found - 1.0) / 0.455 == pytest.approx(ratio.var() / plain.var(), rel=0.1)
+    assert found > 3.0
+    assert overstated(leaning, own, 1e-3 * others) == 1.0  # no place of its own
+    shared = np.broadcast_to(columns @ [0.3, -2.0], own.shape)
+    assert overstated(leaning, shared, others) == pytest.approx(1.0)
+
+
+def test_a_density_divided_is_that_of_more_noise():
+    point = np.random.default_rng(6).uniform(-20.0, 20.0, (40_000, 1))
+    density = -0.5 * point[:, 0] ** 2
+    draws = Draws(point, density, np.exp(density) / np.exp(density).sum())
+    wider = draws.tempered(9.0)
+    assert wider.weight @ point[:, 0] ** 2 == pytest.approx(9.0, rel=0.05)
+    assert draws.tempered(1.0) is draws
+
+
+@pytest.fixture
+def models() -> tuple[NoiseModel, ...]:
+    return noise_models(np.random.default_rng(0).uniform(0, 100, (20, 3)), offset=False)
+
+
+def weights(models: tuple[NoiseModel, ...], **kinds: float) -> np.ndarray:
+    """Weights of the models at 4000 draws, so much for each kind [4000, models]."""
+    number = {kind: sum(model.kind == kind for model in models) for kind in kinds}
+    row = [kinds.get(model.kind, 0.0) / number.get(model.kind, 1) for model in models]
+    return np.tile(row, (4000, 1))
+
+
+def test_spreads_are_as_likely_as_the_data_say(models):
+    apart = spreads(models, weights(models, gaussian=0.2, heterogeneous=0.8), models)
+    # Four times as likely now and twice before: the data speak for it by two to one, and so was thought before.
+    assert np.mean(apart > 0) == pytest.approx(0.8 + 0.2 * 4 / 5, abs=0.015)
+    assert np.mean(apart == 0.3) == pytest.approx(0.8 / 3 + 0.2 * 4 / 5 * 0.137, abs=0.03)
+    alike = spreads(models, weights(models, gaussian=1.0), models)
+    assert np.mean(alike > 0) < 0.01
+    # Heavy tails explain all: nothing was learnt of buildings, and they differ as likely as was thought before.
+    heavy = spreads(models, weights(models, **{"student-t": 1.0}), models)
+    assert np.mean(heavy > 0) == pytest.approx(2 / 3, abs=0.03)
+
+
+def test_a_study_of_like_buildings_moves_nothing(models):
+    alike = tuple(model for model in models if model.kind != DIFFERING)
+    share = weights(alike, gaussian=1.0)
+    assert (spreads(alike, share, alike) == 0).all()
+
+
+def test_models_left_out_count_as_unlikely(models):
+    """Those that explain little are not evaluated; what is left tells of the others."""
+    left = tuple(replace(model) for model in models if model.kind == "gaussian")
+    assert np.mean(spreads(left, np.ones((2000, len(left))) / len(left), models) > 0) < 0.01
+
+
+def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():
+    """Links tell those seen to a tenth of the range; that others may differ widens the interval and says so."""
+    random = np.random.default_rng(2)
+    seen, means = (
+        Draws(point, np.zeros(4000), np.full(4000, 1 / 4000))
+        for point in (random.normal(0.5, 0.02, (4000, 1)), random.uniform(0.1, 0.9, (4000, 1)))
+    )
+
+    def told(draws: Draws, lean: Draws | None):
+        ends = np.zeros(1), np.ones(1)
+        return verdicts(draws, lambda points: points * 50.0, ["walls"], *ends, 3.0, seen=lean)[0]
+
+    assert told(means, seen).name == "weakly identified"
+    assert "buildings that were seen" in told(means, seen).reason
+    assert told(means, seen).pieces == told(means, None).pieces
+    assert told(means, None).name == "not identifiable"
+    assert told(means, means).name == "not identifiable"
+    assert told(seen, seen).name == "identified"

@@ -1,0 +1,73 @@
+"""Densities of gaps each under a model of its own against those under all models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibray.uncertainty import quadratic_forms as module
+from calibray.uncertainty.noise_models import Marginal, noise_models
+from calibray.uncertainty.quadratic_forms import Forms
+
+LINKS, COUNT = 30, 120
+
+
+def _marginal(columns, unheard=None):
+    random = np.random.default_rng(1)
+    position = random.uniform(0, 300, (LINKS, 3))
+    models = [
+        model
+        for model in noise_models(position, unheard=unheard is not None)
+        if model.kind != "heterogeneous"
+    ]
+    if unheard is not None:
+        models = [model for model in models if model.kind != "correlated"]
+    return Marginal.of(
+        random.standard_normal((LINKS, columns)),
+        np.array([0.0, 0.3])[:columns],  # the first is flat
+        random.uniform(0.8, 1.2, LINKS),
+        position,
+        3.0,
+        models,
+        unheard,
+    )
+
+
+def _asked(marginal, seed=2):
+    random = np.random.default_rng(seed)
+    gap = 3.0 * random.standard_normal((COUNT, LINKS)) + 15.0 * (random.random((COUNT, LINKS)) < 0.1)
+    gap[3, 4] = np.inf
+    return gap, random.integers(0, len(marginal.models), COUNT)
+
+
+@pytest.mark.parametrize("columns", [0, 2])
+@pytest.mark.parametrize("most", [module.LINKS, LINKS - 1])
+def test_each_is_as_under_all_models(columns, most, monkeypatch):
+    monkeypatch.setattr(module, "LINKS", most)
+    marginal = _marginal(columns)
+    gap, model = _asked(marginal)
+    forms = Forms.of(marginal)
+    assert bool(forms.square) == (most >= LINKS)
+    found, wanted = forms.densities(gap, model), marginal.densities(gap)[np.arange(COUNT), model]
+    assert np.isneginf(found[3])
+    there = np.arange(COUNT) != 3
+    assert found[there] == pytest.approx(wanted[there], abs=1e-3)
+
+
+def test_links_that_were_not_heard_are_left_to_the_density():
+    unheard = np.arange(LINKS) % 5 == 0
+    marginal = _marginal(1, unheard)
+    gap, model = _asked(marginal)
+    wanted = marginal.densities(gap)[np.arange(COUNT), model]
+    found = Forms.of(marginal).densities(gap, model)
+    np.testing.assert_array_equal(np.isfinite(found), np.isfinite(wanted))
+    assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3), abs=1e-4)
+
+
+def test_one_kind_alone_is_enough():
+    marginal = _marginal(0)
+    heavy = replace(marginal, models=tuple(model for model in marginal.models if model.kind == "student-t"))
+    gap, model = _asked(heavy)
+    wanted = heavy.densities(gap)[np.arange(COUNT), model]
+    found = Forms.of(heavy).densities(gap, model)
+    assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3), abs=1e-3)

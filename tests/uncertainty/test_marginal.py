@@ -1,0 +1,227 @@
+"""Densities of the measurements against integrals by brute force, and what planted errors speak for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.special import logsumexp
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from calibray.uncertainty import heavy_tails as tails
+from calibray.uncertainty.correlation import whitener
+from calibray.uncertainty.noise_models import (
+    OFFSET_DB,
+    Differing,
+    Marginal,
+    NoiseModel,
+    corners,
+    noise_models,
+)
+
+RANDOM = np.random.default_rng(1)
+COUNT = 6
+POSITION = RANDOM.uniform(0, 100, (COUNT, 3))
+GAP = RANDOM.normal(0, 2, COUNT)
+VARIANCE = RANDOM.uniform(0, 8, COUNT)
+SHIFT = RANDOM.normal(0, 1, COUNT)
+
+
+def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0) -> Marginal:
+    design = np.zeros((len(position), 0)) if design is None else design
+    ridge = np.zeros(design.shape[1]) if ridge is None else ridge
+    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models)
+
+
+def integral(log_density) -> float:
+    """Over the logarithm of the noise's size and one coefficient."""
+    size, coefficient = np.linspace(-2.5, 4, 261), np.linspace(-30, 30, 601)
+    value = log_density(coefficient[:, None, None], np.exp(size)[None, :, None])
+    return float(logsumexp(value) + np.log((size[1] - size[0]) * (coefficient[1] - coefficient[0])))
+
+
+@pytest.mark.parametrize(
+    ("model", "covariance"),
+    [
+        (NoiseModel("gaussian", 1.0), np.eye(COUNT)),
+        (
+            NoiseModel("correlated", 1.0, range_m=50.0, share=0.7),
+            0.7 * np.exp(-cdist(POSITION, POSITION) / 50) + 0.3 * np.eye(COUNT),
+        ),
+        (NoiseModel("heterogeneous", 1.0, spread=0.2), np.diag(1 + VARIANCE / 4)),
+    ],
+)
+def test_gaussian_densities_are_the_integrals(model, covariance):
+    precision, determinant = np.linalg.inv(covariance), np.linalg.slogdet(covariance)[1]
+
+    def log_density(offset, size):
+        left = GAP - SHIFT * (model.kind == "heterogeneous") - offset
+        square = np.einsum("...i,ij,...j->...", left, precision, left)
+        normal = COUNT * (np.log(size[..., 0]) + 0.5 * np.log(2 * np.pi)) + 0.5 * determinant
+        return -0.5 * square / size[..., 0] ** 2 - normal
+
+    found = marginal((model,), np.ones((COUNT, 1))).densities(
+        GAP[None], Differing(SHIFT[None], VARIANCE[None])
+    )
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
+
+
+def test_a_forgotten_offset_has_its_prior():
+    def log_density(offset, size):
+        prior = norm.logpdf(offset, 0, OFFSET_DB * size / 2.0)[..., 0]
+        return norm.logpdf(GAP, offset, size).sum(axis=-1) + prior
+
+    found = marginal((NoiseModel("gaussian", 1.0, offset=True),)).densities(GAP[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
+
+
+def _mixed(error):
+    return np.logaddexp(np.log(0.9) + norm.logpdf(error), np.log(0.1) + norm.logpdf(error, scale=7.0))
+
+
+@pytest.mark.parametrize(
+    ("model", "tail", "within"),
+    [
+        (NoiseModel("student-t", 1.0, freedom=4.0), lambda error: student.logpdf(error, 4), 0.25),
+        (NoiseModel("student-t", 1.0, gross=True), _mixed, 0.25),
+    ],
+)
+def test_heavy_tails_are_near_their_integral(model, tail, within):
+    """Over 40 links, four of them far off; with few, Laplace's approximation is rough."""
+    random = np.random.default_rng(3)
+    gap = 2.0 * random.standard_normal(40) + 20.0 * (np.arange(40) < 4)
+
+    def log_density(offset, size):
+        return (tail((gap - offset) / size) - np.log(size)).sum(axis=-1)
+
+    many = random.uniform(0, 100, (40, 3))
+    found = marginal((model,), np.ones((40, 1)), position=many).densities(gap[None])
+    assert found[0, 0] == pytest.approx(integral(log_density), abs=within)
+
+
+@pytest.mark.parametrize("tail", [tails.student(4.0), tails.gross()])
+def test_tails_are_densities_with_their_information(tail):
+    """By quadrature; the weight is the derivative of the logarithm."""
+    error = np.linspace(-200, 200, 400_001)
+    density = np.exp(tail.log_density(error**2))
+    assert np.trapezoid(density, error) == pytest.approx(1.0, abs=1e-3)
+    slope = np.gradient(np.log(density), error)
+    near = np.abs(error) < 30
+    assert (-error * tail.weight(error**2))[near] == pytest.approx(slope[near], abs=1e-3)
+    assert np.trapezoid(density * slope**2, error) == pytest.approx(tail.location, rel=1e-3)
+    assert np.trapezoid(density * (1 + error * slope) ** 2, error) == pytest.approx(tail.size, rel=2e-3)
+
+
+@pytest.mark.parametrize("tail", [tails.student(2.0), tails.student(4.0), tails.gross()])
+@pytest.mark.parametrize("columns", [0, 3])
+def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
+    """As far as many more steps would lead, of errors among which some are far off."""
+    random = np.random.default_rng(5)
+    gap = 3.0 * random.standard_normal((64, 60)) + 20.0 * (random.random((64, 60)) < 0.1)
+    design, ridge = random.standard_normal((60, columns)), np.full(columns, 0.2)
+    found = tails.evidence(gap, design, ridge, tail)
+    monkeypatch.setattr(tails, "STEPS", 400)
+    monkeypatch.setattr(tails, "CLOSE", 1e-9)
+    assert found == pytest.approx(tails.evidence(gap, design, ridge, tail), abs=0.02)
+
+
+def test_gaps_may_have_degrees_of_freedom_and_priors_of_their_own():
+    random = np.random.default_rng(6)
+    gap = 3.0 * random.standard_normal((40, 30)) + 20.0 * (random.random((40, 30)) < 0.1)
+    design, freedom = random.standard_normal((30, 2)), random.choice([2.0, 4.0, 8.0], 40)
+    ridge = random.uniform(0.1, 1.0, (40, 2))
+    found = tails.evidence(gap, design, ridge, tails.student(freedom))
+    alone = [
+        tails.evidence(gap[k : k + 1], design, ridge[k], tails.student(freedom[k]))[0] for k in range(40)
+    ]
+    assert found == pytest.approx(np.array(alone), abs=1e-6)
+    assert np.ptp(found) > 1.0
+
+
+def test_gross_errors_speak_for_themselves():
+    """One link of ten 20 dB off: neither Student's t nor Gaussian errors explain it as well."""
+    random = np.random.default_rng(5)
+    position = random.uniform(0, 600, (60, 2))
+    gap = 3 * random.standard_normal(60) + 20.0 * (np.arange(60) % 10 == 0)
+    models = noise_models(position, offset=False)
+    found = marginal(models, position=position, noise_db=3.0).densities(
+        gap[None], Differing(np.zeros((1, 60)), np.ones((1, 60)))
+    )[0]
+    assert models[int(np.argmax(found))].gross
+    assert not any(model.gross for model in noise_models(position, unheard=True))
+    assert not any(model.gross for model in noise_models(position, kind="student-t"))
+
+
+def test_neighbours_stand_for_all_where_links_are_many():
+    random = np.random.default_rng(0)
+    position, scale = random.uniform(0, 1000, (300, 3)), random.uniform(0.5, 2, 300)
+    exact, near = (whitener(position, scale, 80.0, 0.8, exact=exact) for exact in (300, 10))
+    errors = np.linalg.solve(exact.factor, random.standard_normal((300, 20)))
+    assert near.log_determinant == pytest.approx(exact.log_determinant, abs=1.0)
+    assert (near.apply(errors) ** 2).sum(axis=0) == pytest.approx(
+        (exact.apply(errors) ** 2).sum(axis=0), rel=0.01
+    )
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "correlated", "student-t", "heterogeneous"])
+def test_planted_errors_speak_for_their_kind(kind):
+    """Of 150 links; the kind planted gets the largest weight, and an offset is found where one was planted alone."""
+    random = np.random.default_rng(7)
+    position = random.uniform(0, 600, (150, 2))
+    variance = 0.15**2 * random.choice([0.0, 400.0], 150)
+    errors = {
+        "gaussian": 3 * random.standard_normal(150),
+        "correlated": 3
+        * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
+        @ random.standard_normal(150),
+        "student-t": 3 * random.standard_t(2.5, 150),
+        "heterogeneous": np.sqrt(1 + variance) * random.standard_normal(150),
+    }[kind]
+    models = noise_models(position)
+    assert sum(model.weight for model in models) == pytest.approx(1.0)
+    assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
+    density = marginal(models, position=position, noise_db=2.0)
+    differing = Differing(np.zeros((1, 150)), variance[None])
+    assert density.spread == 0.15
+
+    def weights(gap):
+        found = density.densities(gap[None], differing)[0]
+        share = np.exp(found - logsumexp(found))
+        kinds = {model.kind: 0.0 for model in models}
+        for model, each in zip(models, share, strict=True):
+            kinds[model.kind] += each
+        return kinds, sum(each for model, each in zip(models, share, strict=True) if model.offset)
+
+    kinds, offset = weights(errors)
+    assert max(kinds, key=kinds.get) == kind
+    if kind == "gaussian":
+        assert offset < 0.5 < weights(errors + 4.0)[1]
+
+
+def test_what_a_study_states_is_not_tried():
+    def kinds(**stated):
+        return {model.kind for model in noise_models(POSITION, **stated)}
+
+    assert kinds(kind="gaussian", range_m=0.0, spread=0.0) == {"gaussian"}
+    assert kinds(kind="student-t") == {"student-t"}
+    assert {model.range_m for model in noise_models(POSITION, range_m=60.0)} == {60.0}
+    assert {model.spread for model in noise_models(POSITION, spread=0.2)} == {0.2}
+    assert not any(model.offset for model in noise_models(POSITION, offset=False))
+
+
+def test_corners_tell_the_mean_and_the_variance_of_materials_that_differ():
+    """Of a curved function of three constants, against draws of it: to the second order both are right."""
+    slope, bend, spread = np.array([3.0, -2.0, 1.0]), np.array([4.0, 0.0, -7.0]), 0.15
+
+    def loss(factor):
+        return factor @ slope + 0.5 * factor**2 @ bend
+
+    there = loss(spread * corners(3))
+    drawn = loss(spread * np.random.default_rng(2).standard_normal((200_000, 3)))
+    assert there.mean() == pytest.approx(drawn.mean(), abs=0.003)
+    assert there.std() == pytest.approx(drawn.std(), rel=0.05)
+    for count in range(1, 9):
+        signs = corners(count)
+        assert np.array_equal(signs.T @ signs, len(signs) * np.eye(count))
+        assert np.array_equal(signs.sum(axis=0), np.zeros(count))

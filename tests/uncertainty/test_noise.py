@@ -1,0 +1,140 @@
+"""Noise against SciPy's densities, planted scales and ranges, and simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+from threadpoolctl import threadpool_limits
+
+from calibray.errors import EngineError, InputError
+from calibray.uncertainty.noise import Correlation, Noise, fit_correlation
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Small factors are slower on several threads where others compute too."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 4.0, 1.0])
+def test_the_log_likelihood_is_that_of_the_density(freedom):
+    rng = np.random.default_rng(0)
+    errors, scale, deviation = rng.normal(0, 4, (3, 25)), np.array([1.0, 3.0, 9.0]), rng.uniform(0.5, 2, 25)
+    density = stats.norm(0, scale[:, None] * deviation)
+    if np.isfinite(freedom):
+        density = stats.t(freedom, 0, scale[:, None] * deviation)
+    found = Noise(freedom).log_likelihood(errors, scale, deviation)
+    assert found == pytest.approx(density.logpdf(errors).sum(axis=1), rel=1e-12)
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 4.0, 1.0])
+def test_the_scale_is_that_of_largest_likelihood(freedom):
+    rng = np.random.default_rng(1)
+    noise, deviation = Noise(freedom), rng.uniform(0.5, 2, 40)
+    errors = rng.standard_t(4, (5, 40)) * 3.0 * deviation
+    best = noise.scale(errors, deviation)
+    top = noise.log_likelihood(errors, best, deviation)
+    for factor in (0.999, 1.001):
+        assert (noise.log_likelihood(errors, best * factor, deviation) < top).all()
+    assert noise.scale(10 * errors, deviation) == pytest.approx(10 * best)
+    assert noise.scale(np.zeros((1, 5))).tolist() == [0.0]
+
+
+def test_the_scale_of_planted_errors_is_recovered_and_outliers_move_a_gaussian_only():
+    rng = np.random.default_rng(2)
+    errors = 3.0 * rng.standard_t(4, (1, 20_000))
+    assert Noise(4.0).scale(errors)[0] == pytest.approx(3.0, rel=0.02)
+    spoilt = rng.normal(0, 3, (1, 2000))
+    spoilt[0, :200] += 20
+    assert Noise(4.0).scale(spoilt)[0] < 4.0
+    assert Noise().scale(spoilt)[0] > 6.0
+    with pytest.raises(InputError, match="freedom = 0, must be greater"):
+        Noise(0.0)
+
+
+def street(count: int, seed: int = 0) -> np.ndarray:
+    """Receivers along two streets [m]."""
+    rng = np.random.default_rng(seed)
+    along, across = rng.uniform(0, 1500, count), rng.choice([0.0, 400.0], count)
+    return np.stack([along, across, np.full(count, 1.5)], axis=1)
+
+
+def drawn(position: np.ndarray, range_m: float, shared: float, own: float, rng) -> np.ndarray:
+    """Errors of which neighbours share a part."""
+    matrix = Correlation(range_m, shared, own, 0.0, 0.0).covariance(position)
+    return np.linalg.cholesky(matrix) @ rng.normal(size=len(position))
+
+
+def test_range_and_size_of_a_shared_part_are_recovered():
+    position, rng = street(250), np.random.default_rng(3)
+    found = [fit_correlation(drawn(position, 60.0, 4.0, 2.0, rng), position) for _ in range(10)]
+    assert np.median([each.range_m for each in found]) == pytest.approx(60.0, rel=0.25)
+    assert np.median([each.shared_db for each in found]) == pytest.approx(4.0, rel=0.12)
+    assert np.median([each.own_db for each in found]) == pytest.approx(2.0, rel=0.12)
+    assert all(each.log_likelihood > each.independent + 5 for each in found)
+
+
+def test_errors_that_neighbours_do_not_share_are_said_to_be_independent():
+    position, rng = street(120), np.random.default_rng(4)
+    gain = [
+        (each := fit_correlation(rng.normal(0, 3, 120), position)).log_likelihood - each.independent
+        for _ in range(12)
+    ]
+    assert np.median(gain) < 1.0
+    assert max(gain) < 5.0
+
+
+def test_the_restricted_likelihood_is_the_density_of_what_the_columns_leave():
+    rng = np.random.default_rng(5)
+    position = street(40)
+    columns = np.column_stack([np.ones(40), position[:, 0] / 1000])
+    errors = drawn(position, 80.0, 3.0, 1.0, rng)
+    found = fit_correlation(errors, position, design=columns)
+    # Written out: the density of the errors' components at right angles to the columns, as Patterson and Thompson
+    # define it, but for the columns' own determinant.
+    null = np.linalg.svd(columns.T)[2][2:].T
+    matrix = null.T @ found.covariance(position) @ null
+    density = stats.multivariate_normal(np.zeros(38), matrix).logpdf(null.T @ errors)
+    inner = np.linalg.slogdet(columns.T @ columns)[1]
+    assert found.log_likelihood + 0.5 * inner == pytest.approx(density, abs=1e-6)
+    # What the columns explain does not matter.
+    shifted = fit_correlation(errors + columns @ [7.0, -3.0], position, design=columns)
+    assert shifted.log_likelihood == pytest.approx(found.log_likelihood, abs=1e-6)
+
+
+def test_columns_that_were_fitted_do_not_pass_for_less_noise():
+    rng, position, own = np.random.default_rng(6), street(60), []
+    columns = rng.normal(size=(60, 20))
+    for _ in range(30):
+        errors = rng.normal(0, 3, 60)
+        errors -= columns @ np.linalg.lstsq(columns, errors, rcond=None)[0]
+        parts = [fit_correlation(errors, position, design=each) for each in (columns, None)]
+        own.append([np.hypot(part.own_db, part.shared_db) for part in parts])
+    restricted, plain = np.mean(own, axis=0)
+    assert restricted == pytest.approx(3.0, rel=0.06)
+    assert plain < 2.7
+
+
+def test_whitened_errors_are_independent_and_of_unit_variance():
+    position, rng = street(80), np.random.default_rng(7)
+    known = Correlation(60.0, 4.0, 2.0, 0.0, 0.0)
+    deviation = rng.uniform(0.5, 2.0, 80)
+    matrix = known.covariance(position, deviation)
+    samples = np.linalg.cholesky(matrix) @ rng.normal(size=(80, 4000))
+    white = known.whitened(position, samples, deviation)
+    assert np.cov(white) == pytest.approx(np.eye(80), abs=0.1)
+    assert np.cov(samples) != pytest.approx(np.eye(80), abs=0.1)
+    cube = known.whitened(position, samples[:, :6].reshape(80, 2, 3), deviation)
+    assert cube.reshape(80, 6) == pytest.approx(white[:, :6])
+
+
+def test_errors_that_cannot_tell_are_refused():
+    position = street(5)
+    with pytest.raises(InputError, match="5 links beside 3 fitted columns"):
+        fit_correlation(np.ones(5), position, design=np.ones((5, 3)))
+    with pytest.raises(InputError, match="all receivers stand at one place"):
+        fit_correlation(np.ones(5), np.zeros((5, 3)))
+    with pytest.raises(EngineError, match="all errors are zero"):
+        fit_correlation(np.zeros(5), position)
