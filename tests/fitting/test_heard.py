@@ -131,12 +131,12 @@ def test_links_that_were_not_heard_are_counted_and_judge_nothing(tmp_path):
     table = table.assign(power=np.where(-table["path_loss_db"] > floor, -table["path_loss_db"], np.nan))
     links = {
         "file": "links.csv", "tx": list(planted.COLUMNS[:3]), "rx": list(planted.COLUMNS[3:]), "value": "power",
-        "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": floor, "unheard": "censor",
+        "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": floor, "below_floor": "censor",
     }  # fmt: skip
     method = {"name": "auto", "options": {"starts": 64}}
     found = calibrate(planted.study(tmp_path, table, links=links, method=method), engine=planted.engine())
     missing = table["power"].isna().to_numpy()
-    assert found.links["unheard"].to_numpy(bool).tolist() == missing.tolist()
+    assert found.links["censored"].to_numpy(bool).tolist() == missing.tolist()
     assert found.links["faint"].to_numpy(bool)[missing].all()
     assert found.prepared["at or below the noise floor, counted as censored"] == missing.sum() == 4
     assert found.counts["calibrated_on"] <= 8

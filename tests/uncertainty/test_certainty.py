@@ -30,7 +30,7 @@ from calibray.validation.validate import validated
 from calibray.validation.validation import CALIBRATED, LAW
 
 CENSORED = planted.content("links.csv")["links"] | {
-    "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "unheard": "censor",
+    "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
 }  # fmt: skip
 STEPS = 31
 """Values of every parameter that a posterior is taken on."""

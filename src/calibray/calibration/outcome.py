@@ -110,7 +110,7 @@ def outcome(
             "held_out": setup.held_out,
             "retrace_gap_db": np.nan if gap is None else gap,
             **({} if problem.faint is None else {"faint": problem.faint}),
-            **({} if links.unheard is None else {"unheard": links.unheard}),
+            **({} if links.censored is None else {"censored": links.censored}),
             **_places(links),
             **({"offset_only_db": offset_only} if fitted else {}),
             **seen.columns,
@@ -187,8 +187,8 @@ def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
     judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
-    if links.unheard is not None:
-        judged &= ~links.unheard
+    if links.censored is not None:
+        judged &= ~links.censored
     judgement: tuple[str, ...] = () if judged.any() or study.engine.name != "replay" else (UNJUDGED,)
     errors = (models.after - objective.measured)[judged]
     if judged.any():
@@ -223,7 +223,7 @@ def _held_out(problem: Problem, trail: Trail, models: Models) -> dict[str, Any]:
 
 def _left_out(problem: Problem) -> dict[str, int]:
     """How many links are left out that were heard, by what the model expects of them."""
-    faint, unheard = problem.faint, problem.setup.links.unheard
+    faint, unheard = problem.faint, problem.setup.links.censored
     count = 0 if faint is None else int((faint if unheard is None else faint & ~unheard).sum())
     return {FAINT: count} if count else {}
 

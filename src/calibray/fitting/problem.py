@@ -103,7 +103,7 @@ class Problem:
         """
         study, links, held_out = setup.study, setup.links, setup.held_out
         before = observable.modelled(engine, engine.parameters.start[None])[0]
-        unheard = np.zeros(len(links), dtype=bool) if links.unheard is None else links.unheard
+        unheard = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
         objective = make_objective(
             links,
             np.isfinite(before),

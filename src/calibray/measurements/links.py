@@ -39,8 +39,8 @@ class Measurements:
         frequency: Carrier of each link [links], [Hz], or None where all have the study's.
         limit_db: Path loss [links], [dB], beyond which a link could not have been measured, or None where none is
             known.
-        unheard: Which links [links] were not heard, so that their path loss is at least `path_loss_db`; None where all
-            were.
+        censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
+            no link is censored.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
         prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
@@ -63,7 +63,7 @@ class Measurements:
     group: NDArray[np.str_] | None = None
     frequency: NDArray[np.float64] | None = None
     limit_db: NDArray[np.float64] | None = None
-    unheard: NDArray[np.bool_] | None = None
+    censored: NDArray[np.bool_] | None = None
     table: SourceTable = field(default=None)  # type: ignore[assignment]
     prepared: dict[str, int] = field(default_factory=dict)
 
@@ -85,8 +85,8 @@ class Measurements:
             set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
         if self.limit_db is not None:
             set_field(self, "limit_db", _array("limit_db", self.limit_db, (count,)))
-        if self.unheard is not None:
-            set_field(self, "unheard", _array("unheard", self.unheard, (count,), np.bool_))
+        if self.censored is not None:
+            set_field(self, "censored", _array("censored", self.censored, (count,), np.bool_))
         if self.table is None:
             set_field(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
@@ -171,7 +171,7 @@ class Measurements:
             group=None if self.group is None else self.group[chosen],
             frequency=None if self.frequency is None else self.frequency[chosen],
             limit_db=None if self.limit_db is None else self.limit_db[chosen],
-            unheard=None if self.unheard is None else self.unheard[chosen],
+            censored=None if self.censored is None else self.censored[chosen],
             table=self.table.select(chosen),
             prepared=self.prepared,
         )

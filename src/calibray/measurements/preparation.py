@@ -23,8 +23,8 @@ Coordinates = Sequence[float | str]
 
 _DEGREES: Final = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
 _ROW: Final = "calibray row"
-UNHEARD: Final = "unheard"
-"""Column of rows that were not heard, where these are kept."""
+CENSORED: Final = "censored"
+"""Column that marks the rows below the noise floor, if these are kept."""
 
 _UNHEARD: Final = "calibray unheard"
 
@@ -89,7 +89,7 @@ class Preparation:
         transmitter: Column, of both tables, that says which transmitter it is.
         frame: Where the scene lies on the globe, for positions as longitude, latitude and height; None for metres.
         noise_floor_dbm: Values at or below it, and missing ones, were not heard [dBm].
-        censored: Whether rows that were not heard are kept, at the floor, and marked in the column `UNHEARD`.
+        censored: Whether rows that were not heard are kept, at the floor, and marked in the column `CENSORED`.
         averaging: How samples are averaged.
         keep: Columns that no average crosses, beside the transmitter.
         inside: What becomes of receivers on what buildings cover; nothing if None.
@@ -184,8 +184,8 @@ def prepare(
         table = _with_transmitters(table, steps)
     unheard = np.zeros(len(table), dtype=bool)
     if steps.noise_floor_dbm is not None:
-        marked = marked_censored(table.frame, value, steps.noise_floor_dbm, mark=UNHEARD)
-        unheard = (marked[UNHEARD] if steps.censored else marked.pop(UNHEARD)).to_numpy()
+        marked = marked_censored(table.frame, value, steps.noise_floor_dbm, mark=CENSORED)
+        unheard = (marked[CENSORED] if steps.censored else marked.pop(CENSORED)).to_numpy()
         table = SourceTable(marked, table.row, table.source)
         if steps.censored:
             counts["at or below the noise floor, counted as censored"] = int(unheard.sum())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.links import Measurements
-from calibray.measurements.preparation import UNHEARD, Coordinates, Preparation, positions, prepare
+from calibray.measurements.preparation import CENSORED, Coordinates, Preparation, positions, prepare
 from calibray.measurements.table_files import SourceTable, read_table
 from calibray.support.messages import did_you_mean
 
@@ -125,7 +125,7 @@ def measured_links(
         group=None if group is None else group_labels(table, group),
         frequency=None if frequency is None else table.numbers(frequency),
         limit_db=limit,
-        unheard=table.frame[UNHEARD].to_numpy(bool) if steps is not None and steps.censored else None,
+        censored=table.frame[CENSORED].to_numpy(bool) if steps is not None and steps.censored else None,
         table=table,
         prepared=made.counts,
     )

@@ -118,10 +118,10 @@ class Study(Section):
             raise InputError(
                 "links.quantity = 'rsrp' needs [offset]: what was transmitted is not known, and the offset takes it"
             )
-        if self.links.unheard == "censor" and self.noise.range_m not in ("auto", 0):
+        if self.links.below_floor == "censor" and self.noise.range_m not in ("auto", 0):
             raise InputError(
-                f"links.unheard = 'censor' with noise.range_m = {self.noise.range_m:g}: links that were not heard are "
-                "counted one by one, as if their errors were not alike; leave one of them out"
+                f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are "
+                "counted as if their errors were independent; leave one of them out"
             )
         frequency = self.scene.frequency
         for name, material in self.materials.items():

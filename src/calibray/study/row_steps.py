@@ -44,7 +44,7 @@ def preparation(study: Study) -> Preparation:
         wide=links.wide,
         where=links.where,
         noise_floor_dbm=links.noise_floor_dbm,
-        censored=links.unheard == "censor",
+        censored=links.below_floor == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
         keep=list(dict.fromkeys([*groups, *([links.frequency] if links.frequency else [])])),
         inside=inside,

@@ -150,9 +150,9 @@ class LinksSection(Section):
         heights: "ground" for heights above the scene's ground at each place; above the scene's zero if absent.
         transmitters: Table with a row for every transmitter, relative to the study file's folder.
         transmitter: Column, of both tables, that says which transmitter it is.
-        noise_floor_dbm: Received powers at or below it, and missing ones, were not heard [dBm].
-        unheard: What becomes of rows that were not heard: "exclude" leaves them out; with "censor" the intervals count
-            that no more than the noise floor was received there.
+        noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
+        below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, "censor" keeps them as
+            upper bounds of the received power, which the intervals take into account.
         inside: What becomes of receivers on what buildings cover: "keep", "drop", or "move" to the nearest street.
         average: How samples are averaged.
     """
@@ -174,7 +174,7 @@ class LinksSection(Section):
     transmitters: Text | None = None
     transmitter: Text = "transmitter"
     noise_floor_dbm: float | None = None
-    unheard: Literal["exclude", "censor"] = "exclude"
+    below_floor: Literal["exclude", "censor"] = "exclude"
     inside: Literal["keep", "drop", "move"] = "keep"
     average: AverageSection | None = None
 
@@ -185,14 +185,14 @@ class LinksSection(Section):
                 f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: is a received "
                 "power; filter losses by links.where"
             )
-        if self.unheard == "censor" and self.noise_floor_dbm is None:
+        if self.below_floor == "censor" and self.noise_floor_dbm is None:
             raise InputError(
-                "links.unheard = 'censor' needs noise_floor_dbm [dBm], below which nothing is heard"
+                "links.below_floor = 'censor' needs noise_floor_dbm [dBm], the floor at which links are censored"
             )
-        if self.unheard == "censor" and self.average is not None:
+        if self.below_floor == "censor" and self.average is not None:
             raise InputError(
-                "links.unheard = 'censor' with [links.average]: averages count what was not heard at half of the noise "
-                "floor already; leave one of them out"
+                "links.below_floor = 'censor' with [links.average]: averages already count samples below the "
+                "noise floor at half of the floor; leave one of them out"
             )
         return self
 

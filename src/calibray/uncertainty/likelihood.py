@@ -180,11 +180,11 @@ def _taking_part(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool
     are no selection by luck.
     """
     objective, links = problem.objective, problem.setup.links
-    if links.unheard is None or problem.faint is None:
+    if links.censored is None or problem.faint is None:
         return objective.weight, np.zeros(len(links), dtype=bool)
     # Where the model hears nothing either, it agrees, and there is nothing to learn.
     there = problem.faint & ~problem.setup.held_out & np.isfinite(problem.before)
-    return np.where(there, links.weight, objective.weight), links.unheard
+    return np.where(there, links.weight, objective.weight), links.censored
 
 
 def has_offset(problem: Problem) -> bool:
