@@ -16,7 +16,7 @@ def pytest_configure(config: pytest.Config) -> None:
     kept = getattr(config, "cache", None)  # not there with -p no:cacheprovider
     if kept is not None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv(caching.VARIABLE, str(kept.mkdir("calibray")))
+            patch.setenv(caching.CACHE_VARIABLE, str(kept.mkdir("calibray")))
             import calibray.fields  # noqa: F401
 
 

@@ -21,9 +21,9 @@ from calibray.study import Study
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
-from calibray.tracing.launches import Plan, plan
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.trace_plan import TracePlan, plan_trace
 from small_scenes import write_scene
 
 MIRROR = np.array([1.0, 1.0, -1.0])
@@ -54,8 +54,8 @@ class TwoRay:
     def with_settings(self, settings: TraceSettings) -> TwoRay:
         return replace(self, settings=settings)
 
-    def plan(self, links: Links) -> Plan:
-        return plan(positions(links)[0], replace(self.settings, samples=1), lanes=1000, buffer=0)
+    def plan(self, links: Links) -> TracePlan:
+        return plan_trace(positions(links)[0], replace(self.settings, samples=1), lanes=1000, buffer=0)
 
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None

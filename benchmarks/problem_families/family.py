@@ -32,7 +32,7 @@ from calibray.paths.program import concatenate, take, take_links
 from calibray.scenes import read_scene
 from calibray.support.messages import did_you_mean
 from calibray.tracing import cache
-from calibray.tracing.factory import SIONNA
+from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.settings import Antenna, TraceSettings
 from problem_families import optima
 from problem_families.numpy_replay import Direct
@@ -405,10 +405,10 @@ def _paths(
     digest = cache.trace_digest(
         SIONNA.versions, scene, frequency, settings, (antenna, antenna), links.tx, links.rx
     )
-    paths = cache.find(digest)
+    paths = cache.load_trace(digest)
     if paths is None:
         paths = SIONNA(scene, frequency, settings, antenna, antenna).trace(links)
-        cache.keep(digest, paths)
+        cache.store_trace(digest, paths)
     return paths
 
 

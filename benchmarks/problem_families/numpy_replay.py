@@ -56,7 +56,7 @@ class Direct:
         self._groups = _by_kinds(paths)
         self._scale = paths.spreading * speed_of_light / paths.frequency / (4.0 * np.pi)
         self._base = material_table(paths)
-        self._rows, self._columns = parameters.indices(list(paths.materials))
+        self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         link = np.repeat(paths.link, np.diff(paths.first))
         place = np.concatenate([link, link[faces]]) * len(self._base) + self._material
         count = len(place)

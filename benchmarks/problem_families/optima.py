@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from calibray.support.cache_folder import folder
+from calibray.support.cache_folder import cache_folder
 from calibray.support.output_files import replacing
 
 _ENTRY: Final = re.compile(r"optimum-[0-9a-f]{40}-[0-9]+\.json")
@@ -51,12 +51,12 @@ def keep(fingerprint: str, starts: int, rmse_db: float) -> None:
 
 def kept() -> list[Path]:
     """The files of the optima that are kept."""
-    here = folder()
+    here = cache_folder()
     if here is None or not here.is_dir():
         return []
     return sorted(path for path in here.iterdir() if _ENTRY.fullmatch(path.name) and path.is_file())
 
 
 def _path(fingerprint: str, starts: int) -> Path | None:
-    here = folder()
+    here = cache_folder()
     return None if here is None else here / f"optimum-{fingerprint[:40]}-{starts}.json"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibray.fields import path_gains
-from calibray.tracing.factory import trace
+from calibray.tracing.default_tracer import trace
 
 ANTENNA = {"pattern": "iso", "polarization": "V"}
 

@@ -5,7 +5,7 @@ Names are loaded when first used, so that importing the package costs nothing.
 
 from typing import TYPE_CHECKING
 
-from calibray.support.lazy import lazily
+from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray import engines as engines
@@ -55,4 +55,4 @@ _HOMES = {
 }
 
 __all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazily(__name__, _HOMES)
+__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)

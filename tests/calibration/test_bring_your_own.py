@@ -17,7 +17,7 @@ from calibray.measurements.received_power import with_transmitters
 from calibray.scenes.authoring.openstreetmap import read_openstreetmap
 from calibray.scenes.authoring.outlines import led_outside, outlines
 from calibray.scenes.authoring.scene_folder import make_scene
-from calibray.tracing.factory import trace
+from calibray.tracing.default_tracer import trace
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "bring_your_own"
 

@@ -24,7 +24,7 @@ from calibray.result import FILES, Result
 from calibray.result import tables as report
 from calibray.support.output_files import SIGNATURES
 from calibray.tables.text import render
-from calibray.tracing.enclosed import Enclosed
+from calibray.tracing.positions import EnclosedAntennas
 from problem_families import optima
 
 LOST_ROW = planted.INSIDE + 2  # the header is row 1
@@ -134,7 +134,7 @@ def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeyp
     def refuse(*_: object) -> None:
         pytest.fail("the ray tracer was loaded")
 
-    monkeypatch.setattr("calibray.tracing.factory.Sionna.__call__", refuse)
+    monkeypatch.setattr("calibray.tracing.default_tracer.SionnaFactory.__call__", refuse)
     arguments = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", "2")
     first = calibray(*arguments)
     assert first.exit_code == 0, first.output
@@ -264,13 +264,16 @@ def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
     result = Result.load(folder / "out")
     row, none = np.arange(2, 14), np.zeros(12, dtype=bool)
     few, most = np.arange(12) < 2, np.arange(12) < 11
-    told = render(*report.tables(replace(result, enclosed=Enclosed.of(row, none, few))))
+    told = render(*report.tables(replace(result, enclosed=EnclosedAntennas.of(row, none, few))))
     assert re.search(
         r"transmitter inside a building +0\nreceiver inside a building +2 +rows 2, 3: check", told
     )
-    indoors = render(*report.tables(replace(result, enclosed=Enclosed.of(row, most, most))))
+    indoors = render(*report.tables(replace(result, enclosed=EnclosedAntennas.of(row, most, most))))
     assert re.search(r"receiver inside a building +11 +as most are: taken for an indoor scene\n", indoors)
-    assert replace(result, enclosed=Enclosed.of(row, none, few)).counts["rows_with_enclosed_rx"] == [2, 3]
+    assert replace(result, enclosed=EnclosedAntennas.of(row, none, few)).counts["rows_with_enclosed_rx"] == [
+        2,
+        3,
+    ]
 
 
 def test_tables_fit_what_there_is(folder, ran):

@@ -98,7 +98,7 @@ def test_jacobian_equals_central_differences(paths: Paths, combining: str) -> No
 
 def test_forward_mode_through_the_pure_function_equals_the_engine(paths: Paths) -> None:
     parameters = all_parameters(paths)
-    rows, columns = parameters.indices(list(paths.materials))
+    rows, columns = parameters.matrix_indices(list(paths.materials))
     value, full = _value_and_jacobian(layout(paths).program, jnp.asarray(material_table(paths)))
     engine = Replay(paths, parameters, dtype=np.float64)
     loss, jacobian = engine.path_loss_and_jacobian(parameters.start[None])

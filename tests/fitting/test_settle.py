@@ -10,8 +10,8 @@ import planted
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.paths import take
-from calibray.tracing.launches import plan
 from calibray.tracing.settings import TraceSettings
+from calibray.tracing.trace_plan import plan_trace
 
 
 def stronger(decibels):
@@ -32,7 +32,7 @@ class StandIn:
         return self
 
     def plan(self, links):
-        return plan(links.tx, TraceSettings(samples=1, max_depth=1), 1000, 0)
+        return plan_trace(links.tx, TraceSettings(samples=1, max_depth=1), 1000, 0)
 
     def trace(self, links, progress=None, materials=None):
         self.asked += 1

@@ -43,7 +43,7 @@ def test_a_coefficient_that_is_no_parameter_is_that_of_the_materials_law():
     wall = law.materials([0.05], BASE, 28e9)["walls"]
     assert wall.conductivity == pytest.approx(0.05 * 28**0.7822)
     assert wall.relative_permittivity == 5.0  # of which nothing is a parameter
-    assert law.law([0.05]) == {"walls": {"itu_c": 0.05, "itu_d": 0.7822}}
+    assert law.law_coefficients([0.05]) == {"walls": {"itu_c": 0.05, "itu_d": 0.7822}}
     exponent = parameters("walls.itu_d")
     assert exponent.materials([0.5], BASE, 28e9)["walls"].conductivity == pytest.approx(0.0462 * 28**0.5)
 
@@ -51,27 +51,32 @@ def test_a_coefficient_that_is_no_parameter_is_that_of_the_materials_law():
 def test_entries_and_slopes_follow_the_law_and_leave_other_parameters_alone():
     law = parameters("walls.itu_b", "walls.thickness", "walls.itu_a", "walls.itu_c")
     points = np.random.default_rng(1).uniform(0.1, 2.0, (5, 4))
-    values, slopes = law.entries(points, 28e9)
+    values, slopes = law.constants_and_slopes(points, 28e9)
     np.testing.assert_allclose(values[:, 0], points[:, 2] * 28 ** points[:, 0])
     np.testing.assert_array_equal(values[:, 2], values[:, 0])
     np.testing.assert_array_equal(values[:, 1], points[:, 1])
     np.testing.assert_array_equal(slopes[:, 1], 1.0)
     for k in range(4):
         step = 1e-6 * np.eye(4)[k]
-        numeric = (law.entries(points + step, 28e9)[0] - law.entries(points - step, 28e9)[0])[:, k] / 2e-6
+        numeric = (
+            law.constants_and_slopes(points + step, 28e9)[0]
+            - law.constants_and_slopes(points - step, 28e9)[0]
+        )[:, k] / 2e-6
         np.testing.assert_allclose(slopes[:, k], numeric, rtol=1e-7)
     matrix = law.constants_of(points, BASE, 28e9)
     np.testing.assert_array_equal(matrix[:, 0, :3], values[:, [0, 3, 1]])
-    constants, places = law.at(28e9)
+    constants, places = law.at_carrier(28e9)
     assert constants.names == ("walls.relative_permittivity", "walls.thickness", "walls.conductivity")
     assert places.tolist() == [0, 1, 0, 2]
-    np.testing.assert_allclose(constants.start[places], law.entries(law.start, 28e9)[0])
+    np.testing.assert_allclose(constants.start[places], law.constants_and_slopes(law.start, 28e9)[0])
 
 
 def test_without_a_frequency_the_law_is_taken_at_the_carrier_of_the_parameters():
     law = parameters("walls.itu_a", "walls.itu_b")
-    np.testing.assert_array_equal(law.entries([3.0, 0.2])[0], law.entries([3.0, 0.2], 4e9)[0])
-    assert law.entries([3.0, 0.2], 1e9)[0][0] == 3.0
+    np.testing.assert_array_equal(
+        law.constants_and_slopes([3.0, 0.2])[0], law.constants_and_slopes([3.0, 0.2], 4e9)[0]
+    )
+    assert law.constants_and_slopes([3.0, 0.2], 1e9)[0][0] == 3.0
     assert power(np.array(3.0), np.array(0.2), 1e9).by_exponent == 0.0
 
 
@@ -118,7 +123,7 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
             "'walls.conductivity' is the same at every carrier and 'walls.itu_d' belongs to its law; remove one",
         ),
         (
-            lambda: parameters("walls.itu_a", "walls.thickness").indices(list(BASE)),
+            lambda: parameters("walls.itu_a", "walls.thickness").matrix_indices(list(BASE)),
             r"parameters walls\.itu_a, walls\.thickness: a law stands in no constants matrix; take them at a carrier",
         ),
         (

@@ -58,7 +58,7 @@ def test_the_batch_of_constants_equals_the_materials_one_by_one(units):
 
 
 def test_indices_point_at_the_cells_that_a_candidate_sets():
-    rows, columns = PARAMETERS.indices(["walls", "ground", "tower.7"])
+    rows, columns = PARAMETERS.matrix_indices(["walls", "ground", "tower.7"])
     assert rows.tolist() == [0, 2, 1, 0]
     assert [FIELDS[column] for column in columns] == [
         "relative_permittivity",
@@ -136,7 +136,7 @@ def test_impossible_sets_and_candidates_are_refused():
     with pytest.raises(InputError, match="no material 'walls'; did you mean 'wall'"):
         PARAMETERS.materials(PARAMETERS.start, {"wall": BASE["walls"]})
     with pytest.raises(InputError, match=r"no material 'tower\.7'"):
-        PARAMETERS.indices(["walls", "ground"])
+        PARAMETERS.matrix_indices(["walls", "ground"])
 
 
 @pytest.mark.parametrize(

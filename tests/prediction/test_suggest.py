@@ -55,8 +55,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
     places(np.geomspace(3, 290, 25)).to_csv(folder / "candidates.csv", index=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", str(folder / "cache"))
-        patch.setattr("calibray.tracing.factory.Sionna.versions", {"two-ray": "1"})
-        patch.setattr("calibray.tracing.factory.Sionna.__call__", lambda _, *given: TwoRay(*given))
+        patch.setattr("calibray.tracing.default_tracer.SionnaFactory.versions", {"two-ray": "1"})
+        patch.setattr(
+            "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *given: TwoRay(*given)
+        )
         cb.calibrate(study(folder), out=folder / "out")
         yield folder
 

@@ -19,7 +19,7 @@ from calibray.report import trace_tables as trace
 from calibray.result import tables as result
 from calibray.tables import Column, Table, html, markdown, numbers
 from calibray.tables.text import render, rows_text
-from calibray.tracing.enclosed import Enclosed
+from calibray.tracing.positions import EnclosedAntennas
 
 HOSTILE = '<script>alert("x")</script>&amp;'
 
@@ -29,10 +29,10 @@ def golden(name: str) -> str:
     return (shown.GOLDEN / f"{name}.txt").read_text(encoding="utf-8").removesuffix("\n")
 
 
-def inside(of: str) -> Enclosed:
+def inside(of: str) -> EnclosedAntennas:
     """Antennas inside buildings for the twelve links of the stored result: one, and most."""
     row, link, none = shown.result().links["row"].to_numpy(), np.arange(12), np.zeros(12, dtype=bool)
-    return Enclosed.of(row, none, link == 5 if of == "one" else link < 11)
+    return EnclosedAntennas.of(row, none, link == 5 if of == "one" else link < 11)
 
 
 def test_a_result_is_printed_as_ever():
@@ -46,7 +46,7 @@ def test_a_result_is_printed_as_ever():
 
 
 def test_a_trace_and_its_check_are_printed_as_ever():
-    enclosed = Enclosed.of(shown.ROWS, shown.ROWS < 4, shown.ROWS == 9)
+    enclosed = EnclosedAntennas.of(shown.ROWS, shown.ROWS < 4, shown.ROWS == 9)
     assert render(trace.found(shown.paths(), shown.ROWS, enclosed)) == golden("trace")
     assert render(*trace.convergence(shown.convergence(), shown.ROWS, 0.5)) == golden("convergence")
 

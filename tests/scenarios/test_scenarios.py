@@ -18,7 +18,7 @@ from calibray.scenarios import campaign, demo_study_path, district, sounder, wor
 from calibray.scenes.meshes import Mesh, joined, ply_bytes
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
-from calibray.tracing.factory import trace
+from calibray.tracing.default_tracer import trace
 
 PACKAGED = demo_study_path().parent
 BUILDINGS = district.district()

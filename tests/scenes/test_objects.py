@@ -7,7 +7,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import Measurements
 from calibray.scenes import export_scene, read_scene
-from calibray.tracing.factory import trace
+from calibray.tracing.default_tracer import trace
 
 CANYON = "sionna:simple_street_canyon"
 FREQUENCY = 3.5e9

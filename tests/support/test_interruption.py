@@ -103,7 +103,7 @@ def test_an_interruption_that_a_library_drops_comes_at_the_next_step(terminal, m
 
 @pytest.mark.parametrize("failure", [RuntimeError, SystemError, ImportError])
 def test_an_interruption_that_a_library_took_for_its_own_failure_is_one(failure):
-    @interruption.interruptible()
+    @interruption.unwrap_interruption()
     def work():
         try:
             raise KeyboardInterrupt
@@ -117,7 +117,7 @@ def test_an_interruption_that_a_library_took_for_its_own_failure_is_one(failure)
 @pytest.mark.parametrize("pressed", [True, False])
 def test_what_fails_after_ctrl_c_is_an_interruption_and_nothing_else_is(pressed):
     def work():
-        with interruption.noticed():
+        with interruption.ensure_interruption():
             with contextlib.suppress(KeyboardInterrupt):
                 if pressed:
                     signal.raise_signal(signal.SIGINT)
@@ -158,7 +158,7 @@ def test_an_interruption_waits_for_what_must_not_be_left_half_made():
     done = []
 
     def work():
-        with interruption.deferred():
+        with interruption.defer_interruption():
             signal.raise_signal(signal.SIGINT)
             done.append("whole")
 

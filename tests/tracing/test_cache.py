@@ -16,15 +16,15 @@ from calibray.tracing import cache
 @pytest.fixture
 def entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A kept trace with the fingerprint "d"."""
-    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
-    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
+    monkeypatch.setenv(caching.CACHE_VARIABLE, str(tmp_path))
+    cache.store_trace("d", synthetic.program(synthetic.EVERY_KIND))
     return tmp_path / "d.h5"
 
 
 def test_what_was_kept_is_found(entry: Path, caplog: pytest.LogCaptureFixture) -> None:
-    found = cache.find("d")
+    found = cache.load_trace("d")
     np.testing.assert_array_equal(found.tx_field, synthetic.program(synthetic.EVERY_KIND).tx_field)
-    assert cache.find("other") is None
+    assert cache.load_trace("other") is None
     assert not caplog.records
 
 
@@ -40,11 +40,11 @@ def test_a_damaged_entry_is_dropped_with_a_line(
     if damage == "a folder":
         entry.unlink()
         entry.mkdir()
-        assert cache.find("d") is None
+        assert cache.load_trace("d") is None
         return
     entry.write_bytes(contents[damage])
     with caplog.at_level(logging.WARNING):
-        assert cache.find("d") is None
+        assert cache.load_trace("d") is None
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "d.h5: is damaged" in caplog.text
     assert "tracing again" in caplog.text
@@ -55,9 +55,9 @@ def test_a_folder_that_cannot_be_written_is_done_without(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "file"))
-    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
-    assert cache.find("d") is None
-    monkeypatch.setenv(caching.VARIABLE, "")
-    cache.keep("d", synthetic.program(synthetic.EVERY_KIND))
-    assert cache.find("d") is None
+    monkeypatch.setenv(caching.CACHE_VARIABLE, str(tmp_path / "file"))
+    cache.store_trace("d", synthetic.program(synthetic.EVERY_KIND))
+    assert cache.load_trace("d") is None
+    monkeypatch.setenv(caching.CACHE_VARIABLE, "")
+    cache.store_trace("d", synthetic.program(synthetic.EVERY_KIND))
+    assert cache.load_trace("d") is None

@@ -14,10 +14,10 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenes import read_scene
-from calibray.tracing.launches import starts_at_receivers
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Trace, Tracer
 from calibray.tracing.sionna.chunks import without_empty_places
+from calibray.tracing.trace_plan import starts_at_receivers
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9

@@ -24,8 +24,8 @@ from calibray.study import Setup
 from calibray.support import cache_folder as caching
 from calibray.tracing import convergence
 from calibray.tracing.antennas import Radiator
-from calibray.tracing.enclosed import Enclosed
-from calibray.tracing.factory import SIONNA
+from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
 from calibray.tracing.settings import PATTERNS, POLARIZATIONS, Antenna, TraceSettings
 from small_scenes import write_scene
@@ -181,7 +181,7 @@ def test_lossless_antennas_radiate_the_power_they_take(pattern: str, mean: float
 def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one(
     plane: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(caching.CACHE_VARIABLE, str(tmp_path / "cache"))
     sections = {
         "scene": {"file": str(plane.path), "frequency": FREQUENCY},
         "parameters": {"ground.relative_permittivity": {"bounds": [1.5, 12.0]}},
@@ -208,7 +208,7 @@ def test_a_kept_trace_is_found_without_opening_a_tracer_and_never_by_another_one
 
 
 def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(caching.VARIABLE, "")
+    monkeypatch.setenv(caching.CACHE_VARIABLE, "")
     study = planted.study(tmp_path, planted.campaign())
     told: list[tuple] = []
     paths = cb.trace(study, progress=lambda *step: told.append(step))
@@ -253,17 +253,19 @@ def test_a_scene_alone_is_not_enough() -> None:
 
 def test_enclosed_antennas_are_told_by_row_unless_most_are() -> None:
     row, no = np.arange(2, 7), np.zeros(5, dtype=bool)
-    found = Enclosed.of(row, no, np.arange(5) == 3)
+    found = EnclosedAntennas.of(row, no, np.arange(5) == 3)
     assert (found.tx, found.rx, found.indoors) == ((), (5,), False)
-    assert Enclosed.of(row, np.arange(5) < 2, np.arange(5) > 1) == Enclosed((2, 3), (4, 5, 6), True)
+    assert EnclosedAntennas.of(row, np.arange(5) < 2, np.arange(5) > 1) == EnclosedAntennas(
+        (2, 3), (4, 5, 6), True
+    )
 
 
 # What loads the ray tracer
 
 LIGHT = (
-    "calibray.tracing", "calibray.tracing.protocol", "calibray.tracing.factory", "calibray.tracing.settings",
+    "calibray.tracing", "calibray.tracing.protocol", "calibray.tracing.default_tracer", "calibray.tracing.settings",
     "calibray.tracing.antennas", "calibray.tracing.cache", "calibray.tracing.convergence",
-    "calibray.tracing.enclosed", "calibray.study.trace", "calibray.study", "calibray.result", "calibray.engines",
+    "calibray.tracing.positions", "calibray.study.trace", "calibray.study", "calibray.result", "calibray.engines",
 )  # fmt: skip
 
 

@@ -18,10 +18,10 @@ from calibray.errors import EngineError, InputError
 from calibray.fields import path_gains, path_loss
 from calibray.paths import Paths
 from calibray.scenes import read_scene
-from calibray.support.interruption import interruptible
-from calibray.tracing.launches import directions
+from calibray.support.interruption import unwrap_interruption
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
+from calibray.tracing.trace_plan import directions
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -110,7 +110,7 @@ def test_paths_that_memory_cannot_hold_are_an_error(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
-    monkeypatch.setattr("calibray.tracing.sionna.tracer.available", lambda: 32_000)
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.available_memory", lambda: 32_000)
     with pytest.raises(
         EngineError, match=r"more paths than fit into memory, with 6 receivers at work; lower trace\.samples"
     ):
@@ -348,7 +348,7 @@ def test_an_interruption_in_the_midst_of_a_kernel_is_one():
         except BaseException as cause:
             raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from cause
 
-    with pytest.raises(KeyboardInterrupt), interruptible():
+    with pytest.raises(KeyboardInterrupt), unwrap_interruption():
         kernel(KeyboardInterrupt())
-    with pytest.raises(RuntimeError, match="while_loop"), interruptible():
+    with pytest.raises(RuntimeError, match="while_loop"), unwrap_interruption():
         kernel(ValueError("another"))

@@ -77,7 +77,7 @@ def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
 def test_a_stated_prior_is_kept_where_nothing_is_told():
     parameters, prior = _parameters(), LogNormal((0,), (4.0,), (0.1,))
     flat = _even(parameters)
-    density = -0.5 * prior.rows(flat.point)[:, 0] ** 2
+    density = -0.5 * prior.residuals(flat.point)[:, 0] ** 2
     weight = np.exp(density)
     alike = Draws(flat.point, density, weight / weight.sum())
     found = hierarchical(_hierarchy(parameters, _silent, 4, priors=prior), alike, COUNT, SWEEPS, seed=3)

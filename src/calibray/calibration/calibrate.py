@@ -21,10 +21,10 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.result import FILES, Result
 from calibray.study import Setup, Study
-from calibray.support.interruption import interruptible, noticed
+from calibray.support.interruption import ensure_interruption, unwrap_interruption
 from calibray.support.output_files import check_outputs
 from calibray.support.progress import Progress
-from calibray.tracing.factory import SIONNA
+from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.validate import check_engine, validated
@@ -36,8 +36,8 @@ FEW: Final = 2
 
 
 # Cut short, an import leaves modules half-made, and what fails then knows nothing of Ctrl-C.
-@noticed()
-@interruptible()
+@ensure_interruption()
+@unwrap_interruption()
 def calibrate(
     study: Study | Setup,
     method: str | None = None,

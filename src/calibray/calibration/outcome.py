@@ -22,7 +22,7 @@ from calibray.prediction.residual_field import measured_errors
 from calibray.result import Result
 from calibray.result.residuals import ResidualField
 from calibray.study import Study
-from calibray.tracing.enclosed import Enclosed
+from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
 from calibray.uncertainty.link_diagnostics import examined
 from calibray.uncertainty.noise_models import HEAVY
@@ -69,7 +69,7 @@ def outcome(
     gap: NDArray[np.float64] | None,
     certainty: Certainty,
     validation: Validation | None,
-    enclosed: Enclosed | None,
+    enclosed: EnclosedAntennas | None,
     seconds: float,
     trace_seconds: float,
     helper: Aid,
@@ -148,7 +148,7 @@ def outcome(
         trace_seconds=trace_seconds,
         links=table,
         history=trail.history(),
-        laws=parameters.law(trail.best),
+        laws=parameters.law_coefficients(trail.best),
         enclosed=enclosed,
         scene=setup.scene,
         files=setup.files,

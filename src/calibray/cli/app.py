@@ -29,7 +29,7 @@ from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
-from calibray.support.interruption import noticed
+from calibray.support.interruption import ensure_interruption
 
 LONGEST: Final = 4096
 """The number of characters beyond which an argument is refused; Linux takes no longer path."""
@@ -68,7 +68,7 @@ class Commands(TyperGroup):
             BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
-            with noticed():
+            with ensure_interruption():
                 return super().invoke(ctx)
         except InputError as error:
             typer.echo(f"Error: {error}", err=True)

@@ -15,14 +15,14 @@ def cache(
     The folder is named by CALIBRAY_CACHE; where that is empty, none are kept.
     """
     from calibray.support import cache_folder as caching
-    from calibray.support.cache_folder import compiled
+    from calibray.support.cache_folder import compiled_programs
     from calibray.tables import Column, Table, numbers
     from calibray.tables.text import render
     from calibray.tracing import cache as traces
 
-    folder, programs = caching.folder(), compiled()
+    folder, programs = caching.cache_folder(), compiled_programs()
     kept = {
-        "traces": traces.kept(),
+        "traces": traces.stored_traces(),
         "compiled programs": [] if programs is None else programs.kept(),
     }
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}

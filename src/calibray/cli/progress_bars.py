@@ -38,10 +38,10 @@ def progress_bars(console: Console, every: float | None = None) -> Iterator[Prog
         What to call with the stage's name, how much is done, and out of how much.
     """
     told = _bars(console) if console.is_terminal else _lines(console, every or EVERY)
-    with told as report, interruption.noticed():
+    with told as report, interruption.ensure_interruption():
 
         def progress(stage: str, done: int, total: int | None) -> None:
-            interruption.check()
+            interruption.raise_pending_interruption()
             report(stage, done, total)
 
         yield progress

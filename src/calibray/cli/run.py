@@ -95,8 +95,8 @@ def _kept(out: Path) -> str:
     if (out / LEDGER_FILE).is_file():
         with closing(open_ledger(out)) as ledger:
             parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
-    if cache.kept():
-        parts.append(f"finished traces in {caching.folder()}")
+    if cache.stored_traces():
+        parts.append(f"finished traces in {caching.cache_folder()}")
     kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished that could be kept."
     return f"{kept} Start the same command again to go on; what is kept is not computed twice."
 

@@ -75,7 +75,7 @@ def _traced(
     from functools import partial
 
     from calibray.fields import path_loss
-    from calibray.support.progress import staged
+    from calibray.support.progress import with_stage
     from calibray.tracing import convergence
 
     study, links, tracer = setup.study, setup.links, setup.tracer
@@ -86,7 +86,7 @@ def _traced(
         paths.save(out)
     loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
     return paths, convergence.check(
-        tracer, links, paths, loss, staged(progress, "checking")
+        tracer, links, paths, loss, with_stage(progress, "checking")
     ) if again else None
 
 

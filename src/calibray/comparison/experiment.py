@@ -19,7 +19,7 @@ from calibray.optimizers.labels import label
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
-from calibray.support.progress import Progress, staged
+from calibray.support.progress import Progress, with_stage
 from calibray.tables import display as glance
 
 METHODS: Final = ("gwo", "sgwo-im")
@@ -119,11 +119,11 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
     trace_seconds = time.perf_counter() - started
     chosen = replay if engine == "replay" else engines.make(setup, engine)
     results = {
-        method: calibrate(setup, method, seed, engine=chosen, progress=staged(progress, label(method)))
+        method: calibrate(setup, method, seed, engine=chosen, progress=with_stage(progress, label(method)))
         for method in METHODS
     }
-    results[MAPPING] = _mapped(setup, seed, staged(progress, label(MAPPING)))
-    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=staged(progress, label(AUTO)))
+    results[MAPPING] = _mapped(setup, seed, with_stage(progress, label(MAPPING)))
+    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=with_stage(progress, label(AUTO)))
     truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
     return Demo(
         results=results,

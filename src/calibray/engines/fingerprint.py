@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 
 from calibray.materials import Material
 from calibray.scenes import Scene
-from calibray.tracing.cache import meshes
 
 if TYPE_CHECKING:
     from calibray.study.setup import Setup
@@ -43,7 +42,7 @@ def fingerprint(setup: Setup) -> str:
         "materials": _fixed(scene.materials, free),
         "objects": [asdict(entry) for entry in scene.objects],
     }
-    if law := parameters.law(parameters.start):
+    if law := parameters.law_coefficients(parameters.start):
         record["law"] = {
             name: {key: value for key, value in entry.items() if f"{name}.{key}" not in parameters.names}
             for name, entry in law.items()
@@ -54,7 +53,7 @@ def fingerprint(setup: Setup) -> str:
         }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     digest.update(_geometry(scene))
-    for mesh in meshes(scene):
+    for mesh in mesh_files(scene):
         digest.update(mesh.read_bytes())
     for positions in (links.tx, links.rx):
         digest.update(positions.astype("<f8").tobytes())

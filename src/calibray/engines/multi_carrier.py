@@ -54,7 +54,7 @@ class ReplayCarriers:
         self.num_links = sum(len(carrier.links) for carrier in carriers)
         self._links = [carrier.links for carrier in carriers]
         self._frequencies = [carrier.paths.frequency for carrier in carriers]
-        acting = [parameters.at(frequency) for frequency in self._frequencies]
+        acting = [parameters.at_carrier(frequency) for frequency in self._frequencies]
         self._places = acting[0][1]  # the same at every carrier
         self._first = np.unique(self._places, return_index=True)[1]
         self._replays = [
@@ -87,7 +87,7 @@ class ReplayCarriers:
         given = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(given), self.num_links))
         for replay, frequency, links in self._carriers():
-            values, _ = self.parameters.entries(given, frequency)
+            values, _ = self.parameters.constants_and_slopes(given, frequency)
             loss[:, links] = replay.path_loss(values[:, self._first])
         self.calls += len(given)
         return loss
@@ -110,7 +110,7 @@ class ReplayCarriers:
         loss = np.empty((len(given), self.num_links))
         jacobian = np.empty((*loss.shape, len(self.parameters)))
         for replay, frequency, links in self._carriers():
-            values, slopes = self.parameters.entries(given, frequency)
+            values, slopes = self.parameters.constants_and_slopes(given, frequency)
             loss[:, links], by_constant = replay.path_loss_and_jacobian(values[:, self._first])
             jacobian[:, links] = by_constant[:, :, self._places] * slopes[:, None, :]
         self.calls += len(given)

@@ -71,7 +71,7 @@ class Replay:
         self._dtype, self._block = dtype, block
         self._offsets = fields.check_combining(paths, combining, bandwidth)
         self._combining = combining
-        self._rows, columns = parameters.indices(list(paths.materials))
+        self._rows, columns = parameters.matrix_indices(list(paths.materials))
         used, self._places = np.unique(columns, return_inverse=True)
         self._columns = columns
         self._base = fields.material_table(paths).astype(dtype)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calibray.engines.protocol import Engine
 from calibray.support.progress import Progress
-from calibray.support.strict import Section
+from calibray.support.strict_models import Section
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Crew

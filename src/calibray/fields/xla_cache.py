@@ -25,7 +25,7 @@ def keep_compiled() -> bool:
     Returns:
         Whether it does: there is a folder for it that can be trusted, and JAX can be told of it.
     """
-    kept = caching.compiled()
+    kept = caching.compiled_programs()
     if kept is None or jax.config.values["jax_compilation_cache_dir"] is not None or not kept.trusted:
         return False
     try:

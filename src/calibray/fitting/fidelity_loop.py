@@ -12,7 +12,7 @@ from calibray.engines.protocol import Parted
 from calibray.fitting.methods import AUTO, choose
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
-from calibray.support.progress import Progress, staged
+from calibray.support.progress import Progress, with_stage
 
 
 def settle(
@@ -41,7 +41,7 @@ def settle(
     gap = None
     for turn in range(study.fidelity.rounds):
         materials = parameters.materials(trail.best, problem.engine.materials)
-        told = staged(progress, "checking")
+        told = with_stage(progress, "checking")
         if isinstance(problem.engine, Parted):
             again = problem.engine.traced_with(materials, told)
         else:

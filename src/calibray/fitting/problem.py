@@ -192,9 +192,9 @@ class Problem:
             unit[:, :-1] = parameters.search_slope(candidates)
         products = products * unit[:, :, None] * unit[:, None, :]
         if len(self.priors):
-            known = -objective.noise_db * self.priors.rows(candidates)[..., None]
+            known = -objective.noise_db * self.priors.residuals(candidates)[..., None]
             if derivatives:
-                slopes = objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :-1]
+                slopes = objective.noise_db * self.priors.jacobian(candidates) * unit[:, None, :-1]
                 known = np.concatenate([slopes, known], axis=2)
             products = products + known.transpose(0, 2, 1) @ known
             count += known.shape[1]
@@ -234,7 +234,7 @@ class Problem:
         residuals = self.objective.residuals(modelled)
         if not len(self.priors):
             return residuals
-        rows = self.objective.noise_db * self.priors.rows(candidates)
+        rows = self.objective.noise_db * self.priors.residuals(candidates)
         return np.concatenate([residuals, rows], axis=1)
 
     def slopes(
@@ -257,7 +257,7 @@ class Problem:
         if not len(self.priors):
             return jacobian
         unit = self.parameters.search_slope(candidates)
-        rows = self.objective.noise_db * self.priors.slopes(candidates) * unit[:, None, :]
+        rows = self.objective.noise_db * self.priors.jacobian(candidates) * unit[:, None, :]
         others = np.zeros((*rows.shape[:2], slope.shape[2] - rows.shape[2]))
         return np.concatenate([jacobian, np.concatenate([rows, others], axis=2)], axis=1)
 

@@ -15,8 +15,8 @@ from calibray.engines.protocol import Engine
 from calibray.errors import InputError
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.optimizers import Optimizer
+from calibray.support.blas_threads import single_blas_thread
 from calibray.support.progress import Progress
-from calibray.support.threads import one_thread
 
 Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
 """Points of the search space [n, d], and whether derivatives are wanted, to what an optimizer is told."""
@@ -34,7 +34,7 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
     """
     derivatives = optimizer.needs_derivatives()
     # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
-    with one_thread():
+    with single_blas_thread():
         while not optimizer.done:
             points = optimizer.ask()
             told = evaluate(points, derivatives)

@@ -17,7 +17,7 @@ from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.schedule import AS_GIVEN, Schedule
 from calibray.optimizers.session import Search, Session
-from calibray.support.interruption import deferred
+from calibray.support.interruption import defer_interruption
 
 
 def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -38,7 +38,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
     # SciPy drops an interruption while it reads its direction numbers, and goes on without them.
-    with deferred():
+    with defer_interruption():
         sequence = qmc.Sobol(dimension, rng=rng)
     # Sobol points are balanced in blocks of a power of two only, and SciPy warns about other counts.
     return sequence.random_base2((count - 1).bit_length())[:count]

@@ -74,7 +74,7 @@ def power(scale: NDArray[np.float64], exponent: NDArray[np.float64], frequency: 
     return Power(value, rise, value * log(frequency_ghz))
 
 
-def steady_law(material: Material) -> ItuLaw:
+def frequency_independent_law(material: Material) -> ItuLaw:
     """The law of a material whose constants are the same at every frequency."""
     return ItuLaw(0, inf, material.relative_permittivity, 0.0, material.conductivity, 0.0)
 

@@ -17,7 +17,7 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
-from calibray.parameters.laws import CONSTANT, LAWS, PARAMETER_BOUNDS, steady_law
+from calibray.parameters.laws import CONSTANT, LAWS, PARAMETER_BOUNDS, frequency_independent_law
 from calibray.support.messages import did_you_mean
 
 Scale = Literal["linear", "log"]
@@ -166,7 +166,9 @@ def make_parameter(
     if start is None and field in FIELDS:
         value = float(getattr(base[material], field))
     elif start is None:
-        value = float(getattr((laws or {}).get(material) or steady_law(base[material]), field[-1]))
+        value = float(
+            getattr((laws or {}).get(material) or frequency_independent_law(base[material]), field[-1])
+        )
     elif isinstance(start, str):
         value = itu_start(name, start, frequency)
     elif isinstance(start, bool) or not isfinite(start):

@@ -20,7 +20,7 @@ class LogNormal:
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
-        >>> prior.rows(np.array([[4.0, 1.0], [8.0, 1.0]])).round(2).tolist()
+        >>> prior.residuals(np.array([[4.0, 1.0], [8.0, 1.0]])).round(2).tolist()
         [[0.0], [2.31]]
     """
 
@@ -31,7 +31,7 @@ class LogNormal:
     def __len__(self) -> int:
         return len(self.index)
 
-    def rows(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rows of residuals, in units of the noise, that stand for the priors.
 
         Args:
@@ -42,7 +42,7 @@ class LogNormal:
         """
         return (np.log(candidates[:, self._place]) - np.log(self.centre)) / self.spread
 
-    def slopes(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives of the rows by the parameters.
 
         Args:

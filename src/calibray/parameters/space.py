@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, ItuLaw, Material, constants_matrix
-from calibray.parameters.laws import LAWS, PARAMETER_BOUNDS, check_law, power, steady_law
+from calibray.parameters.laws import LAWS, PARAMETER_BOUNDS, check_law, frequency_independent_law, power
 from calibray.parameters.parameter import Parameter, check_material
 
-_NO_LAW: Final = steady_law(Material(1.0, 0.0, 1.0))
+_NO_LAW: Final = frequency_independent_law(Material(1.0, 0.0, 1.0))
 _UNBOUNDED: Final = 1e300
 
 MAX_PARAMETERS: Final = 10_000
@@ -106,7 +106,7 @@ class Parameters:
         """
         return dict(zip(self.names, self._components(candidate).tolist(), strict=True))
 
-    def entries(
+    def constants_and_slopes(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What candidates put into a constants matrix at one carrier.
@@ -140,7 +140,7 @@ class Parameters:
         """Whether some parameter is a coefficient of a law."""
         return any(parameter.field != parameter.constant for parameter in self.items)
 
-    def at(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
+    def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
         """The constants that the parameters act on, as parameters themselves: what is left of laws at one carrier.
 
         Args:
@@ -152,7 +152,7 @@ class Parameters:
         """
         if not self.has_laws:
             return self, np.arange(len(self))
-        starts, _ = self.entries(self.start, frequency)
+        starts, _ = self.constants_and_slopes(self.start, frequency)
         found: dict[str, Parameter] = {}
         for parameter, start in zip(self.items, starts.tolist(), strict=True):
             name = f"{parameter.material}.{parameter.constant}"
@@ -163,7 +163,7 @@ class Parameters:
         places = [order[f"{parameter.material}.{parameter.constant}"] for parameter in self.items]
         return Parameters(tuple(found.values()), frequency), np.array(places, dtype=np.int64)
 
-    def law(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
+    def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
         """The coefficients of the laws that a candidate describes.
 
         Args:
@@ -238,17 +238,17 @@ class Parameters:
                 f"candidate: shape {values.shape}, must be ({len(self)},), one value per parameter"
             )
         changes: dict[str, dict[str, float]] = {}
-        entries, _ = self.entries(values, frequency)
+        entries, _ = self.constants_and_slopes(values, frequency)
         for parameter, value in zip(self.items, entries.tolist(), strict=True):
             check_material(parameter.name, base)
             changes.setdefault(parameter.material, {})[parameter.constant] = value
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
-    def indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Where each parameter stands in a constants matrix [materials, fields].
 
         A pure replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``. Coefficients
-        of laws stand nowhere there; what they come to at a carrier does (`at`).
+        of laws stand nowhere there; what they come to at a carrier does (`at_carrier`).
 
         Args:
             materials: The names of the matrix's rows, in order; its columns are `FIELDS`.
@@ -287,8 +287,11 @@ class Parameters:
             InputError: The candidates have another length, or a parameter's material is unknown.
         """
         carrier = self.frequency if frequency is None else frequency
-        (values, _), (acting, places) = self.entries(candidates, carrier), self.at(carrier)
-        rows, columns = (index[places] for index in acting.indices(list(base)))
+        (values, _), (acting, places) = (
+            self.constants_and_slopes(candidates, carrier),
+            self.at_carrier(carrier),
+        )
+        rows, columns = (index[places] for index in acting.matrix_indices(list(base)))
         matrix = constants_matrix(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
         batch[..., rows, columns] = values

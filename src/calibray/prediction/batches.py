@@ -16,7 +16,7 @@ from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.position_checks import remarks
 from calibray.prediction.predict import as_links, check_groups, interval, opened
 from calibray.study import Setup
-from calibray.support.progress import Progress, part
+from calibray.support.progress import Progress, with_total
 
 if TYPE_CHECKING:
     from calibray.result import Result
@@ -140,7 +140,7 @@ def predicted_in_pieces(
     done, size = 0, PIECE if crew is None else piece_size(setup, crew)
     for rows in table.pieces(size):
         setup = setup.at(as_links(result, rows))
-        told = predicted(result, setup, level, part(progress, done, table.rows), crew, remarked=True)
+        told = predicted(result, setup, level, with_total(progress, done, table.rows), crew, remarked=True)
         done += len(rows)
         yield setup.links, told
 

@@ -26,7 +26,7 @@ from calibray.scenes.authoring.ground import ground_heights
 from calibray.scenes.triangles import Triangles, read_triangles
 from calibray.study import Study
 from calibray.study.row_steps import known_frame
-from calibray.support.progress import Progress, part
+from calibray.support.progress import Progress, with_total
 
 if TYPE_CHECKING:
     from calibray.result import Result
@@ -155,7 +155,7 @@ def coverage_map(
         block = wanted[start : start + size]
         rows = pd.DataFrame({**_ends(place, rx[block]), **held})
         setup = setup.at(as_links(result, rows))
-        told = predicted(result, setup, level, part(progress, int(block[0]), len(rx)), crew)
+        told = predicted(result, setup, level, with_total(progress, int(block[0]), len(rx)), crew)
         for row, name in enumerate(("path_loss_db", "lower_db", "upper_db")[: 1 if level is None else 3]):
             found[row, block] = told[name]
     loss, lower, upper = found.reshape(3, *z.shape)

@@ -15,13 +15,13 @@ from calibray.tables.text import LISTED, rows_text
 if TYPE_CHECKING:
     from calibray.paths import Paths
     from calibray.tracing.convergence import Convergence
-    from calibray.tracing.enclosed import Enclosed
+    from calibray.tracing.positions import EnclosedAntennas
 
 VISIBLE_DB: Final = 0.005
 """Change [dB] that is not 0 when shown to 0.01 dB."""
 
 
-def found(paths: Paths, row: NDArray[np.int64], enclosed: Enclosed | None) -> Table:
+def found(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
     """What a trace found.
 
     Args:

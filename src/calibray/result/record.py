@@ -26,7 +26,7 @@ from calibray.study import Study
 from calibray.support.output_files import check_outputs, check_unchanged, write_text
 from calibray.support.progress import Progress
 from calibray.tables import display as glance
-from calibray.tracing.enclosed import Enclosed
+from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.intervals import Interval
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class Result:
     history: pd.DataFrame
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
     groups_without_path: tuple[str, ...] = ()
-    enclosed: Enclosed | None = None
+    enclosed: EnclosedAntennas | None = None
     scene: Scene | None = None
     files: dict[str, str] = field(default_factory=dict)
     paths: Paths | None = None
@@ -289,7 +289,7 @@ class Result:
         # Results of the version before say nothing of enclosed antennas.
         if stored.links is not None and stored.antennas_indoors is not None:
             tx, rx = stored.links.rows_with_enclosed_tx or (), stored.links.rows_with_enclosed_rx or ()
-            given["enclosed"] = Enclosed(tx, rx, stored.antennas_indoors)
+            given["enclosed"] = EnclosedAntennas(tx, rx, stored.antennas_indoors)
         if stored.chosen is not None:
             terms = tuple(ChosenTerm(**asdict(each)) for each in stored.chosen.terms)
             given["chosen"] = replace(Chosen(**asdict(stored.chosen)), terms=terms)

@@ -16,7 +16,7 @@ from calibray.result.residuals import ResidualField
 from calibray.study import Study
 from calibray.study.validation_errors import explain
 from calibray.support.messages import shortened
-from calibray.support.strict import CLOSED, Section
+from calibray.support.strict_models import CLOSED, Section
 from calibray.uncertainty.intervals import Interval
 
 VERSION = 1

@@ -11,7 +11,7 @@ from calibray.tables.text import decibels, rows_text
 
 if TYPE_CHECKING:
     from calibray.result.record import Result
-    from calibray.tracing.enclosed import Enclosed
+    from calibray.tracing.positions import EnclosedAntennas
     from calibray.uncertainty.intervals import Interval
 
 SHOWN: Final = 3
@@ -87,7 +87,7 @@ def links(result: Result) -> Table:
 
 
 def suspects(
-    without_path: Sequence[int], verdict: str, enclosed: Enclosed | None
+    without_path: Sequence[int], verdict: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
     """Rows of a table of links: those that need a look.
 

@@ -17,7 +17,7 @@ from calibray.scenarios.district import lamp_places, scene_objects
 from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
 from calibray.scenes.meshes import write_scene
-from calibray.tracing.factory import trace
+from calibray.tracing.default_tracer import trace
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}
 SPECULAR: Final[dict[str, Any]] = {"max_depth": 4, "samples": 500_000}

@@ -24,7 +24,7 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
-from calibray.parameters.laws import steady_law
+from calibray.parameters.laws import frequency_independent_law
 from calibray.scenes.scene_file import check_files, check_shape, parse, scene_path
 from calibray.support.messages import did_you_mean
 
@@ -248,7 +248,7 @@ def _law(
     frequency: float,
 ) -> ItuLaw:
     """How a material's constants follow the frequency: those given as numbers do not."""
-    steady = steady_law(material)
+    steady = frequency_independent_law(material)
     if isinstance(override, Material):
         return steady
     given = {key: value for key, value in (override or {}).items() if value is not None}

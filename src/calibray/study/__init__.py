@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from calibray.support.lazy import lazily
+from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray.study.model import VERSION as VERSION
@@ -18,4 +18,4 @@ _HOMES = {
 }
 
 __all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazily(__name__, _HOMES)
+__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)

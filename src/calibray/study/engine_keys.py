@@ -12,7 +12,7 @@ from calibray.engines.kinds import DEFAULT, KINDS
 from calibray.errors import InputError
 from calibray.study.validation_errors import words
 from calibray.support.messages import shortened
-from calibray.support.strict import CLOSED
+from calibray.support.strict_models import CLOSED
 
 
 def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:

@@ -19,7 +19,7 @@ from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.measurements import LINK_COLUMNS, Measurements, links_from_table, measured_links
 from calibray.measurements.table_files import SourceTable, read_table
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
-from calibray.parameters.laws import steady_law
+from calibray.parameters.laws import frequency_independent_law
 from calibray.study.engine_keys import part_engine
 from calibray.study.row_steps import AS_THEY_ARE, placing, preparation
 from calibray.study.sections import (
@@ -42,7 +42,7 @@ from calibray.study.toml_file import expand, read_content, refuse_unquoted_names
 from calibray.study.validation_errors import dotted, explain
 from calibray.support.messages import shortened
 from calibray.support.output_files import exists
-from calibray.support.strict import Section, Text
+from calibray.support.strict_models import Section, Text
 from calibray.tables import display as glance
 from calibray.tracing.settings import Antenna
 
@@ -362,7 +362,9 @@ class Study(Section):
                 make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
                 for name, entry in self.parameters.items()
             )
-            known = {name: steady_law(material) for name, material in base.items()} | dict(laws or {})
+            known = {name: frequency_independent_law(material) for name, material in base.items()} | dict(
+                laws or {}
+            )
             lawful = {item.material: known[item.material] for item in items if item.field != item.constant}
             parameters = Parameters(items, frequency, lawful)
             parameters.check_carriers([frequency])

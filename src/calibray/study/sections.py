@@ -12,7 +12,7 @@ from calibray.materials import Material
 from calibray.measurements import FREQUENCIES, Quantity
 from calibray.parameters import Scale, itu_start
 from calibray.study.method_options import check_options
-from calibray.support.strict import CLOSED, Section, Text
+from calibray.support.strict_models import CLOSED, Section, Text
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _Antenna = checked(Antenna, config=CLOSED, frozen=True)

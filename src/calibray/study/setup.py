@@ -22,10 +22,10 @@ from calibray.scenes.scene_file import content
 from calibray.study.model import Study
 from calibray.support.progress import Progress
 from calibray.tracing import cache
-from calibray.tracing.enclosed import Enclosed
-from calibray.tracing.factory import SIONNA
-from calibray.tracing.launches import LONG
+from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
+from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -131,18 +131,18 @@ class Setup:
         return {frequency: self._scene_at(frequency).materials for frequency, _ in self.links.carriers}
 
     @cached_property
-    def enclosed(self) -> Enclosed | None:
+    def enclosed(self) -> EnclosedAntennas | None:
         """Antennas that stand inside closed bodies of the scene; None where a program outside answers."""
         if self.study.engine.external:
             return None
         tracer, links = self.tracer, self.links
-        return Enclosed.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+        return EnclosedAntennas.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
 
     @cached_property
     def files(self) -> dict[str, str]:
         """SHA-256 of every file that the scene and the antennas are read from, by path as the study finds it."""
         antennas = [Path(each.gain_file) for each in self.study.antenna_pair if each.gain_file is not None]
-        files = dict.fromkeys([self.scene.path, *cache.meshes(self.scene), *antennas])
+        files = dict.fromkeys([self.scene.path, *cache.mesh_files(self.scene), *antennas])
         read = {file: content(file) if file == self.scene.path else file.read_bytes() for file in files}
         return {str(file): hashlib.sha256(each).hexdigest() for file, each in read.items()}
 
@@ -198,13 +198,13 @@ class Setup:
             links.tx,
             links.rx,
         )
-        paths = cache.find(digest)
+        paths = cache.load_trace(digest)
         if paths is None:
             plan = self.tracer.plan(links)
-            if plan.seconds > LONG:
+            if plan.seconds > LONG_TRACE_SECONDS:
                 _LOG.warning("%s", plan.announcement(len(links)))
             paths = self.tracer.trace(links, progress, scene.materials)
-            cache.keep(digest, paths)
+            cache.store_trace(digest, paths)
         return paths
 
     def _with_tracer(self, changed: Setup) -> Setup:

@@ -14,7 +14,7 @@ from calibray.scenes import Scene
 from calibray.study.model import Study
 from calibray.study.setup import Setup
 from calibray.support.progress import Progress
-from calibray.tracing import factory
+from calibray.tracing import default_tracer
 from calibray.tracing.protocol import Links
 from calibray.tracing.settings import Antenna
 
@@ -94,7 +94,7 @@ def trace(
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
         raise InputError(f"trace: without a study needs {missing}; give it")
-    return factory.trace(
+    return default_tracer.trace(
         scene,
         measurements,
         frequency=frequency,

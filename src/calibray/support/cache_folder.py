@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-VARIABLE: Final = "CALIBRAY_CACHE"
+CACHE_VARIABLE: Final = "CALIBRAY_CACHE"
 MOST: Final = 512 * 2**20
 """Size that compiled programs may take [bytes]."""
 _SEAL: Final = 32
 """Bytes of the SHA-256 that an entry begins with."""
 
 
-def folder() -> Path | None:
+def cache_folder() -> Path | None:
     """Where things are kept, whether it is there yet or not; None where they are not."""
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(CACHE_VARIABLE)
     if named == "":
         return None
     if named is None:
@@ -122,7 +122,7 @@ class Store:
         return self.path / f"{name}{self.suffix}"
 
 
-def compiled() -> Store | None:
+def compiled_programs() -> Store | None:
     """Where compiled programs are kept; None where nothing is."""
-    here = folder()
+    here = cache_folder()
     return None if here is None else Store(here / "compiled", ".xla", MOST)

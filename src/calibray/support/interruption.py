@@ -15,7 +15,7 @@ GRACE: Final = 1.0
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
+def unwrap_interruption() -> Iterator[None]:
     """Let an interruption through as what it is.
 
     Yields:
@@ -40,7 +40,7 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def noticed() -> Iterator[None]:
+def ensure_interruption() -> Iterator[None]:
     """See to it that Ctrl-C ends what runs meanwhile, whatever a library makes of it.
 
     Compiled code drops interruptions that fall into its callbacks, and raises errors of its own in their place: `check`
@@ -70,17 +70,17 @@ def noticed() -> Iterator[None]:
             _pressed.clear()
 
 
-def check() -> None:
+def raise_pending_interruption() -> None:
     """Go on, unless Ctrl-C was pressed a while ago and nobody has heeded it.
 
     Raises:
-        KeyboardInterrupt: It was, within `noticed`.
+        KeyboardInterrupt: It was, within `ensure_interruption`.
     """
     if _pressed and time.monotonic() - _pressed[-1] > GRACE:
         raise KeyboardInterrupt
 
 
-# When, within `noticed`; there is one keyboard, and one handler of its signal, a process.
+# When, within `ensure_interruption`; there is one keyboard, and one handler of its signal, a process.
 _pressed: list[float] = []
 
 
@@ -90,7 +90,7 @@ def _press(_: int, __: FrameType | None) -> None:
 
 
 @contextmanager
-def deferred() -> Iterator[None]:
+def defer_interruption() -> Iterator[None]:
     """Let Ctrl-C wait until something is made that a library would leave half-made, and say nothing.
 
     Yields:

@@ -14,7 +14,7 @@ UNKNOWN = 2**34
 """What is taken to be built in where nothing tells [bytes]."""
 
 
-def available() -> int:
+def available_memory() -> int:
     """Memory that can be taken before the system, or the container, ends processes.
 
     Returns:

@@ -8,7 +8,7 @@ Progress = Callable[[str, int, int | None], None]
 """Called with the stage ("tracing", "calibrating", ...), how much is done, and out of how much; None if unknown."""
 
 
-def staged(progress: Progress | None, stage: str) -> Progress | None:
+def with_stage(progress: Progress | None, stage: str) -> Progress | None:
     """Tell progress under another stage's name.
 
     Args:
@@ -19,7 +19,7 @@ def staged(progress: Progress | None, stage: str) -> Progress | None:
         What the work calls.
 
     Example:
-        >>> told = staged(lambda *parts: print(*parts), "checking")
+        >>> told = with_stage(lambda *parts: print(*parts), "checking")
         >>> told("tracing", 3, 40)
         checking 3 40
     """
@@ -28,7 +28,7 @@ def staged(progress: Progress | None, stage: str) -> Progress | None:
     return lambda _, done, total: progress(stage, done, total)
 
 
-def part(progress: Progress | None, before: int, total: int) -> Progress | None:
+def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
     """Tell progress of one of several pieces of work as that of all.
 
     Args:
@@ -40,7 +40,7 @@ def part(progress: Progress | None, before: int, total: int) -> Progress | None:
         What the work calls.
 
     Example:
-        >>> told = part(lambda *parts: print(*parts), 100, 250)
+        >>> told = with_total(lambda *parts: print(*parts), 100, 250)
         >>> told("tracing", 3, 40)
         tracing 103 250
     """

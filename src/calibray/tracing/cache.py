@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.paths import SCHEMA_VERSION, Paths
 from calibray.scenes import Scene
-from calibray.support.cache_folder import folder
+from calibray.support.cache_folder import cache_folder
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}\.h5")
@@ -66,14 +66,14 @@ def trace_digest(
     }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     digest.update(scene.xml.encode())
-    for mesh in meshes(scene):
+    for mesh in mesh_files(scene):
         digest.update(mesh.read_bytes())
     for position in (tx, rx):
         digest.update(np.ascontiguousarray(position, dtype=np.float64).tobytes())
     return digest.hexdigest()
 
 
-def find(digest: str) -> Paths | None:
+def load_trace(digest: str) -> Paths | None:
     """The trace with a fingerprint, or None if there is none; one that cannot be read is dropped.
 
     Args:
@@ -94,7 +94,7 @@ def find(digest: str) -> Paths | None:
         return None
 
 
-def keep(digest: str, paths: Paths) -> None:
+def store_trace(digest: str, paths: Paths) -> None:
     """Keep a trace; where the folder cannot be written, it is simply not kept.
 
     Args:
@@ -111,9 +111,9 @@ def keep(digest: str, paths: Paths) -> None:
         return
 
 
-def kept() -> list[Path]:
+def stored_traces() -> list[Path]:
     """The traces that are kept, the latest first; no other file of the folder."""
-    here = folder()
+    here = cache_folder()
     if here is None or not here.is_dir():
         return []
     traces = [path for path in here.iterdir() if _ENTRY.fullmatch(path.name) and path.is_file()]
@@ -121,11 +121,11 @@ def kept() -> list[Path]:
 
 
 def _path(digest: str) -> Path | None:
-    here = folder()
+    here = cache_folder()
     return None if here is None else here / f"{digest}.h5"
 
 
-def meshes(scene: Scene) -> Iterator[Path]:
+def mesh_files(scene: Scene) -> Iterator[Path]:
     """The mesh files of a scene.
 
     Args:

@@ -19,8 +19,8 @@ from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.scenes import Scene
 from calibray.support.progress import Progress
-from calibray.tracing.launches import Plan
 from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.trace_plan import TracePlan
 
 
 class Links(Protocol):
@@ -79,7 +79,7 @@ class Tracer(Protocol):
         """
         ...
 
-    def plan(self, links: Links) -> Plan:
+    def plan(self, links: Links) -> TracePlan:
         """How the links will be traced.
 
         Args:

@@ -16,8 +16,8 @@ from calibray.fitting.minima import BASINS, likely, minima
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.parameters import Parameters
+from calibray.support.blas_threads import single_blas_thread
 from calibray.support.progress import Progress
-from calibray.support.threads import one_thread
 from calibray.uncertainty.buildings import over_buildings
 from calibray.uncertainty.curvature import alone, by_curvature, covariances
 from calibray.uncertainty.emulator import ensemble
@@ -121,7 +121,7 @@ def certainty(
     """
     started = time.perf_counter()
     # Matrices of few links are small: threads of the linear algebra cost more there than they give.
-    with one_thread(problem.objective.num_counted <= FEW):
+    with single_blas_thread(problem.objective.num_counted <= FEW):
         if problem.differentiable:
             calls = problem.engine.calls
             found = _certain(problem, [problem], trail, trail.rt_calls, progress)

@@ -179,7 +179,7 @@ class _Asked:
         known = np.full((len(point), len(parameters) + marginal.design.shape[1]), KNOWN)
         known[:, len(parameters) :] = (marginal.ridge / marginal.noise_db) ** 2
         if len(problem.priors):
-            stated = problem.priors.slopes(candidates) * by_unit[:, None, :]
+            stated = problem.priors.jacobian(candidates) * by_unit[:, None, :]
             known[:, : len(parameters)] += np.square(stated).sum(axis=1)
         unit, slope = (point - lower) / (upper - lower), np.where(np.isfinite(slope), slope, 0.0)
         return cls(

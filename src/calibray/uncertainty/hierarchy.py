@@ -111,7 +111,7 @@ class Hierarchy:
         """Logarithm of the priors that are stated, at points [n, d], but for a constant [n]."""
         if not len(self.priors):
             return np.zeros(len(point))
-        return -0.5 * np.sum(self.priors.rows(self.parameters.from_unit(point)) ** 2, axis=1)
+        return -0.5 * np.sum(self.priors.residuals(self.parameters.from_unit(point)) ** 2, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

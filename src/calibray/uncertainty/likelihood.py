@@ -140,7 +140,7 @@ class Explaining:
             changed = self._differing(candidates[near], loss[near])
             found[np.ix_(near, apart)] = _only(self.marginal, apart).densities(gap[near], changed)
         if len(self.problem.priors):
-            found -= 0.5 * np.sum(self.problem.priors.rows(candidates) ** 2, axis=1)[:, None]
+            found -= 0.5 * np.sum(self.problem.priors.residuals(candidates) ** 2, axis=1)[:, None]
         return found
 
     def _differing(self, candidates: NDArray[np.float64], loss: NDArray[np.float64]) -> Differing:

@@ -23,7 +23,7 @@ from scipy.spatial.distance import cdist, pdist
 from scipy.special import gammaln
 
 from calibray.errors import EngineError, InputError
-from calibray.support.threads import one_thread
+from calibray.support.blas_threads import single_blas_thread
 
 GAUSSIAN: Final = np.inf
 """Degrees of freedom at which Student's t is Gaussian."""
@@ -213,7 +213,7 @@ def fit_correlation(
     middle = np.quantile(reach, (0.4, 0.6, 0.8))
     starts = [np.array([share, at]) for share in (0.3, 0.8) for at in middle]
     # On factors of this size, threads of the linear algebra cost more than they give where others compute too.
-    with one_thread():
+    with single_blas_thread():
         bounds, first = (SHARES, tuple(reach)), min(starts, key=cost)
         found = minimize(cost, first, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3})
         share, log_range = found.x

@@ -17,7 +17,7 @@ from calibray.fitting.noise_level import weighed
 from calibray.fitting.problem import Problem
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
-from calibray.tracing.factory import SIONNA
+from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import kriging, log_distance
 from calibray.validation.blocks import blocks as parted

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, cast, final
 
 from calibray.engines.cluster.executors import open_client, open_local_client
 from calibray.errors import EngineError, InputError
-from calibray.support.cache_folder import folder
-from calibray.support.memory import available
+from calibray.support.cache_folder import cache_folder
+from calibray.support.memory import available_memory
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -98,7 +98,7 @@ class Here:
     """
 
     def __init__(self, at_most: int | None = None) -> None:
-        self._at_most, self._reserve = at_most, available() // 2
+        self._at_most, self._reserve = at_most, available_memory() // 2
 
     def keep(self, make: Callable[[Any], Any], given: Sequence[Any]) -> Kept:
         """Make one thing for every block; see `Crew.keep`."""
@@ -108,7 +108,7 @@ class Here:
         if self._at_most is not None:
             return kept < self._at_most
         # Without a cache, what is not kept would be traced again and again.
-        return folder() is None or available() > self._reserve
+        return cache_folder() is None or available_memory() > self._reserve
 
     def ask(
         self,

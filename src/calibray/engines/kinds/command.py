@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from calibray.engines.section import EngineSection
 from calibray.errors import InputError
 from calibray.support.progress import Progress
-from calibray.support.strict import Text
+from calibray.support.strict_models import Text
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Crew

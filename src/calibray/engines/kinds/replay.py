@@ -70,11 +70,11 @@ class ReplaySection(EngineSection):
             from calibray.engines.cluster.blocks import Blocks
             from calibray.engines.cluster.partition import block_size, cut, seconds_to_trace
             from calibray.engines.cluster.workers import Here
-            from calibray.tracing.launches import LONG
+            from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 
             crew = Here() if executor is None else cast("Crew", executor)
             blocks = cut(setup.links, block_size(self.block_links, len(setup.links)))
-            if executor is None and (seconds := seconds_to_trace(setup, blocks)) > LONG:
+            if executor is None and (seconds := seconds_to_trace(setup, blocks)) > LONG_TRACE_SECONDS:
                 _LOG.warning(
                     "Tracing %s links in %d blocks; about %s on two cores",
                     f"{len(setup.links):,}", len(blocks), duration(seconds),

@@ -14,8 +14,8 @@ from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
 from calibray.paths import Kind
-from calibray.tracing.launches import repeated
 from calibray.tracing.sionna.arrays import aligned, per_interaction, vertices_of
+from calibray.tracing.trace_plan import find_repeats
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def without_repeats(pieces: list[Chunk]) -> list[Chunk]:
     if len(pieces) == 1:
         return pieces
     kind = np.concatenate([per_interaction(chunk.buffer, "interaction_types") for chunk in pieces])
-    found = repeated(
+    found = find_repeats(
         np.repeat(np.arange(len(pieces)), [len(chunk.link) for chunk in pieces]),
         np.concatenate([chunk.link for chunk in pieces]),
         kind,

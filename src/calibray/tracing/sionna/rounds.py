@@ -25,12 +25,12 @@ from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from calibray.errors import EngineError
 from calibray.materials import Material
 from calibray.support.progress import Progress
-from calibray.tracing.launches import Launch, Plan, directions, seed_of
 from calibray.tracing.settings import ROUND
 from calibray.tracing.sionna.arrays import aligned, points
 from calibray.tracing.sionna.chunks import Chunk, rays_towards, without_repeats
 from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.sequences import Meshes, Unhidden, keys, possible, unfolded
+from calibray.tracing.trace_plan import Launch, TracePlan, directions, seed_of
 
 if TYPE_CHECKING:
     from calibray.tracing.sionna.tracer import Tracer
@@ -53,7 +53,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 def search(
     tracer: Tracer,
-    plan: Plan,
+    plan: TracePlan,
     ends: tuple[NDArray[np.float64], NDArray[np.float64]],
     backwards: bool,
     room: int,

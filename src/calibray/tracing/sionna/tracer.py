@@ -4,7 +4,7 @@ Sionna's solver is a chain of stages: candidates by shooting and bouncing, exact
 The first two never depend on what is calibrated, so their result is kept (`Trace`) and compiled into a path program.
 The third stage remains at hand as the rival that replay is measured and tested against.
 
-Receivers, and rays if need be, are shared out over launches (`calibray.tracing.launches`): Sionna's path buffer is
+Receivers, and rays if need be, are shared out over launches (`calibray.tracing.trace_plan`): Sionna's path buffer is
 shared by all receivers of a source, and its memory grows with samples x depth x receivers (NVlabs/sionna#1172). A
 buffer that filled up is traced again, larger.
 """
@@ -31,12 +31,11 @@ from calibray.materials import Material
 from calibray.paths import Paths
 from calibray.paths.chains import Chains
 from calibray.scenes import Scene, check_material_name
-from calibray.support.interruption import interruptible
-from calibray.support.memory import available
+from calibray.support.interruption import unwrap_interruption
+from calibray.support.memory import available_memory
 from calibray.support.progress import Progress
 from calibray.tracing.antennas import Radiator
 from calibray.tracing.compilation import compile_paths
-from calibray.tracing.launches import Launch, Plan, directions, paths_that_fit, plan, starts_at_receivers
 from calibray.tracing.protocol import Links, Solution, positions
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.antennas import patterns_of
@@ -46,6 +45,14 @@ from calibray.tracing.sionna.loading import load, mitsuba_scene, scattering_patt
 from calibray.tracing.sionna.reciprocity import turned_around
 from calibray.tracing.sionna.rounds import SourceChains, search
 from calibray.tracing.sionna.stored import Trace
+from calibray.tracing.trace_plan import (
+    Launch,
+    TracePlan,
+    directions,
+    paths_that_fit,
+    plan_trace,
+    starts_at_receivers,
+)
 
 LANES: Final = 20_000_000
 """Samples x depth x receivers of one launch."""
@@ -112,7 +119,7 @@ class Tracer:
         other.settings = settings
         return other
 
-    def plan(self, links: Links) -> Plan:
+    def plan(self, links: Links) -> TracePlan:
         """How the links will be traced.
 
         Args:
@@ -125,9 +132,11 @@ class Tracer:
             InputError: There is no link, a position is not finite, or a link's ends coincide.
         """
         tx, rx = positions(links)
-        return plan(rx if starts_at_receivers(tx, rx, self.settings) else tx, self.settings, LANES, BUFFER)
+        return plan_trace(
+            rx if starts_at_receivers(tx, rx, self.settings) else tx, self.settings, LANES, BUFFER
+        )
 
-    @interruptible()
+    @unwrap_interruption()
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
@@ -148,7 +157,7 @@ class Tracer:
         """
         return self.find(links, progress, materials).paths()
 
-    @interruptible()
+    @unwrap_interruption()
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with Sionna's own field stage.
 
@@ -166,7 +175,7 @@ class Tracer:
         found = self.find(links, None, materials)
         return Solution(found.path_gains(), found.link(), found.delay())
 
-    @interruptible()
+    @unwrap_interruption()
     def find(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Trace:
@@ -190,7 +199,7 @@ class Tracer:
         backwards = starts_at_receivers(tx, rx, self.settings)
         ends = tx if backwards else rx
         constants = self.give(materials or {})
-        room = paths_that_fit(available(), self.settings.max_depth)
+        room = paths_that_fit(available_memory(), self.settings.max_depth)
         if self.settings.adaptive:
             found, told = search(self, self.plan(links), (tx, rx), backwards, room, constants, progress)
             return Trace(self, constants, tx, rx, found, told)
@@ -238,7 +247,7 @@ class Tracer:
             target.scattering_pattern = scattering_pattern(material)
         return constants
 
-    @interruptible()
+    @unwrap_interruption()
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether points lie inside closed bodies of the scene, such as buildings.
 

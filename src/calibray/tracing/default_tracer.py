@@ -17,7 +17,7 @@ from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
 
 
 @final
-class Sionna:
+class SionnaFactory:
     """Sionna RT, imported when the first scene is opened."""
 
     @property
@@ -54,7 +54,7 @@ class Sionna:
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)
 
 
-SIONNA: Final = Sionna()
+SIONNA: Final = SionnaFactory()
 """The tracer that is used where none is named."""
 
 

@@ -3,7 +3,7 @@
 import pytest
 from threadpoolctl import threadpool_info
 
-from calibray.support import threads
+from calibray.support import blas_threads
 
 
 def _numbers():
@@ -12,22 +12,22 @@ def _numbers():
 
 def test_threads_are_as_before_afterwards():
     before = _numbers()
-    with threads.one_thread():
+    with blas_threads.single_blas_thread():
         assert set(_numbers()) == {1}
-        with threads.one_thread(wanted=False):
+        with blas_threads.single_blas_thread(wanted=False):
             assert set(_numbers()) == {1}
     assert _numbers() == before
 
 
 def test_nothing_is_changed_where_it_is_not_wanted():
     before = _numbers()
-    with threads.one_thread(wanted=False):
+    with blas_threads.single_blas_thread(wanted=False):
         assert _numbers() == before
 
 
 def test_libraries_are_looked_up_once(monkeypatch):
-    with threads.one_thread():
+    with blas_threads.single_blas_thread():
         pass
-    monkeypatch.setattr(threads, "ThreadpoolController", lambda: pytest.fail("looked up again"))
-    with threads.one_thread():
+    monkeypatch.setattr(blas_threads, "ThreadpoolController", lambda: pytest.fail("looked up again"))
+    with blas_threads.single_blas_thread():
         assert set(_numbers()) == {1}

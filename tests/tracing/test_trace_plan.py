@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibray.support import memory
-from calibray.tracing.launches import LANE_BYTES, directions, paths_that_fit, plan, repeated
 from calibray.tracing.settings import TraceSettings
+from calibray.tracing.trace_plan import LANE_BYTES, directions, find_repeats, paths_that_fit, plan_trace
 
 MASTS = np.repeat([[0.0, 0, 10], [50, 0, 10]], [7, 4], axis=0)[[0, 7, 1, 8, 2, 9, 3, 10, 4, 5, 6]]
 
@@ -19,7 +19,7 @@ def test_every_ray_goes_to_every_receiver_once(samples, depth, lanes):
     if samples // lanes > 1000:
         lanes = 20_000_000
     settings = TraceSettings(samples=samples, max_depth=depth, seed=5)
-    found = plan(MASTS, settings, lanes, 1000)
+    found = plan_trace(MASTS, settings, lanes, 1000)
     sent = np.zeros(len(MASTS), dtype=np.int64)
     for launch in found.launches:
         assert (MASTS[launch.links] == launch.source).all()
@@ -36,7 +36,7 @@ def test_every_ray_goes_to_every_receiver_once(samples, depth, lanes):
 def test_more_launches_than_could_be_kept_are_counted_and_made_one_by_one():
     """10^12 rays to 10,000 receivers: 1.5 thousand million launches."""
     tx = np.tile([[0.0, 0, 10]], (10_000, 1))
-    found = plan(tx, TraceSettings(samples=10**12, max_depth=3), 20_000_000, 1_000_000)
+    found = plan_trace(tx, TraceSettings(samples=10**12, max_depth=3), 20_000_000, 1_000_000)
     assert len(found.launches) == 10_000 * 150_000
     assert found.lanes <= 20_000_001
     assert found.memory < 2**31
@@ -53,17 +53,17 @@ def test_more_launches_than_could_be_kept_are_counted_and_made_one_by_one():
 
 def test_rays_are_shared_out_only_where_one_receiver_is_too_much():
     settings = TraceSettings(samples=16_000_000, max_depth=3)
-    assert [launch.rays for launch in plan(MASTS[:1], settings, 20_000_000, 1).launches] == [
+    assert [launch.rays for launch in plan_trace(MASTS[:1], settings, 20_000_000, 1).launches] == [
         5_333_333, 5_333_333, 5_333_334,
     ]  # fmt: skip
-    few = plan(MASTS, TraceSettings(samples=100, max_depth=3), 700, 1).launches
+    few = plan_trace(MASTS, TraceSettings(samples=100, max_depth=3), 700, 1).launches
     assert all(launch.rays == 100 and launch.last for launch in few)
     assert sorted(len(launch.links) for launch in few) == [1, 2, 2, 2, 2, 2]
 
 
 def test_launches_of_one_receiver_have_seeds_of_their_own():
     seeds = [
-        [launch.seed for launch in plan(MASTS[:1], TraceSettings(samples=100, seed=s), 30, 1).launches]
+        [launch.seed for launch in plan_trace(MASTS[:1], TraceSettings(samples=100, seed=s), 30, 1).launches]
         for s in (1, 2)
     ]
     assert len(seeds[0]) == 10
@@ -81,7 +81,7 @@ def test_directions_cover_the_square_evenly():
 def rows(paths):
     """`repeated` for (piece, link, kinds, shapes, vertices, drawn) of each path."""
     piece, link, kind, shape, vertex, drawn = (np.array(column) for column in zip(*paths, strict=True))
-    return repeated(piece, link, kind, shape, vertex.astype(float), drawn).tolist()
+    return find_repeats(piece, link, kind, shape, vertex.astype(float), drawn).tolist()
 
 
 def test_repeats_are_paths_through_the_same_points_of_the_same_objects():
@@ -119,35 +119,35 @@ def test_paths_that_fit_grow_with_memory_and_shrink_with_depth():
 def test_memory_is_the_least_that_system_and_container_have_left(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "SYSTEM", tmp_path / "meminfo")
     monkeypatch.setattr(memory, "GROUP", tmp_path)
-    whole = memory.available()
+    whole = memory.available_memory()
     assert whole > 2**20  # half of what is built in, as nothing tells more
     (tmp_path / "meminfo").write_text("MemTotal:  9 kB\nMemFree: 1 kB\nMemAvailable:   5000 kB\n")
-    assert memory.available() == 5000 * 1024
+    assert memory.available_memory() == 5000 * 1024
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "memory.stat").write_text("anon 1000\nfile 400\n")
-    assert memory.available() == 5000 * 1024
+    assert memory.available_memory() == 5000 * 1024
     (tmp_path / "memory.max").write_text("3000\n")
-    assert memory.available() == 2000
+    assert memory.available_memory() == 2000
     (tmp_path / "memory.max").write_text("500\n")
-    assert memory.available() == 0
+    assert memory.available_memory() == 0
 
 
 def test_long_traces_are_announced():
-    short = plan(MASTS[:1], TraceSettings(samples=1000, max_depth=2), 20_000_000, 1_000_000)
+    short = plan_trace(MASTS[:1], TraceSettings(samples=1000, max_depth=2), 20_000_000, 1_000_000)
     assert short.announcement(1) == ""
-    long = plan(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
+    long = plan_trace(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
     assert long.announcement(11) == (
         "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
         "about 0.9 GiB of memory, besides that of the scene and the paths found, "
         "and 7 seconds on two cores"
     )
     # Ten thousand times the rays take ten thousand times as long.
-    longer = plan(MASTS, TraceSettings(samples=40_000_000_000, max_depth=5), 20_000_000, 1_000_000)
+    longer = plan_trace(MASTS, TraceSettings(samples=40_000_000_000, max_depth=5), 20_000_000, 1_000_000)
     assert longer.announcement(11).endswith("and 20 hours on two cores")
 
 
 def test_rays_added_in_rounds_take_a_launch_for_every_position():
-    found = plan(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
+    found = plan_trace(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
     assert sorted(len(launch.links) for launch in found.launches) == [4, 7]
     assert found.announcement(11) == (
         "Tracing 11 links from 2 positions, rays added until path loss stands still; about 6 seconds on two cores, "

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calibray.support.messages import duration
 from calibray.tracing.settings import TraceSettings
 
-LONG: Final = 30.0
+LONG_TRACE_SECONDS: Final = 30.0
 """A trace that takes longer is announced before it starts [s]."""
 
 LANE_BYTES: Final = 40
@@ -94,7 +94,7 @@ class Launches(Sequence[Launch]):
 
 
 @dataclass(frozen=True)
-class Plan:
+class TracePlan:
     """The launches of a trace.
 
     Attributes:
@@ -160,7 +160,7 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
 
 
-def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> Plan:
+def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
     """Cut a trace into launches.
 
     Args:
@@ -189,7 +189,7 @@ def plan(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffe
     rays = -(-samples // pieces)
     largest = rays * settings.max_depth * (1 if alone else max(len(part) for _, part in receivers))
     size = buffer * (BUFFER_BYTES[0] + BUFFER_BYTES[1] * depth)
-    return Plan(Launches(receivers, settings, pieces), largest, size, alone)
+    return TracePlan(Launches(receivers, settings, pieces), largest, size, alone)
 
 
 def seed_of(seed: int, piece: int) -> int:
@@ -226,7 +226,7 @@ def directions(first: int, rays: int, samples: int) -> NDArray[np.float64]:
     return np.stack([np.modf(n / ((1 + np.sqrt(5)) / 2))[0], n / (samples - 1)])
 
 
-def repeated(
+def find_repeats(
     piece: NDArray[np.int64],
     link: NDArray[np.integer],
     kind: NDArray[np.int64],

@@ -8,7 +8,7 @@ from functools import cache
 from threadpoolctl import ThreadpoolController
 
 
-def one_thread(wanted: bool = True) -> AbstractContextManager[object]:
+def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
     """One thread for the linear algebra, as long as the context lasts.
 
     Args:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Enclosed:
+class EnclosedAntennas:
     """Antennas that stand inside closed bodies of the scene.
 
     Attributes:
@@ -23,7 +23,7 @@ class Enclosed:
     indoors: bool = False
 
     @classmethod
-    def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> Enclosed:
+    def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> EnclosedAntennas:
         """Sort out which antennas are enclosed.
 
         Args:
