@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 from calibray.materials import Material
 from calibray.scenes import Scene
+from calibray.tracing.cache import mesh_files
 
 if TYPE_CHECKING:
     from calibray.study.setup import Setup
