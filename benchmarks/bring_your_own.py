@@ -38,9 +38,14 @@ from calibray.fitting.methods import choose  # noqa: E402
 from calibray.fitting.noise_floor import heard  # noqa: E402
 from calibray.fitting.problem import Problem  # noqa: E402
 from calibray.fitting.search import search  # noqa: E402
-from calibray.measurements import Averaging, Measurements, Preparation  # noqa: E402
-from calibray.measurements.preparation import prepare  # noqa: E402
-from calibray.measurements.table_files import SourceTable  # noqa: E402
+from calibray.measurements import (  # noqa: E402
+    Averaging,
+    LinkColumns,
+    Measurements,
+    Preparation,
+    SourceTable,
+    measured_links,
+)
 from calibray.scenes.authoring.floor_plan import make_plan_scene  # noqa: E402
 from calibray.scenes.authoring.floor_plan_file import read_plan  # noqa: E402
 from calibray.scenes.authoring.openstreetmap import read_openstreetmap  # noqa: E402
@@ -135,9 +140,8 @@ def _heard_in_town(
                     rows.append((number[mast, phone, stop, choice], cell, name, *place, loud))
     log = pd.DataFrame(rows, columns=["link", "cell", "device", "x", "y", "z", "rsrp"])
     steps = Preparation(noise_floor_dbm=town.FLOOR_DBM, averaging=averaging, keep=("cell", "device"))
-    table = prepare(
-        SourceTable(log, source="log"), steps, (0.0, 0.0, 0.0), ("x", "y", "z"), "rsrp"
-    ).table.frame
+    columns = LinkColumns((0.0, 0.0, 0.0), ("x", "y", "z"), "rsrp", "rsrp")
+    table = measured_links(SourceTable(log, source="log"), columns, steps).frame
     measured, weight = np.array(problem.objective.measured), np.zeros(number.size)
     measured[table["link"]], weight[table["link"]] = -table["rsrp"], 1.0
     weight[problem.objective.weight == 0] = 0.0

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 import shown
 from calibray.engines.ledger.entry import LedgerEntry, read_entry
 from calibray.errors import InputError
-from calibray.measurements import read_measurements
+from calibray.measurements import read_measurements, read_table
 from calibray.measurements.filters import evaluate
-from calibray.measurements.table_files import read_table
 from calibray.report.export import export
 from calibray.result import Result
 from calibray.scenes import export_scene, read_scene

@@ -1,9 +1,8 @@
-"""Coordinates: where a scene's metres lie on the globe.
+"""The position of a scene on the globe.
 
-A scene has its own frame, x to the east and y to the north of an origin. Far from the origin of a map projection a
-metre on the map is no metre on the ground (UTM: 0.4 m in a kilometre), so the frame made for a scene by default is a
-projection centred on the scene itself: the azimuthal equidistant one of PROJ (`aeqd`), true to 1 mm in a kilometre
-over several kilometres.
+A scene has a local frame, with x to the east and y to the north of an origin. Map projections distort lengths (UTM by
+up to 0.4 m per kilometre), so the default frame is a projection centred on the scene: PROJ's azimuthal equidistant
+projection (`aeqd`), whose lengths are right to 1 mm per kilometre over several kilometres.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
 WGS84: Final = "EPSG:4326"
-"""Longitude and latitude as satellite receivers give them."""
+"""Reference system of satellite receivers: longitude and latitude."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A scene's frame: a projection whose unit is the metre, and the point of it that is the scene's origin.
+    """A scene's frame: a projection in metres, and its point that is the scene's origin.
 
     Attributes:
         crs: The projection, anything that PROJ reads: `EPSG:32632`, a `+proj` string, WKT.
-        easting: What is taken off the projection's x [m].
-        northing: What is taken off the projection's y [m].
-        height: Height that is z = 0 [m], above whatever the heights given are above.
+        easting: x of the origin in the projection [m].
+        northing: y of the origin in the projection [m].
+        height: Height of z = 0 [m], above the same datum as other heights.
 
     Raises:
-        InputError: PROJ does not know the projection, it is none in metres with x to the east, or a number is not
+        InputError: PROJ does not know the projection, it is not in metres with x to the east, or a number is not
             finite.
     """
 
@@ -49,17 +48,17 @@ class Frame:
     def __post_init__(self) -> None:
         if not np.isfinite([self.easting, self.northing, self.height]).all():
             raise InputError(f"frame {self.record()}: the origin must be finite numbers of metres")
-        known = parse_crs(self.crs)
-        units = {axis.unit_name for axis in known.axis_info[:2]}
-        if not known.is_projected or units != {"metre"}:
+        projection = parse_crs(self.crs)
+        units = {axis.unit_name for axis in projection.axis_info[:2]}
+        if not projection.is_projected or units != {"metre"}:
             raise InputError(
-                f"crs = {self.crs!r}: {known.name} is not a projection in metres; "
+                f"crs = {self.crs!r}: {projection.name} is not a projection in metres; "
                 "name one, such as the UTM zone EPSG:326xx, or leave it out for a local one"
             )
 
     @classmethod
     def local(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The frame centred on a place: distances from there are true.
+        """The frame centred on a point: distances from that point are true.
 
         Args:
             longitude: East of Greenwich [deg].
@@ -70,16 +69,16 @@ class Frame:
             The frame.
 
         Raises:
-            InputError: The place is not on the globe.
+            InputError: The point is not on the globe.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
-        # A tenth of a microdegree is 1 cm: the string stays short, and states the origin exactly.
+        # A tenth of a microdegree is 1 cm: the string stays short and states the origin exactly.
         centre = f"+lat_0={round(float(latitude), 7)!r} +lon_0={round(float(longitude), 7)!r}"
         return cls(f"+proj=aeqd {centre} +datum=WGS84 +units=m", height=height)
 
     @classmethod
     def utm(cls, longitude: float, latitude: float, height: float = 0.0) -> Frame:
-        """The UTM zone of a place, less the whole metres of the place.
+        """The UTM zone of a point, with the origin at the nearest whole metre.
 
         Args:
             longitude: East of Greenwich [deg].
@@ -90,11 +89,11 @@ class Frame:
             The frame.
 
         Raises:
-            InputError: The place is not on the globe, or nearer to a pole than UTM goes.
+            InputError: The point is not on the globe, or too close to a pole for UTM.
         """
         _check_degrees(np.array([longitude]), np.array([latitude]))
         if not -80 <= latitude <= 84:
-            raise InputError(f"latitude = {latitude:g}: UTM goes from -80 to 84 degrees; use a local frame")
+            raise InputError(f"latitude = {latitude:g}: must be -80 to 84 degrees for UTM; use a local frame")
         zone = min(int((longitude + 180) // 6) + 1, 60)
         crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         easting, northing, _ = cls(crs).to_scene([longitude], [latitude])[0]
@@ -102,16 +101,16 @@ class Frame:
 
     @classmethod
     def from_record(cls, record: object) -> Frame:
-        """The frame that a record tells of.
+        """Read a frame from its record.
 
         Args:
-            record: What `record` gave.
+            record: The dictionary that `record` returned.
 
         Returns:
             The frame.
 
         Raises:
-            InputError: It is no such record.
+            InputError: It is not such a record.
         """
         keys = ("easting", "northing", "height")
         if not isinstance(record, Mapping) or not isinstance(record.get("crs"), str):
@@ -121,7 +120,7 @@ class Frame:
         return cls(record["crs"], *(float(record[key]) for key in keys))
 
     def record(self) -> dict[str, str | float]:
-        """The frame as JSON takes it."""
+        """The frame as a dictionary for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -130,54 +129,48 @@ class Frame:
     def to_scene(
         self, longitude: ArrayLike, latitude: ArrayLike, height: ArrayLike = 0.0, crs: str = WGS84
     ) -> NDArray[np.float64]:
-        """Positions in the scene's frame.
+        """Convert positions to the scene's frame.
 
         Args:
             longitude: East of Greenwich [n], [deg]; or x in the units of `crs`.
-            latitude: North of the equator [n], [deg]; or y.
-            height: Height [n] or one for all [m], above the same as the frame's.
-            crs: What the coordinates are given in.
+            latitude: North of the equator [n], [deg]; or y in the units of `crs`.
+            height: Height [n] or one for all [m], above the same datum as the frame's.
+            crs: Reference system of the coordinates.
 
         Returns:
             Positions x, y, z [n, 3], [m].
 
         Raises:
-            InputError: A coordinate is not on the globe, or not where the projection can be used.
+            InputError: A coordinate is not on the globe, or outside the projection.
         """
         x, y, z = (np.asarray(part, dtype=float) for part in np.broadcast_arrays(longitude, latitude, height))
         if crs == WGS84:
             _check_degrees(x, y)
-        return np.stack([*self._projected(x, y, crs), z - self.height], axis=-1)
+        easting, northing = transformer(crs, self.crs).transform(x, y)
+        outside = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
+        if len(outside):
+            raise InputError(
+                f"position ({np.ravel(x)[outside[0]]:g}, {np.ravel(y)[outside[0]]:g}) of {crs} lies outside the "
+                f"projection {self.crs}; check the order of the axes"
+            )
+        return np.stack([easting - self.easting, northing - self.northing, z - self.height], axis=-1)
 
     def to_geographic(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """Longitude, latitude and height of positions in the scene's frame.
+        """Convert positions in the scene's frame to longitude, latitude and height.
 
         Args:
             positions: x, y and z [n, 3], [m].
 
         Returns:
-            Longitude [deg], latitude [deg] and height [m], each one column [n, 3].
+            Longitude [deg], latitude [deg] and height [m], one column each [n, 3].
         """
         x, y, z = np.moveaxis(np.asarray(positions, dtype=float), -1, 0)
-        to_degrees = transformer(self.crs, WGS84)
-        longitude, latitude = to_degrees.transform(x + self.easting, y + self.northing)
+        longitude, latitude = transformer(self.crs, WGS84).transform(x + self.easting, y + self.northing)
         return np.stack([longitude, latitude, z + self.height], axis=-1)
-
-    def _projected(
-        self, x: NDArray[np.float64], y: NDArray[np.float64], crs: str
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        easting, northing = transformer(crs, self.crs).transform(x, y)
-        lost = np.flatnonzero(~np.isfinite(np.ravel(easting) + np.ravel(northing)))
-        if len(lost):
-            where = f"({np.ravel(x)[lost[0]]:g}, {np.ravel(y)[lost[0]]:g})"
-            raise InputError(
-                f"position {where} of {crs} lies outside the projection {self.crs}; check the axes"
-            )
-        return easting - self.easting, northing - self.northing
 
 
 def parse_crs(crs: object) -> CRS:
-    """A coordinate reference system by its name.
+    """Look up a coordinate reference system.
 
     Args:
         crs: Anything that PROJ reads.
@@ -194,16 +187,16 @@ def parse_crs(crs: object) -> CRS:
     except pyproj.exceptions.CRSError as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"crs = {crs!r}: PROJ does not know it ({reason}); name an EPSG code, EPSG:4326"
+            f"crs = {crs!r}: PROJ does not know it ({reason}); give an EPSG code, such as EPSG:4326"
         ) from None
 
 
 def transformer(source: object, target: object) -> Transformer:
-    """What turns coordinates of one reference system into another's, x (longitude) always first.
+    """The transformation between two coordinate reference systems, with x (longitude) always first.
 
     Args:
-        source: The system that the coordinates are given in.
-        target: The system that they are wanted in.
+        source: System of the given coordinates.
+        target: System to convert to.
 
     Returns:
         The transformation.
@@ -217,9 +210,9 @@ def transformer(source: object, target: object) -> Transformer:
 
 def _check_degrees(longitude: NDArray[np.float64], latitude: NDArray[np.float64]) -> None:
     for name, values, bound in (("latitude", latitude, 90.0), ("longitude", longitude, 180.0)):
-        bad = np.flatnonzero(~(np.abs(np.ravel(values)) <= bound))
-        if len(bad):
+        outside = np.flatnonzero(~(np.abs(np.ravel(values)) <= bound))
+        if len(outside):
             raise InputError(
-                f"{name} of position {bad[0]} is {np.ravel(values)[bad[0]]:g}, must be -{bound:g} to {bound:g} "
-                "degrees; check the columns' order and their unit"
+                f"{name} of position {outside[0]} is {np.ravel(values)[outside[0]]:g}, must be -{bound:g} to "
+                f"{bound:g} degrees; check the order of the columns and their unit"
             )

@@ -11,9 +11,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.fields import path_loss
-from calibray.measurements.averaging import averaged
-from calibray.measurements.geographic import with_scene_positions
-from calibray.measurements.received_power import with_transmitters
+from calibray.measurements import Averaging, LinkColumns, Preparation, measured_links, read_table
 from calibray.scenes.authoring.openstreetmap import read_openstreetmap
 from calibray.scenes.authoring.outlines import led_outside, outlines
 from calibray.scenes.authoring.scene_folder import make_scene
@@ -29,16 +27,20 @@ def test_planted_walls_and_phones_are_found_from_a_map_and_a_log(tmp_path):
     assert footprints.guessed() == {"levels": ["way-3", "way-6", "way-11"], "default": ["way-8"]}
     made = make_scene(footprints, tmp_path, frame)
 
-    log = pd.read_csv(EXAMPLE / "rsrp.csv").dropna(subset=["rsrp_dbm"])
-    placed = with_scene_positions(log, "rx", frame, "longitude", "latitude", 1.5)
-    stop = placed.groupby(["longitude", "latitude"], sort=False).ngroup().to_numpy()
-    links = averaged(placed, "rsrp_dbm", stop, "power", keep=["cell", "device"])
-    # Where fewer than all samples were heard, those heard are the strong ones.
-    links = links[links["count"] == 10]
-    cells = with_scene_positions(
-        pd.read_csv(EXAMPLE / "cells.csv"), "tx", frame, "longitude", "latitude", 6.0
-    )[["cell", "tx_x", "tx_y", "tx_z"]]
-    links = with_transmitters(links, cells, "cell")
+    columns = LinkColumns(
+        ("cell_longitude", "cell_latitude", 6.0), ("longitude", "latitude", 1.5), "rsrp_dbm", "rsrp"
+    )
+    steps = Preparation(
+        where="rsrp_dbm.notna()",
+        transmitters=read_table(EXAMPLE / "cells.csv"),
+        transmitter="cell",
+        frame=frame,
+        averaging=Averaging("cell", 0.01),  # Each stop is one position.
+        keep=("device",),
+    )
+    averages = measured_links(read_table(EXAMPLE / "rsrp.csv"), columns, steps).frame
+    # If some samples of a stop are below the noise floor, the others are the strong ones.
+    links = averages[averages["count"] == 10]
     rx, moved = led_outside(links[["rx_x", "rx_y", "rx_z"]], outlines(made.path))
     assert len(links) > 100
     assert moved.max() == 0

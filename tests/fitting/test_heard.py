@@ -15,10 +15,14 @@ from calibray.fitting.noise_floor import MARGIN, heard
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.fitting.problem import Problem
-from calibray.measurements import Averaging, Measurements, Preparation
-from calibray.measurements.preparation import prepare
-from calibray.measurements.reading import measured_links
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements import (
+    Averaging,
+    LinkColumns,
+    Measurements,
+    Preparation,
+    SourceTable,
+    measured_links,
+)
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Setup
 from calibray.uncertainty.likelihood import Explaining
@@ -106,7 +110,8 @@ def test_links_that_are_all_faint_stay():
 def test_the_floor_is_a_limit_of_path_loss(quantity, sent, limit):
     rows = SourceTable(pd.DataFrame({"x": [0.0, 40.0], "y": 0.0, "z": 1.5, "p": [-80.0, -119.0]}))
     steps = Preparation(noise_floor_dbm=-120.0)
-    links = measured_links(rows, (5.0, 5.0, 9.0), ("x", "y", "z"), "p", quantity, steps, tx_power_dbm=sent)
+    columns = LinkColumns((5.0, 5.0, 9.0), ("x", "y", "z"), "p", quantity, tx_power_dbm=sent)
+    links = measured_links(rows, columns, steps)
     assert links.limit_db is not None
     assert links.limit_db.tolist() == [limit, limit]
     assert links.select(np.array([True, False])).limit_db == pytest.approx([limit])
@@ -119,9 +124,10 @@ def test_the_logarithm_of_a_mean_of_few_samples_is_put_right():
     rows = {"x": np.repeat(10.0 * np.arange(4000), 10), "y": 0.0, "z": 1.5, "p": 10 * np.log10(power.ravel())}
     for unbiased, off in ((False, -0.219), (True, 0.0)):
         steps = Preparation(averaging=Averaging("cell", 5.0, unbiased=unbiased))
-        made = prepare(SourceTable(pd.DataFrame(rows)), steps, (9.0, 9.0, 9.0), ("x", "y", "z"), "p")
+        columns = LinkColumns((9.0, 9.0, 9.0), ("x", "y", "z"), "p", "rsrp")
+        links = measured_links(SourceTable(pd.DataFrame(rows)), columns, steps)
         # The standard error is 0.022 dB, and higher orders leave some hundredths.
-        assert made.table.frame["p"].mean() + 80.0 == pytest.approx(off, abs=0.09)
+        assert 80.0 - links.path_loss_db.mean() == pytest.approx(off, abs=0.09)
 
 
 def test_links_that_were_not_heard_are_counted_and_judge_nothing(tmp_path):

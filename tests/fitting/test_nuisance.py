@@ -12,8 +12,7 @@ from calibray.fitting import arrowhead
 from calibray.fitting.elimination import DENSE, Elimination
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
-from calibray.measurements import Measurements
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements import Measurements, SourceTable
 
 
 def campaign(count: int, groups: int, seed: int = 0) -> Measurements:

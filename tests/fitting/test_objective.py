@@ -12,8 +12,7 @@ from scipy.optimize import lsq_linear, minimize
 from calibray.errors import InputError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
-from calibray.measurements import Measurements
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements import Measurements, SourceTable
 
 LINKS = 30
 

@@ -1,7 +1,8 @@
-"""Row filters: what is allowed means what pandas means by it, and nothing else is evaluated at all."""
+"""Row filters: what is allowed means the same as in pandas, and nothing else is evaluated."""
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 
@@ -10,9 +11,9 @@ import pandas as pd
 import pytest
 
 from calibray.errors import InputError
-from calibray.measurements.filter_grammar import FUNCTIONS, METHODS, TEXT_METHODS
+from calibray.measurements.filter_language import FUNCTIONS, METHODS, TEXT_METHODS
 from calibray.measurements.filters import evaluate
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements.source_table import SourceTable
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "study-file.md"
 
@@ -53,16 +54,16 @@ SAME_AS_PANDAS = [
 
 
 @pytest.mark.parametrize("expression", SAME_AS_PANDAS)
-def test_what_is_allowed_means_what_pandas_means(expression):
+def test_filters_give_the_same_rows_as_pandas(expression):
     with np.errstate(all="ignore"):
         expected = FRAME.eval(expression, engine="python", local_dict={}, global_dict={})
-    found = evaluate(expression, FRAME)
-    np.testing.assert_array_equal(found, expected.to_numpy(dtype=bool, na_value=False))
-    assert found.dtype == np.bool_
+    mask = evaluate(expression, FRAME)
+    np.testing.assert_array_equal(mask, expected.to_numpy(dtype=bool, na_value=False))
+    assert mask.dtype == np.bool_
 
 
-def test_results_of_filters_are_right():
-    """Pandas is no judge of itself."""
+def test_filters_give_the_right_rows():
+    """Independent of pandas."""
     assert np.flatnonzero(evaluate("x > 8 | y < 0 & x < 2", FRAME)).tolist() == [2, 5]
     assert np.flatnonzero(evaluate("-3 < x <= 4 and set != 'NLOS'", FRAME)).tolist() == [2, 3]
     assert np.flatnonzero(evaluate("set.str.startswith(('N', 'l'))", FRAME)).tolist() == [1, 3]
@@ -112,7 +113,7 @@ ESCAPES = [
 
 
 @pytest.mark.parametrize("expression", ESCAPES, ids=lambda text: ascii(text[:40]))
-def test_whatever_else_is_refused_before_it_does_anything(expression, tmp_path, monkeypatch, capfd):
+def test_anything_else_is_refused_without_side_effects(expression, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as caught:
         SourceTable(FRAME.copy(), source="links.csv").where(expression)
@@ -146,7 +147,7 @@ def test_a_refusal_names_the_piece_and_the_remedy(expression, piece, remedy):
 
 
 def test_full_width_letters_are_not_taken_for_plain_ones():
-    """Python reads a full-width x as x; a column is meant as it is written."""
+    """Python normalizes a full-width x to x; a column is meant as it is written."""
     frame = FRAME.assign(**{"ｘ": 5})
     assert evaluate("ｘ == 5", frame).all()
     assert evaluate("`ｘ` == 5", frame).all()
@@ -168,21 +169,22 @@ def test_long_texts_are_not_searched_for_repetitions():
         evaluate("note.str.contains('a*b$')", frame)
 
 
-def test_a_column_that_stands_twice_is_refused():
+def test_a_repeated_column_name_is_refused():
     frame = pd.DataFrame([[1, 2]], columns=["x", "x"])
-    with pytest.raises(InputError, match="stands several times"):
+    with pytest.raises(InputError, match="appears several times"):
         evaluate("x > 1", frame)
 
 
-def test_the_document_names_all_that_may_be_called():
+def test_the_documentation_names_all_functions_and_methods():
     text = DOCUMENT.read_text()
     filters = text[text.index("### Filters") :].split("\n## ")[0]
     for name in FUNCTIONS:
         assert f"`{name}`" in filters, name
     for prefix, methods in ((".", METHODS), (".str.", TEXT_METHODS)):
-        for name, arguments in methods.items():
+        for name, method in methods.items():
+            arguments = [*inspect.signature(method).parameters][1:]
             documented = re.search(rf"`column{re.escape(prefix)}{name}\(([^`]*)\)`", filters)
             assert documented, name
-            assert [each.split("=")[0].strip() for each in documented[1].split(",") if each] == [
+            assert [argument.split("=")[0].strip() for argument in documented[1].split(",") if argument] == [
                 *arguments
             ], name

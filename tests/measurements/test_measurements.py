@@ -7,8 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements, links_from_frame, links_from_table, read_measurements
-from calibray.measurements.table_files import read_table
+from calibray.measurements import (
+    Measurements,
+    links_from_frame,
+    links_from_table,
+    read_measurements,
+    read_table,
+)
 
 TABLE = """\
 x,y,z,loss,set,spread
@@ -44,7 +49,7 @@ def test_columns_and_constants_become_positions(tmp_path):
 
 
 @pytest.mark.parametrize("quantity", ["path_gain", "received_power"])
-def test_every_quantity_describes_the_same_links(tmp_path, quantity):
+def test_gains_and_received_powers_become_path_losses(tmp_path, quantity):
     frame = pd.read_csv(table_file(tmp_path, TABLE))
     frame["power"] = [30.0, 31.0, 32.0, 33.0]
     frame["measured"] = -frame["loss"] if quantity == "path_gain" else frame["power"] - frame["loss"]
@@ -53,7 +58,7 @@ def test_every_quantity_describes_the_same_links(tmp_path, quantity):
     np.testing.assert_allclose(links.path_loss_db, frame["loss"], rtol=1e-15)
 
 
-def test_constant_transmitter_power(tmp_path):
+def test_the_transmitted_power_may_be_a_number(tmp_path):
     frame = pd.read_csv(table_file(tmp_path, TABLE)).assign(loss=lambda frame: 20 - frame["loss"])
     links = read(tmp_path, frame.to_csv(index=False), quantity="received_power", tx_power_dbm=20)
     np.testing.assert_allclose(links.path_loss_db, [80.5, 86.5, 101.25, 110])
@@ -72,7 +77,7 @@ def test_groups_are_sorted_labels_and_indices(tmp_path):
     assert read(tmp_path, group="set").group_names == ("LOS", "NLOS")
 
 
-def test_a_gap_elsewhere_does_not_rename_numeric_groups(tmp_path):
+def test_a_gap_in_a_row_that_is_left_out_does_not_rename_numeric_groups(tmp_path):
     text = TABLE + "0,50,1.5,111,NLOS,\n"
     assert read(tmp_path, text, group="spread", where="y < 45").group_names == ("1", "2", "4")
 
@@ -91,7 +96,7 @@ def test_rows_left_out_by_the_filter_may_be_faulty(tmp_path):
         read(tmp_path, text)
 
 
-def test_split_parts_the_links_and_refuses_an_empty_part(tmp_path):
+def test_split_refuses_an_empty_part(tmp_path):
     links = read(tmp_path, group="set", weight="spread")
     kept, held_out = links.split("x > 15 or y > 35")
     assert (kept.row.tolist(), held_out.row.tolist()) == ([2, 4], [3, 5])
@@ -103,19 +108,19 @@ def test_split_parts_the_links_and_refuses_an_empty_part(tmp_path):
 
 
 @given(st.lists(st.booleans(), min_size=5, max_size=5).filter(any))
-def test_selection_keeps_links_whole(mask):
+def test_selected_links_keep_all_their_values(mask):
     rng = np.random.default_rng(1)
     links = Measurements(
         rng.normal(size=(5, 3)), 9 + rng.normal(size=(5, 3)), np.arange(60, 65.0), group=list("abcab")
     )
     chosen = links.select(mask)
-    places = np.flatnonzero(mask)
-    assert len(chosen) == len(places)
+    indices = np.flatnonzero(mask)
+    assert len(chosen) == len(indices)
     for name in ("tx", "rx", "path_loss_db", "weight", "group", "row", "distance"):
-        np.testing.assert_array_equal(getattr(chosen, name), getattr(links, name)[places])
+        np.testing.assert_array_equal(getattr(chosen, name), getattr(links, name)[indices])
 
 
-def test_arrays_cannot_be_changed_from_either_side():
+def test_arrays_are_copied_and_read_only():
     losses = np.array([80.0])
     links = Measurements([[0, 0, 1]], [[9, 0, 1]], losses)
     losses[0] = 90.0
@@ -137,7 +142,7 @@ def test_parquet_reads_like_csv(tmp_path):
         read_measurements(path, [0, 0, 10.0], ["x", "y", "z"], "loss")
 
 
-def test_a_row_for_which_a_filter_has_no_answer_does_not_pass(tmp_path):
+def test_a_row_with_a_missing_value_does_not_pass_a_filter(tmp_path):
     frame = pd.read_csv(table_file(tmp_path, TABLE)).assign(mode=pd.array([4, None, 4, 1], dtype="Int64"))
     frame.to_parquet(tmp_path / "links.parquet")
     arguments = (tmp_path / "links.parquet", [0, 0, 10.0], ["x", "y", "z"], "loss")
@@ -159,7 +164,7 @@ def test_blank_lines_and_line_breaks_in_quotes_do_not_shift_the_lines(tmp_path):
     assert read(tmp_path, text, where="x > 0").row.tolist() == [3, 6]
 
 
-def test_a_byte_order_mark_and_spaces_after_commas_are_read_over(tmp_path):
+def test_a_byte_order_mark_and_spaces_after_commas_are_ignored(tmp_path):
     text = "\ufeff" + TABLE.replace(",", ", ")
     np.testing.assert_array_equal(read(tmp_path, text, group="set").path_loss_db, [80.5, 86.5, 101.25, 110])
 
@@ -175,8 +180,8 @@ LATER = TABLE.splitlines()[1:]
         ("x,y,z,loss\n", {}, "holds no rows"),
         (TABLE + "1,2,3\n", {}, "row 6: 3 cells, the header has 6"),
         (TABLE + "1,2,3,99,LOS,1,\n", {}, "row 6: 7 cells, the header has 6"),
-        (TABLE.replace(",", ";"), {}, "row 1: columns are parted by ';'"),
-        (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' stands twice"),
+        (TABLE.replace(",", ";"), {}, "row 1: columns are separated by ';'"),
+        (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' appears twice"),
         # Columns
         (TABLE, {"value": "los"}, "no column 'los'; did you mean 'loss'"),
         (TABLE, {"rx": ["x", "y", "hight"]}, "no column 'hight'; there are: x, y, z, loss"),
@@ -218,10 +223,10 @@ LATER = TABLE.splitlines()[1:]
         (TABLE, {"std": 0}, "std: 0 must be greater than 0"),
         (TABLE, {"std": 1, "weight": "spread"}, "give one of them"),
         # Links
-        (TABLE, {"tx": [20, 0, 1.5]}, "row 3: transmitter and receiver stand at the same place"),
+        (TABLE, {"tx": [20, 0, 1.5]}, "row 3: transmitter and receiver are at the same point"),
         (TABLE + LATER[1] + "\n", {}, "row 6: duplicate link, same positions and value as row 3"),
         # Filters
-        (TABLE, {"where": "x > 1000"}, "lets none of 4 rows pass"),
+        (TABLE, {"where": "x > 1000"}, "passes none of 4 rows"),
         (TABLE, {"where": "sett == 'LOS'"}, "no column 'sett'; did you mean 'set'"),
         (TABLE, {"where": "x >"}, "not a valid filter .*the columns are x, y, z, loss, set, spread"),
         (TABLE, {"where": "x < 'a'"}, "not a valid filter"),
@@ -231,12 +236,12 @@ LATER = TABLE.splitlines()[1:]
         (TABLE, {"where": "x.to_csv('out.csv')"}, r"to_csv\(\) is not allowed"),
     ],
 )
-def test_faults_are_refused_with_their_place(tmp_path, text, changes, message):
+def test_faults_are_refused_with_file_row_and_column(tmp_path, text, changes, message):
     with pytest.raises(InputError, match=rf"(?s){message}"):
         read(tmp_path, text, **changes)
 
 
-def test_missing_and_foreign_files(tmp_path):
+def test_missing_files_and_other_formats_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.csv: no such file"):
         read_measurements(tmp_path / "nowhere.csv", [0, 0, 1], [1, 1, 1], "loss")
     with pytest.raises(InputError, match=r"cannot read a \.ods table"):
@@ -247,7 +252,7 @@ def test_missing_and_foreign_files(tmp_path):
         read_measurements(latin, [0, 0, 1], [1, 1, 1], "loss")
 
 
-def test_repeated_measurements_of_one_link_are_kept_and_groups_tell_links_apart(tmp_path):
+def test_repeated_measurements_are_kept_and_copies_refused(tmp_path):
     again = TABLE + LATER[1].replace("86.5", "87.0") + "\n"
     assert len(read(tmp_path, again)) == 5
     other_group = TABLE + LATER[1].replace("LOS", "NLOS") + "\n"
@@ -271,13 +276,13 @@ def test_repeated_measurements_of_one_link_are_kept_and_groups_tell_links_apart(
         ({"group": ["a", "b"]}, r"group: shape \(2,\)"),
     ],
 )
-def test_a_record_of_impossible_links_is_refused(changes, message):
+def test_impossible_links_are_refused(changes, message):
     arguments = {"tx": [[0, 0, 1]], "rx": [[9, 0, 1]], "path_loss_db": [80.0]} | changes
     with pytest.raises(InputError, match=message):
         Measurements(**arguments)
 
 
-def test_half_measured_links_and_bad_masks_are_refused():
+def test_partly_measured_links_and_invalid_masks_are_refused():
     tx, rx = np.zeros((2, 3)), np.ones((2, 3))
     with pytest.raises(InputError, match="only some links have a path loss"):
         Measurements(tx, rx, [80.0, np.nan])

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 from calibray.cli.app import app
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements import column_names as guessing
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring.floor_plan import make_plan_scene
 from calibray.scenes.authoring.floor_plan_file import read_plan
 from calibray.scenes.authoring.footprints import Footprints
@@ -169,7 +168,7 @@ def test_a_track_and_a_hill(tmp_path):
 )
 def test_quantities_are_told_by_name_and_sign(column, values, kind):
     links = SourceTable(pd.DataFrame({column: [values] * 3, "sample_std_db": 3.0, "rx_level": 8}))
-    found = guessing.measured(links, "links.csv")
+    found = column_names.find_value(links)
     assert (found.column, found.quantity) == (column, kind)
 
 

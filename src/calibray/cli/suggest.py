@@ -35,7 +35,7 @@ def suggest(
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.measurements.table_files import read_table
+        from calibray.measurements import read_table
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import shown
         from calibray.prediction.suggestion import suggest as find

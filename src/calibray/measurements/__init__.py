@@ -1,27 +1,44 @@
-"""Measured links: positions, path losses, weights and groups, read from tables and checked at the boundary.
+"""Measured links: positions, path losses, weights and groups, read from tables and checked.
 
-Positions are metres in the scene's frame once rows are links; `preparation` makes them so.
+`reading.measured_links` is the pipeline, from the rows of a table to `Measurements`.
 """
 
-from calibray.measurements.links import FREQUENCIES, Measurements
-from calibray.measurements.parquet import PiecedTable
-from calibray.measurements.preparation import Averaging, Coordinates, Preparation, Track
-from calibray.measurements.reading import (
-    LINK_COLUMNS,
+from calibray.measurements.links import FREQUENCIES, MIN_DISTANCE, Measurements
+from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS
+from calibray.measurements.preparation import (
+    Averaging,
+    Ground,
+    LinkColumns,
+    MoveOutside,
+    Preparation,
     Quantity,
+    Track,
+)
+from calibray.measurements.reading import (
     links_from_frame,
     links_from_table,
     measured_links,
     read_measurements,
 )
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements.selection import select_rows
+from calibray.measurements.source_table import Coordinates, SourceTable
+from calibray.measurements.table_files import PiecedTable, read_table
+from calibray.measurements.tracks import TRACK_COLUMNS
+
+LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
+"""The columns [m] of a table of links without measured values."""
 
 __all__ = [
     "FREQUENCIES",
     "LINK_COLUMNS",
+    "MIN_DISTANCE",
+    "TRACK_COLUMNS",
     "Averaging",
     "Coordinates",
+    "Ground",
+    "LinkColumns",
     "Measurements",
+    "MoveOutside",
     "PiecedTable",
     "Preparation",
     "Quantity",
@@ -31,4 +48,6 @@ __all__ = [
     "links_from_table",
     "measured_links",
     "read_measurements",
+    "read_table",
+    "select_rows",
 ]

@@ -1,174 +1,135 @@
-"""Averaging: many samples about one place to one value, in linear power, with their spread kept.
+"""Average samples to one row per area, in linear power.
 
-Samples along a street fade by several dB within a wavelength, which ray tracing from one point does not tell. What it
-tells is the mean power over some tens of wavelengths (Lee, "Estimate of local average power of a mobile radio signal",
-IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). That mean is taken of powers, not of decibels:
-for Rayleigh fading the mean of the decibels lies 2.5 dB too low.
+Along a street, the power fades by several dB within a wavelength. Ray tracing from one point does not predict that
+fading; it predicts the mean power over some tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a
+mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985: 40 wavelengths, 36 to 50 samples). The mean is taken of
+powers, not of decibels: for Rayleigh fading, the mean of the decibels is 2.5 dB too low.
 
-The logarithm of a mean of few samples lies too low as well, by (10 / ln 10) var / (2 n mean^2) to second order (delta
-method): 0.2 dB for ten samples of Rayleigh fading, and nothing where there is one path.
+The logarithm of a mean of few samples is biased low as well, by (10 / ln 10) var / (2 n mean^2) to second order (delta
+method): 0.2 dB for ten samples of Rayleigh fading, and zero for a single path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements.preparation import Averaging, LinkColumns, Preparation
+from calibray.measurements.source_table import SourceTable
 
-Sense = Literal["power", "loss"]
-"""Whether more decibels are more power (received power, path gain, RSRP), or less (path loss)."""
+MAX_UNCERTAINTY_DB: Final = 1.0
+"""Largest uncertainty [dB] of an average from its samples below the noise floor; more uncertain ones are left out."""
 
-PLACE: Final = ("rx_x", "rx_y")
+_AREA: Final = "calibray area"
 
 
-def by_cell(rows: pd.DataFrame, width: float, place: Sequence[str] = PLACE) -> NDArray[np.int64]:
-    """Label rows by the cell of a square grid that they lie in.
+def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
+    """Average the samples of one area, transmitter and group.
+
+    A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
+    that this leaves uncertain by more than `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor
+    alone would be the strong ones.
 
     Args:
-        rows: The samples.
-        width: Width of a cell [m].
-        place: Columns of the coordinates [m].
+        table: The samples; a value at the noise floor means at or below it.
+        steps: The steps; `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used here.
+        columns: The columns of the positions [m] and of the values [dB] or [dBm].
 
     Returns:
-        A number for every row [rows]: equal where the cells are.
+        For each average the row of its first sample, with the mean receiver position, the mean value, and the columns
+        `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count` (number of samples). The
+        table itself without averaging.
 
     Raises:
-        InputError: A column is missing or holds no number, or the width is not greater than 0.
+        InputError: A column is missing or not numeric, a time cannot be read, or no average remains.
 
     Example:
-        >>> by_cell(pd.DataFrame({"rx_x": [0.1, 0.9, 1.2], "rx_y": [0.0, 0.5, 0.5]}), 1.0)
-        array([0, 0, 1])
+        >>> rows = pd.DataFrame({"rx_x": [0.0, 1.0], "power": [-80.0, -90.0]})
+        >>> rows[["tx_x", "tx_y", "tx_z", "rx_y", "rx_z"]] = 0.0
+        >>> columns = LinkColumns(("tx_x", "tx_y", "tx_z"), ("rx_x", "rx_y", "rx_z"), "power", "rsrp")
+        >>> steps = Preparation(averaging=Averaging("cell", 5.0))
+        >>> averages = average_samples(SourceTable(rows), steps, columns)
+        >>> averages.frame[["rx_x", "power", "std_db", "count"]].round(3).to_dict("records")
+        [{'rx_x': 0.5, 'power': -82.596, 'std_db': 7.071, 'count': 2}]
     """
-    positions = _columns(rows, place)
-    cells = np.floor(positions / _positive("width", width)).astype(np.int64)
+    averaging = steps.averaging
+    if averaging is None:
+        return table
+    # A gain or power rises with the linear power, a loss falls with it.
+    sign = -1.0 if columns.quantity == "path_loss" else 1.0
+    level = sign * table.numbers(columns.value)
+    rx = [str(name) for name in columns.rx]
+    transmitter = [steps.transmitter] if steps.transmitter in table.frame else []
+    keys = dict.fromkeys([*steps.keep, *transmitter, *map(str, columns.tx)])
+    labels = pd.DataFrame({name: table.column(name) for name in keys})
+    labels[_AREA] = _areas(table, averaging, rx[:2])
+    group = labels.groupby([*keys, _AREA], sort=False, dropna=False).ngroup().to_numpy()
+
+    samples = pd.DataFrame({name: table.numbers(name) for name in rx})
+    # Relative to the strongest sample, so that weak powers do not underflow.
+    samples["power"] = 10 ** ((level - level.max()) / 10)
+    samples["level"] = level
+    samples["below"] = 0.0
+    if steps.noise_floor_dbm is not None:
+        samples["below"] = (level <= steps.noise_floor_dbm).astype(float)
+    groups = samples.groupby(group)
+    mean = groups[[*rx, "power", "below"]].mean()
+    count = groups.size()
+    mean_level = (10 * np.log10(mean["power"]) + level.max()).to_numpy()
+
+    table = table.note("samples averaged", len(table))
+    uncertain = np.zeros(len(mean), dtype=bool)
+    if steps.noise_floor_dbm is not None and samples["below"].any():
+        table = table.note("of them at or below the noise floor", int(samples["below"].sum()))
+        highest = 10 ** (mean_level / 10)  # The samples below the floor count as the whole floor.
+        from_below = mean["below"].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
+        lowest = np.maximum(highest - from_below, 0.0)
+        uncertain = highest > lowest * 10 ** (MAX_UNCERTAINTY_DB / 10)
+        mean_level = 10 * np.log10(highest - from_below / 2)
+    if averaging.unbiased:
+        bias_db = 5 / np.log(10) * groups["power"].var() / (count * mean["power"] ** 2)
+        mean_level = mean_level + bias_db.fillna(0.0).to_numpy()
+
+    averages = table.select(~pd.Series(group).duplicated().to_numpy()).assign(
+        **{columns.value: sign * mean_level},
+        **{name: mean[name].to_numpy() for name in rx},
+        std_db=groups["level"].std().to_numpy(),
+        count=count.to_numpy(),
+    )
+    return averages.keep(~uncertain, "averages too near the noise floor, left out")
+
+
+def _areas(table: SourceTable, averaging: Averaging, plan: Sequence[str]) -> NDArray[np.int64]:
+    """Number of the cell, stretch or window of every row [rows]; `plan` names the columns of x and y [m]."""
+    if not (np.isfinite(averaging.size) and averaging.size > 0):
+        raise InputError(f"average.size = {averaging.size!r}: must be a finite number greater than 0")
+    if averaging.by == "time":
+        elapsed = _elapsed(table, str(averaging.time))
+        return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
+    positions = np.stack([table.numbers(name) for name in plan], axis=1)
+    if averaging.by == "distance":
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)
+    cells = np.floor(positions / averaging.size).astype(np.int64)
     return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def by_distance(rows: pd.DataFrame, length: float, place: Sequence[str] = PLACE) -> NDArray[np.int64]:
-    """Label rows by the stretch of the way that they lie on, in the rows' order.
-
-    Args:
-        rows: The samples of one drive, in the order in which they were taken.
-        length: Length of a stretch [m].
-        place: Columns of the coordinates [m].
-
-    Returns:
-        Number of the stretch, from 0 [rows].
-
-    Raises:
-        InputError: A column is missing or holds no number, or the length is not greater than 0.
-
-    Example:
-        >>> by_distance(pd.DataFrame({"rx_x": [0.0, 3.0, 3.0, 3.0], "rx_y": [0.0, 0.0, 1.0, 4.0]}), 4.0)
-        array([0, 0, 1, 1])
-    """
-    positions = _columns(rows, place)
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.floor(np.cumsum([0.0, *steps]) / _positive("length", length)).astype(np.int64)[: len(rows)]
-
-
-def by_time(rows: pd.DataFrame, seconds: float, time: str) -> NDArray[np.int64]:
-    """Label rows by the window of time that they were taken in.
-
-    Args:
-        rows: The samples.
-        seconds: Length of a window [s].
-        time: Column of times: seconds, or texts in ISO 8601.
-
-    Returns:
-        Number of the window, from 0 at the first time [rows].
-
-    Raises:
-        InputError: There is no such column, a time cannot be read, or the length is not greater than 0.
-
-    Example:
-        >>> by_time(pd.DataFrame({"t": [10.0, 10.9, 11.2]}), 1.0, "t")
-        array([0, 0, 1])
-    """
-    table = SourceTable(rows, source="samples")
-    if pd.api.types.is_numeric_dtype(table.column(time)):
-        elapsed = table.numbers(time)
-    else:
-        try:
-            when = pd.to_datetime(table.column(time), utc=True, format="ISO8601")
-        except ValueError as error:
-            raise InputError(
-                f"samples, column {time!r}: a time cannot be read ({error}); give ISO 8601"
-            ) from None
-        if when.isna().any():
-            raise InputError(f"samples, column {time!r}: a time is missing; leave the row out")
-        elapsed = ((when - when.min()) / pd.Timedelta(seconds=1)).to_numpy(dtype=float)
-    return np.floor((elapsed - elapsed.min()) / _positive("seconds", seconds)).astype(np.int64)
-
-
-def averaged(
-    rows: pd.DataFrame,
-    value: str,
-    label: NDArray[np.int64],
-    sense: Sense,
-    keep: Sequence[str] = (),
-    place: Sequence[str] = ("rx_x", "rx_y", "rx_z"),
-) -> pd.DataFrame:
-    """Average the samples of one label in linear power.
-
-    Args:
-        rows: The samples.
-        value: Column of the values [dB] or [dBm].
-        label: Label of every row [rows], as the functions above give it.
-        sense: Whether the values are powers or losses.
-        keep: Columns that no average may cross, such as the transmitter or the carrier: one row for each
-            combination.
-        place: Columns of coordinates [m], averaged as they are; those that the rows lack are passed by.
-
-    Returns:
-        One row a label and combination, in the order of their first sample: the kept columns, the mean coordinates,
-        the value [dB], its `std_db`, the standard deviation of the samples in decibels (NaN of one sample), their
-        `count`, and `low_db`, by how much the logarithm of their mean lies too low on average (0 of one sample).
-
-    Raises:
-        InputError: There is no row, a column is missing or holds no number, or there are not as many labels as rows.
-
-    Example:
-        >>> rows = pd.DataFrame({"rx_x": [0.0, 1.0], "rx_y": [0.0, 0.0], "power": [-80.0, -90.0]})
-        >>> averaged(rows, "power", np.array([0, 0]), "power").round(3).to_dict("records")
-        [{'rx_x': 0.5, 'rx_y': 0.0, 'power': -82.596, 'std_db': 7.071, 'count': 2, 'low_db': 1.454}]
-    """
-    table = SourceTable(rows, source="samples")
-    if not len(rows) or np.shape(label) != (len(rows),):
+def _elapsed(table: SourceTable, time: str) -> NDArray[np.float64]:
+    """Times of the rows [rows], [s] after any start."""
+    column = table.column(time)
+    if pd.api.types.is_numeric_dtype(column):
+        return table.numbers(time)
+    try:
+        times = pd.to_datetime(column, utc=True, format="ISO8601")
+    except ValueError as error:
         raise InputError(
-            f"samples: {np.shape(label)} labels for {len(rows)} rows; give one for each, at least one"
-        )
-    levels = table.numbers(value) * {"power": 1.0, "loss": -1.0}[sense]
-    coordinates = [name for name in place if name in rows]
-    parts = {name: table.column(name).to_numpy() for name in keep}
-    samples = pd.DataFrame({**parts, **{name: table.numbers(name) for name in coordinates}})
-    # The strongest sample is set to 1 so that no power is lost below the smallest number.
-    samples["linear"] = 10 ** ((levels - levels.max()) / 10)
-    samples["level"] = levels
-    samples["label"] = label
-    groups = samples.groupby([*keep, "label"], sort=False, dropna=False)
-    mean: pd.DataFrame = groups[[*coordinates, "linear"]].mean()  # type: ignore[assignment]
-    linear, count = mean.pop("linear"), groups.size()
-    power = 10 * np.log10(linear) + levels.max()
-    mean[value] = power if sense == "power" else -power
-    mean["std_db"] = groups["level"].std()
-    mean["count"] = count
-    mean["low_db"] = (5 / np.log(10) * groups["linear"].var() / (count * linear**2)).fillna(0.0)
-    return mean.reset_index().drop(columns="label")
-
-
-def _columns(rows: pd.DataFrame, place: Sequence[str]) -> NDArray[np.float64]:
-    table = SourceTable(rows, source="samples")
-    return np.stack([table.numbers(name) for name in place], axis=1)
-
-
-def _positive(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0):
-        raise InputError(f"{name} = {value!r}: must be a finite number greater than 0")
-    return float(value)
+            f"{table.source}, column {time!r}: a time cannot be read ({error}); give ISO 8601"
+        ) from None
+    if times.isna().any():
+        raise InputError(f"{table.source}, column {time!r}: a time is missing; leave the row out")
+    return np.asarray((times - times.min()) / pd.Timedelta(seconds=1), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Guessing: what the columns of a table of links are, by their names and checked against their values."""
+"""Guess what the columns of a table hold, from the words of their names and from their values."""
 
 from __future__ import annotations
 
@@ -12,55 +12,51 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.measurements.links import FREQUENCIES
-from calibray.measurements.reading import Quantity
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements.preparation import Quantity
+from calibray.measurements.source_table import SourceTable
 
-ENDS: Final = {
-    "tx": frozenset({"tx", "transmitter", "bs", "site", "cell", "ap", "gnb", "enb", "base", "anchor"}),
-    "rx": frozenset({"rx", "receiver", "ue", "phone", "mobile", "device"}),
+PATTERNS: Final = {
+    # What a column may hold, and the regular expression that a whole word of its name matches.
+    "transmitter": r"tx|transmitter|bs|site|cell|ap|gnb|enb|base|anchor",
+    "receiver": r"rx|receiver|ue|phone|mobile|device",
+    "receiving device": r"rx|receiver|ue|phone|device|handset",
+    "name of a transmitter": r"id|name",
+    "x": r"x|east|easting",
+    "y": r"y|north|northing",
+    "longitude": r"lon|lng|long|longitude",
+    "latitude": r"lat|latitude",
+    "height": r"z|h|height",
+    "altitude or floor": r"alt|altitude|level",
+    "path loss": r"pl|loss|pathloss",
+    "path gain": r"gain|pathgain",
+    "received power": r"rsrp|rssi|rss|dbm|prx|power|level|rxlev|signal",
+    "another quantity": r"std|sigma|snr|sinr|rsrq|count|n|number|noise|floor|eirp|tx|id|error",
+    "EIRP": r"eirp",
+    "transmitted": r"tx|transmit|transmitted",
+    "power": r"power|dbm",
+    "decibel": r"db|dbm",
+    "frequency": r"freq|frequency|carrier|fc",
+    "time": r"time|timestamp|date|datetime|utc|epoch",
+    "distance": r"dist.*",
 }
-_X: Final = frozenset({"x", "east", "easting"})
-_Y: Final = frozenset({"y", "north", "northing"})
-_LONGITUDE: Final = frozenset({"lon", "lng", "long", "longitude"})
-_LATITUDE: Final = frozenset({"lat", "latitude"})
-_HEIGHT: Final = frozenset({"z", "h", "height"})
-_QUANTITIES: Final = (
-    ("path_loss", frozenset({"pl", "loss", "pathloss"})),
-    ("path_gain", frozenset({"gain", "pathgain"})),
-    ("rsrp", frozenset({"rsrp", "rssi", "rss", "dbm", "prx", "power", "level", "rxlev", "signal"})),
-)
-_OTHER: Final = frozenset(
-    {
-        "std",
-        "sigma",
-        "snr",
-        "sinr",
-        "rsrq",
-        "count",
-        "n",
-        "number",
-        "noise",
-        "floor",
-        "eirp",
-        "tx",
-        "id",
-        "error",
-    }
-)
-_GROUPS: Final = frozenset({"device", "phone", "ue", "receiver", "rx", "handset"})
-_TIME: Final = frozenset({"time", "timestamp", "date", "datetime", "utc", "epoch"})
-_NAMES: Final = frozenset({"id", "name", "transmitter", *ENDS["tx"]})
+"""Spellings of column names. To recognize one more, add it to its row; case and punctuation do not matter."""
+
+FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
+"""Units of carriers in column names [Hz]."""
+
+MAX_DEVICES: Final = 12
+"""Largest number of receiving devices; a column with more values probably holds something else, such as a location."""
 
 
 @dataclass(frozen=True)
-class Place:
+class PositionColumns:
     """The columns of one end's position.
 
     Attributes:
         position: "scene" for metres, "geographic" for degrees.
         x: Column of x, or of longitudes.
         y: Column of y, or of latitudes.
-        height: Column of heights; None where there is none.
+        height: Column of heights; None if there is none.
     """
 
     position: Literal["scene", "geographic"]
@@ -70,13 +66,13 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Value:
+class ValueColumn:
     """The column of measured values.
 
     Attributes:
         column: The column.
-        quantity: What it holds.
-        reason: Why it is taken for that.
+        quantity: The quantity that it holds.
+        reason: Why it was chosen.
     """
 
     column: str
@@ -85,7 +81,7 @@ class Value:
 
 
 def words(name: object) -> frozenset[str]:
-    """The words of a column's name, in lower case.
+    """Words of a column's name, in lower case.
 
     Args:
         name: The name.
@@ -100,52 +96,76 @@ def words(name: object) -> frozenset[str]:
     return frozenset(filter(None, re.split(r"[^a-z0-9]+", str(name).lower())))
 
 
-def place(frame: pd.DataFrame, end: Literal["tx", "rx"], own: bool) -> Place | None:
+def matches(name: object, *rows: str) -> bool:
+    """Whether a word of a column's name is a spelling in one of some rows of `PATTERNS`.
+
+    Args:
+        name: The name.
+        rows: The rows.
+
+    Returns:
+        Whether one matches.
+
+    Example:
+        >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
+        (True, False)
+    """
+    return any(re.fullmatch(PATTERNS[row], word) for row in rows for word in words(name))
+
+
+def numeric_columns(frame: pd.DataFrame) -> list[str]:
+    """Names of the columns that hold numbers."""
+    return [
+        str(name)
+        for name in frame
+        if pd.api.types.is_numeric_dtype(frame[name]) and not pd.api.types.is_bool_dtype(frame[name])
+    ]
+
+
+def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns of one end's position; metres are preferred to degrees.
 
     Args:
         frame: The table.
-        end: Which end.
-        own: Whether columns that name no end are this one's.
+        end: The end.
+        unnamed: Whether columns that name neither end may be this end's.
 
     Returns:
         The columns, or None.
 
     Example:
-        >>> place(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", own=True)
-        Place(position='geographic', x='lon', y='lat', height=None)
+        >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
+        PositionColumns(position='geographic', x='lon', y='lat', height=None)
     """
-    other = ENDS["rx" if end == "tx" else "tx"]
-    named = [name for name in numeric(frame) if words(name) & ENDS[end] and not words(name) & other]
-    free = [name for name in numeric(frame) if own and not words(name) & (ENDS["tx"] | ENDS["rx"])]
-    for names in (named, free):
-        height = _first(names, _HEIGHT)
-        for position, east, north in (("scene", _X, _Y), ("geographic", _LONGITUDE, _LATITUDE)):
-            x, y = _first(names, east), _first(names, north)
-            if x is not None and y is not None:
-                return Place(position, x, y, height)  # type: ignore[arg-type]
+    this, other = ("transmitter", "receiver") if end == "tx" else ("receiver", "transmitter")
+    columns = numeric_columns(frame)
+    candidates = [[name for name in columns if matches(name, this) and not matches(name, other)]]
+    if unnamed:
+        candidates.append([name for name in columns if not matches(name, this, other)])
+    for names in candidates:
+        height = _first(names, "height")
+        x, y = _first(names, "x"), _first(names, "y")
+        if x is not None and y is not None:
+            return PositionColumns("scene", x, y, height)
+        longitude, latitude = _first(names, "longitude"), _first(names, "latitude")
+        if longitude is not None and latitude is not None:
+            return PositionColumns("geographic", longitude, latitude, height)
     return None
 
 
-def height(frame: pd.DataFrame, end: Literal["tx", "rx"]) -> str | None:
-    """The column of an end's heights, where it has no other coordinates.
-
-    Args:
-        frame: The table.
-        end: Which end.
-
-    Returns:
-        The column, or None.
-    """
-    return _first([name for name in numeric(frame) if words(name) & ENDS[end]], _HEIGHT)
+def find_transmitter_height(frame: pd.DataFrame) -> str | None:
+    """Column of the transmitter's heights, or None."""
+    return _first([name for name in numeric_columns(frame) if matches(name, "transmitter")], "height")
 
 
-def measured(table: SourceTable, source: str) -> Value:
+def find_value(table: SourceTable) -> ValueColumn:
     """Find the column of measured values.
+
+    Names with a decibel unit come first, then path losses before path gains before received powers. The sign of the
+    values decides between loss and gain.
 
     Args:
         table: The links.
-        source: Their file, for messages.
 
     Returns:
         The column and its quantity.
@@ -153,75 +173,67 @@ def measured(table: SourceTable, source: str) -> Value:
     Raises:
         InputError: No column looks like one.
     """
-    found = []
-    for name in numeric(table.frame):
-        told = words(name)
-        if told & _OTHER:
+    kinds: tuple[tuple[str, Quantity], ...] = (
+        ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
+    )  # fmt: skip
+    candidates: list[tuple[bool, int, str, Quantity]] = []
+    for name in numeric_columns(table.frame):
+        rank = next((rank for rank, (row, _) in enumerate(kinds) if matches(name, row)), None)
+        if rank is None or matches(name, "another quantity"):
             continue
-        for rank, (quantity, terms) in enumerate(_QUANTITIES):
-            if told & terms:
-                found.append((not told & {"db", "dbm"}, rank, quantity, name))
-                break
-    fitting = [
-        entry for entry in sorted(found, key=lambda entry: entry[:2]) if _fits(table, entry[3], entry[2])
-    ]
-    if not fitting:
+        if _is_plausible(table.frame[name], kinds[rank][1]):
+            candidates.append((not matches(name, "decibel"), rank, name, kinds[rank][1]))
+    if not candidates:
         raise InputError(
-            f"{source}: no column looks like path loss, path gain or received power "
+            f"{table.source}: no column looks like path loss, path gain or received power "
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
         )
-    _, _, quantity, name = fitting[0]
-    middle = float(np.nanmedian(table.frame[name]))
-    reason = f"its name, and values about {middle:.0f}"
-    if quantity == "path_loss" and middle < 0:
-        quantity, reason = "path_gain", f"called a loss, but values are negative, about {middle:.0f}: a gain"
-    elif quantity == "path_gain" and middle > 0:
-        quantity, reason = "path_loss", f"called a gain, but values are positive, about {middle:.0f}: a loss"
-    others = [entry[3] for entry in fitting[1:]]
-    return Value(name, quantity, reason + (f"; not {', '.join(others)}" if others else ""))  # type: ignore[arg-type]
+    candidates.sort(key=lambda candidate: candidate[:2])
+    _, _, name, quantity = candidates[0]
+    median = float(np.nanmedian(table.frame[name]))
+    reason = f"its name, and values about {median:.0f}"
+    if quantity == "path_loss" and median < 0:
+        quantity, reason = "path_gain", f"named a loss, but values are negative, about {median:.0f}: a gain"
+    elif quantity == "path_gain" and median > 0:
+        quantity, reason = "path_loss", f"named a gain, but values are positive, about {median:.0f}: a loss"
+    others = [candidate[2] for candidate in candidates[1:]]
+    return ValueColumn(name, quantity, reason + (f"; not {', '.join(others)}" if others else ""))
 
 
-def transmitted(frame: pd.DataFrame) -> str | None:
-    """The column of transmitted powers [dBm], or None.
-
-    Args:
-        frame: The links.
-
-    Returns:
-        The column.
-    """
-    for name in numeric(frame):
-        told = words(name)
-        if "eirp" in told or (told & {"tx", "transmit", "transmitted"} and told & {"power", "dbm"}):
+def find_transmit_power(frame: pd.DataFrame) -> str | None:
+    """Column of transmitted powers [dBm], or None."""
+    for name in numeric_columns(frame):
+        if matches(name, "EIRP") or (matches(name, "transmitted") and matches(name, "power")):
             return name
     return None
 
 
-def wide(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
-    """The columns of a table with one column a transmitter.
+def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
+    """Find the columns of a wide table, one per transmitter.
 
     Args:
         frame: The table.
-        names: The transmitters' names.
+        transmitters: Names of the transmitters.
 
     Returns:
-        Transmitter by column: columns called like it, or ending in its name after a sign; empty if fewer than two.
+        Transmitter by column: columns that are named like it, or whose name ends in its name after a separator. Empty
+        if there are fewer than two.
 
     Example:
-        >>> wide(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
+        >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
         {'rss_a': 'a', 'rss_b': 'b'}
     """
-    found = {
+    columns = {
         str(column): name
-        for name in names
+        for name in transmitters
         for column in frame
         if re.fullmatch(rf"(.*[^a-z0-9])?{re.escape(name.lower())}", str(column).lower())
     }
-    return found if len(found) > 1 else {}
+    return columns if len(columns) > 1 else {}
 
 
-def common_value(columns: Iterable[str]) -> str:
-    """What the column of values is called that columns of transmitters become: by the words that all have in common.
+def name_melted_values(columns: Iterable[str]) -> str:
+    """Name the column of values that the columns of a wide table become, after a word that all of them share.
 
     Args:
         columns: The columns, at least one.
@@ -230,142 +242,102 @@ def common_value(columns: Iterable[str]) -> str:
         The name.
 
     Example:
-        >>> common_value(["RSS AP1", "RSS AP2"])
+        >>> name_melted_values(["RSS AP1", "RSS AP2"])
         'rss_value'
     """
-    common = frozenset.intersection(*map(words, columns))
+    shared = frozenset.intersection(*map(words, columns))
     terms = ("rsrp", "rss", "rssi", "loss", "pl", "gain")
-    return next((term for term in terms if term in common), "rss") + "_value"
+    return next((term for term in terms if term in shared), "rss") + "_value"
 
 
-def shared_name(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """The column by which two tables name the transmitter.
+def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
+    """Find the column by which two tables name the transmitter.
 
     Args:
         links: The links.
-        transmitters: A row for every transmitter.
+        transmitters: One row per transmitter.
 
     Returns:
-        The first column of both whose values in the links are all known, or None.
+        The first column of both tables in which every value of the links appears once among the transmitters, or None.
     """
     for name in transmitters:
-        known = set(transmitters[name].astype(str))
-        if name in links and len(known) == len(transmitters) and set(links[name].astype(str)) <= known:
+        values = set(transmitters[name].astype(str))
+        if name in links and len(values) == len(transmitters) and set(links[name].astype(str)) <= values:
             return str(name)
     return None
 
 
-def own_name(transmitters: pd.DataFrame) -> str:
-    """The column of names of a table of transmitters.
+def find_transmitter_names(transmitters: pd.DataFrame) -> str:
+    """Find the column of names of a table of transmitters.
 
     Args:
-        transmitters: A row for every transmitter.
+        transmitters: One row per transmitter.
 
     Returns:
         The column.
 
     Raises:
-        InputError: No column is called like one and tells the transmitters apart.
+        InputError: No column with such a name distinguishes the transmitters.
     """
     for name in transmitters:
-        if words(name) & _NAMES and transmitters[name].nunique() == len(transmitters):
+        is_named_so = matches(name, "name of a transmitter", "transmitter")
+        if is_named_so and transmitters[name].nunique() == len(transmitters):
             return str(name)
     raise InputError(
         f"transmitters: no column names them ({', '.join(map(str, transmitters))}); call it 'transmitter'"
     )
 
 
-def devices(frame: pd.DataFrame, most: int = 12) -> list[str]:
-    """Columns that tell receiving devices apart.
-
-    Args:
-        frame: The links.
-        most: Devices beyond which a column is taken for something else, such as a place.
-
-    Returns:
-        The columns.
-    """
-    coordinates = _X | _Y | _LONGITUDE | _LATITUDE | _HEIGHT | {"alt", "altitude", "level"}
+def find_devices(frame: pd.DataFrame) -> list[str]:
+    """Columns that distinguish receiving devices."""
+    coordinates = ("x", "y", "longitude", "latitude", "height", "altitude or floor")
     return [
         str(name)
         for name in frame
-        if words(name) & _GROUPS and not words(name) & coordinates and 1 < frame[name].nunique() <= most
+        if matches(name, "receiving device")
+        and not matches(name, *coordinates)
+        and 1 < frame[name].nunique() <= MAX_DEVICES
     ]
 
 
-def frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """The column of carriers, and their values [Hz].
+def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
+    """Find the column of carriers.
 
     Args:
         frame: The links.
 
     Returns:
-        The column and every row's carrier, the unit taken from its name or its size; None if there is none.
+        The column and the carrier of every row [Hz], with the unit from the column's name or else from the size of
+        its values; None if there is none.
     """
-    units = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-    for name in numeric(frame):
-        told = words(name)
-        if told & {"freq", "frequency", "carrier", "fc"}:
-            values = frame[name].to_numpy(dtype=float)
-            size = float(np.nanmedian(values))
-            guess = "ghz" if size < 300 else "mhz" if size < 3e5 else "hz"
-            carrier = values * units[next((unit for unit in units if unit in told), guess)]
-            if FREQUENCIES[0] <= np.nanmin(carrier) and np.nanmax(carrier) <= FREQUENCIES[1]:
-                return name, carrier
+    for name in numeric_columns(frame):
+        if not matches(name, "frequency"):
+            continue
+        values = frame[name].to_numpy(dtype=float)
+        median = float(np.nanmedian(values))
+        likely_unit = "ghz" if median < 300 else "mhz" if median < 3e5 else "hz"
+        unit = next((unit for unit in FREQUENCY_UNITS if unit in words(name)), likely_unit)
+        carriers = values * FREQUENCY_UNITS[unit]
+        if FREQUENCIES[0] <= np.nanmin(carriers) and np.nanmax(carriers) <= FREQUENCIES[1]:
+            return name, carriers
     return None
 
 
-def time(frame: pd.DataFrame) -> str | None:
-    """The column of times, or None.
-
-    Args:
-        frame: The links.
-
-    Returns:
-        The first column called like one.
-
-    Example:
-        >>> time(pd.DataFrame({"power": [-70.0], "UTC time": ["2026-05-04T09:00:00Z"]}))
-        'UTC time'
-    """
-    return next((str(name) for name in frame if words(name) & _TIME), None)
+def find_time(frame: pd.DataFrame) -> str | None:
+    """First column that is named like times, or None."""
+    return _first([str(name) for name in frame], "time")
 
 
-def distance(frame: pd.DataFrame) -> str | None:
-    """The column of distances from transmitter to receiver, or None.
-
-    Args:
-        frame: The links.
-
-    Returns:
-        The column.
-    """
-    return next(
-        (name for name in numeric(frame) if any(part.startswith("dist") for part in words(name))), None
-    )
+def find_distance(frame: pd.DataFrame) -> str | None:
+    """Column of distances from transmitter to receiver, or None."""
+    return _first(numeric_columns(frame), "distance")
 
 
-def numeric(frame: pd.DataFrame) -> list[str]:
-    """The columns that hold numbers.
-
-    Args:
-        frame: A table.
-
-    Returns:
-        Their names.
-    """
-    return [
-        str(name)
-        for name in frame
-        if pd.api.types.is_numeric_dtype(frame[name]) and not pd.api.types.is_bool_dtype(frame[name])
-    ]
+def _first(names: Iterable[str], row: str) -> str | None:
+    return next((name for name in names if matches(name, row)), None)
 
 
-def _first(names: Iterable[str], terms: frozenset[str]) -> str | None:
-    return next((name for name in names if words(name) & terms), None)
-
-
-def _fits(table: SourceTable, name: str, quantity: str) -> bool:
-    """Whether values can be what their name says, the sign apart for loss and gain."""
-    middle = float(np.nanmedian(table.frame[name])) if table.frame[name].notna().any() else 0.0
-    return -200 < middle < -10 if quantity == "rsrp" else 20 < abs(middle) < 250
+def _is_plausible(values: pd.Series, quantity: Quantity) -> bool:
+    """Whether values can be of a quantity; the sign of a loss or gain is open."""
+    median = float(np.nanmedian(values)) if values.notna().any() else 0.0
+    return -200 < median < -10 if quantity == "rsrp" else 20 < abs(median) < 250

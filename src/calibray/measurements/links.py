@@ -10,20 +10,18 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.summary import summary
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements.source_table import SourceTable
 from calibray.support.messages import shortened
-from calibray.tables import display as glance
-from calibray.tables.display import named
+from calibray.tables import Column, Table, display
 
-COINCIDENCE: Final = 1e-3
-"""The distance [m] below which transmitter and receiver stand at the same place."""
+MIN_DISTANCE: Final = 1e-3
+"""Distance [m] between transmitter and receiver below which they coincide, and no path loss is defined."""
 
 FREQUENCIES: Final = (1e6, 1e12)
-"""The carrier frequencies [Hz] taken as meant; one outside was probably given in another unit."""
+"""Range of carriers [Hz]; a value outside was probably given in MHz or GHz."""
 
 MAX_CARRIERS: Final = 32
-"""The number of carriers beyond which a column of frequencies is taken for another quantity."""
+"""Largest number of carriers; a column with more values probably holds another quantity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,20 +31,18 @@ class Measurements:
     Attributes:
         tx: Transmitter positions [links, 3], [m].
         rx: Receiver positions [links, 3], [m].
-        path_loss_db: Measured path losses [links], [dB]; all NaN for links that were not measured.
+        path_loss_db: Measured path losses [links], [dB]; all NaN for links without measured values.
         weight: Relative weights [links], [1], greater than 0; 1 unless given.
-        group: Labels [links] of the group each link belongs to, or None.
-        frequency: Carrier of each link [links], [Hz], or None where all have the study's.
-        limit_db: Path loss [links], [dB], beyond which a link could not have been measured, or None where none is
-            known.
+        group: Label [links] of each link's group, or None.
+        frequency: Carrier of each link [links], [Hz], or None if all have the study's.
+        limit_db: Largest path loss [links], [dB] that could have been measured, or None if unknown.
         censored: Mask [links] of the links below the noise floor, whose path loss is at least `path_loss_db`; None if
             no link is censored.
         table: The rows of the source table, for filters and messages; one empty row per link unless given.
-        prepared: What was left out, averaged or moved before the rows were links, and how many of them.
 
     Raises:
-        InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a
-            weight is not positive, a carrier or their number is implausible, or only some path losses are finite.
+        InputError: Shapes disagree, a position is not finite, a transmitter and its receiver coincide, a weight is not
+            positive, a carrier or the number of carriers is implausible, or only some path losses are finite.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]], rx=[[30, 40, 10]], path_loss_db=[85.0])
@@ -65,30 +61,33 @@ class Measurements:
     limit_db: NDArray[np.float64] | None = None
     censored: NDArray[np.bool_] | None = None
     table: SourceTable = field(default=None)  # type: ignore[assignment]
-    prepared: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        count = np.shape(self.path_loss_db)[:1][0] if np.ndim(self.path_loss_db) == 1 else -1
+        count = np.shape(self.path_loss_db)[0] if np.ndim(self.path_loss_db) == 1 else 0
         if count < 1:
             raise InputError(
                 f"path_loss_db: shape {np.shape(self.path_loss_db)}, must be [links], one or more"
             )
-        set_field = object.__setattr__
-        set_field(self, "tx", _array("tx", self.tx, (count, 3)))
-        set_field(self, "rx", _array("rx", self.rx, (count, 3)))
-        set_field(self, "path_loss_db", _array("path_loss_db", self.path_loss_db, (count,)))
-        weight = np.ones(count) if self.weight is None else self.weight
-        set_field(self, "weight", _array("weight", weight, (count,)))
-        if self.group is not None:
-            set_field(self, "group", _array("group", self.group, (count,), np.str_))
-        if self.frequency is not None:
-            set_field(self, "frequency", _array("frequency", self.frequency, (count,)))
-        if self.limit_db is not None:
-            set_field(self, "limit_db", _array("limit_db", self.limit_db, (count,)))
-        if self.censored is not None:
-            set_field(self, "censored", _array("censored", self.censored, (count,), np.bool_))
+        if self.weight is None:
+            object.__setattr__(self, "weight", np.ones(count))
+        for name, shape, dtype in (
+            ("tx", (count, 3), np.float64),
+            ("rx", (count, 3), np.float64),
+            ("path_loss_db", (count,), np.float64),
+            ("weight", (count,), np.float64),
+            ("group", (count,), np.str_),
+            ("frequency", (count,), np.float64),
+            ("limit_db", (count,), np.float64),
+            ("censored", (count,), np.bool_),
+        ):
+            if getattr(self, name) is not None:
+                array = np.array(getattr(self, name), dtype=dtype)
+                if array.shape != shape:
+                    raise InputError(f"{name}: shape {array.shape}, must be {shape}")
+                array.flags.writeable = False
+                object.__setattr__(self, name, array)
         if self.table is None:
-            set_field(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
+            object.__setattr__(self, "table", SourceTable(pd.DataFrame(index=range(count)), source="links"))
         if len(self.table) != count:
             raise InputError(f"table: {len(self.table)} rows, must be {count}, one per link")
         _check_links(self)
@@ -98,11 +97,11 @@ class Measurements:
 
     def __repr__(self) -> str:
         kind = "measured" if self.measured else "unmeasured"
-        groups = "" if self.group is None else f" in groups {named(self.group_names)}"
-        return glance.text(f"<{len(self)} {kind} links{groups} from {self.source}>")
+        groups = "" if self.group is None else f" in groups {display.named(self.group_names)}"
+        return display.text(f"<{len(self)} {kind} links{groups} from {self.source}>")
 
     def _repr_html_(self) -> str:
-        return glance.html(*summary(self))
+        return display.html(_summary(self))
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -120,8 +119,13 @@ class Measurements:
         return self.table.source
 
     @property
+    def prepared(self) -> dict[str, int]:
+        """What was left out, averaged or moved before rows were links, each with the number of rows."""
+        return dict(self.table.changes)
+
+    @property
     def measured(self) -> bool:
-        """Whether the links carry measured values."""
+        """Whether the links have measured values."""
         return bool(np.isfinite(self.path_loss_db[0]))
 
     @property
@@ -131,23 +135,24 @@ class Measurements:
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """The groups, sorted; one nameless group when there are none."""
+        """The groups, sorted; one with an empty name if the links have no groups."""
         return ("",) if self.group is None else tuple(map(str, np.unique(self.group)))
 
     @property
     def group_index(self) -> NDArray[np.int64]:
-        """The place [links] of each link's group in `group_names`."""
+        """The index [links] of each link's group in `group_names`."""
         if self.group is None:
             return np.zeros(len(self), dtype=np.int64)
         return np.searchsorted(self.group_names, self.group)
 
     @property
     def carriers(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """The carriers [Hz], ascending, each with the links measured there; none where all have the study's."""
+        """The carriers [Hz], ascending, each with the indices of its links; empty if all have the study's carrier."""
         if self.frequency is None:
             return ()
         return tuple(
-            (float(each), np.flatnonzero(self.frequency == each)) for each in np.unique(self.frequency)
+            (float(carrier), np.flatnonzero(self.frequency == carrier))
+            for carrier in np.unique(self.frequency)
         )
 
     def select(self, mask: ArrayLike) -> Measurements:
@@ -173,7 +178,6 @@ class Measurements:
             limit_db=None if self.limit_db is None else self.limit_db[chosen],
             censored=None if self.censored is None else self.censored[chosen],
             table=self.table.select(chosen),
-            prepared=self.prepared,
         )
 
     def where(self, expression: str) -> NDArray[np.bool_]:
@@ -185,13 +189,13 @@ class Measurements:
         return self.table.where(expression)
 
     def split(self, holdout: str) -> tuple[Measurements, Measurements]:
-        """Part the links into those to calibrate on and those to judge by.
+        """Split into calibration and held-out links.
 
         Args:
             holdout: Filter over the source table's columns; the links that pass are held out.
 
         Returns:
-            The links to calibrate on, and those held out.
+            The calibration links and the held-out links.
 
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.
@@ -206,7 +210,7 @@ class Measurements:
             holdout: Filter over the source table's columns.
 
         Returns:
-            The mask [links], true for some links and not for all.
+            The mask [links], true for at least one link and false for at least one.
 
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.
@@ -220,24 +224,12 @@ class Measurements:
         return held_out
 
 
-def _array(name: str, values: ArrayLike, shape: tuple[int, ...], dtype: type = np.float64) -> NDArray:
-    """A read-only copy of values, of a given shape."""
-    array = np.array(values, dtype=dtype)
-    if array.shape != shape:
-        raise InputError(f"{name}: shape {array.shape}, must be {shape}")
-    array.flags.writeable = False
-    return array
-
-
 def _check_links(links: Measurements) -> None:
-    """Refuse links that no engine could evaluate."""
+    """Refuse links that no engine can evaluate."""
     checks = (
         (~np.isfinite(links.tx).all(axis=1), "the transmitter's position is not finite; correct it"),
         (~np.isfinite(links.rx).all(axis=1), "the receiver's position is not finite; correct it"),
-        (
-            links.distance < COINCIDENCE,
-            "transmitter and receiver stand at the same place; move or remove one",
-        ),
+        (links.distance < MIN_DISTANCE, "transmitter and receiver are at the same point; move or remove one"),
         (~(links.weight > 0), "the weight must be greater than 0; leave the row out"),
         (np.isinf(links.weight), "the weight must be finite; correct it"),
         (np.isinf(links.path_loss_db), "the path loss is infinite; leave the row out"),
@@ -258,14 +250,31 @@ def _check_links(links: Measurements) -> None:
 
 def _check_carriers(links: Measurements, frequency: NDArray[np.float64]) -> None:
     lowest, highest = FREQUENCIES
-    if (strange := ~((frequency >= lowest) & (frequency <= highest))).any():
-        first = int(np.flatnonzero(strange)[0])
+    if (outside := ~((frequency >= lowest) & (frequency <= highest))).any():
+        first = int(np.flatnonzero(outside)[0])
         raise InputError(
-            f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must lie in {lowest:g} to "
-            f"{highest:g} Hz ({strange.sum()} of {len(links)} rows); 28.5 GHz is written 28.5e9"
+            f"{links.source}, row {links.row[first]}: the frequency {frequency[first]:g} must be in {lowest:g} to "
+            f"{highest:g} Hz ({outside.sum()} of {len(links)} rows); 28.5 GHz is written 28.5e9"
         )
     if (count := len(np.unique(frequency))) > MAX_CARRIERS:
         raise InputError(
             f"{links.source}: {count} different frequencies, must be at most {MAX_CARRIERS}; give the carrier of each "
-            "link, not what was measured around it"
+            "link, not a frequency within the measured band"
         )
+
+
+def _summary(links: Measurements) -> Table:
+    """Source, number and ranges of the links."""
+    kind = "measured" if links.measured else "unmeasured"
+    rows = [("number", f"{len(links):,} {kind}"), ("distance", _range(links.distance, "m"))]
+    if links.measured:
+        rows.append(("path loss", _range(links.path_loss_db, "dB")))
+    if links.group is not None:
+        rows.append(("groups", display.named(links.group_names)))
+    if links.carriers:
+        rows.append(("carriers", display.named(display.hertz(frequency) for frequency, _ in links.carriers)))
+    return Table(f"Links from {links.source}", (Column(), Column()), tuple(rows))
+
+
+def _range(values: NDArray[np.float64], unit: str) -> str:
+    return f"{values.min():.4g} to {values.max():.4g} {unit}"

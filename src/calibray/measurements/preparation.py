@@ -1,45 +1,72 @@
-"""Preparation: what phones, scanners and tracks wrote becomes one row a link, in metres, and each loss is counted."""
+"""What a table's columns mean, and the steps that turn its rows into links."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Literal, get_args
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements.averaging import Sense, averaged, by_cell, by_distance, by_time
-from calibray.measurements.geographic import Ground, joined_by_time, read_track, with_scene_positions
-from calibray.measurements.received_power import long_table, marked_censored, with_transmitters
-from calibray.measurements.table_files import SourceTable, read_table
-from calibray.support.messages import shortened
+from calibray.measurements.source_table import Coordinates, SourceTable
+from calibray.support.messages import did_you_mean
 
-Coordinates = Sequence[float | str]
+Quantity = Literal["path_loss", "path_gain", "received_power", "rsrp"]
 
-_DEGREES: Final = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
-_ROW: Final = "calibray row"
-CENSORED: Final = "censored"
-"""Column that marks the rows below the noise floor, if these are kept."""
+Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""Height of the ground [m] as a function of x and y [m]."""
 
-_UNHEARD: Final = "calibray unheard"
+MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""From positions [n, 3] to positions outside buildings (NaN if too deep inside) and the moved distances [n], [m]."""
 
-MOST_UNHEARD_DB: Final = 1.0
-"""How far samples below the noise floor may leave an average open [dB]; where further, it is left out."""
 
-PREPARED: Final = {end: tuple(f"{end}_{axis}" for axis in "xyz") for end in ("tx", "rx")}
-"""The columns of positions in the scene's metres that preparation writes."""
+@dataclass(frozen=True)
+class LinkColumns:
+    """The columns of a table that describe its links.
 
-TRACKED: Final = ("track_longitude", "track_latitude")
-"""The columns of a row's position on a track [deg]."""
+    Attributes:
+        tx: Transmitter position: x, y, z [m], or longitude, latitude [deg] and height [m].
+        rx: Receiver position, likewise.
+        value: Column of the measured values.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm]: a received power whose
+            transmitted power is unknown. The path loss is then minus the received power, and an offset absorbs the
+            transmitted power.
+        group: Column of group labels, or several columns whose labels are joined.
+        weight: Column of relative weights [1], greater than 0.
+        std: Standard deviation [dB] of the values, a number or a column; the weights become 1 / std^2.
+        tx_power_dbm: Transmitted power [dBm], a number or a column; for "received_power" only.
+        frequency: Column of carrier frequencies [Hz].
 
-Inside = Literal["drop", "move"]
-Way = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Positions [n, 3] to positions outside of buildings, NaN where given up, and how far each was moved [n], [m]."""
+    Raises:
+        InputError: The quantity is unknown, does not fit `tx_power_dbm`, or both `weight` and `std` are given.
+    """
+
+    tx: Coordinates
+    rx: Coordinates
+    value: str
+    quantity: Quantity = "path_loss"
+    group: str | Sequence[str] | None = None
+    weight: str | None = None
+    std: str | float | None = None
+    tx_power_dbm: str | float | None = None
+    frequency: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.quantity not in get_args(Quantity):
+            remedy = did_you_mean(self.quantity, get_args(Quantity))
+            raise InputError(f"quantity = {self.quantity!r}: unknown, {remedy}")
+        if self.quantity == "received_power" and self.tx_power_dbm is None:
+            raise InputError(
+                "quantity = 'received_power' needs tx_power_dbm [dBm]; if it is unknown, set quantity = 'rsrp' and "
+                "add an [offset]"
+            )
+        if self.quantity != "received_power" and self.tx_power_dbm is not None:
+            raise InputError(f"quantity = {self.quantity!r} takes no tx_power_dbm; leave it out")
+        if self.weight is not None and self.std is not None:
+            raise InputError(f"weight = {self.weight!r} and std = {self.std!r}: give one of them")
 
 
 @dataclass(frozen=True)
@@ -47,10 +74,10 @@ class Averaging:
     """How samples are averaged, in linear power.
 
     Attributes:
-        by: "cell" of a square grid, stretch of "distance", or window of "time".
-        size: Its width or length [m], or duration [s].
+        by: "cell" of a square grid, stretch of "distance" along the rows' order, or window of "time".
+        size: Width or length [m], or duration [s].
         time: Column of times, for "time".
-        unbiased: Whether what the logarithm of a mean of few samples lies too low by is added.
+        unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
     """
 
     by: Literal["cell", "distance", "time"]
@@ -61,13 +88,13 @@ class Averaging:
 
 @dataclass(frozen=True)
 class Track:
-    """A track that tells where rows were measured.
+    """A GPX track that gives the positions of rows by their times.
 
     Attributes:
         file: GPX file.
         time: Column of the rows' times.
-        longest_gap: Rows between two points further apart than this are left out [s].
-        clock: How much the rows' clock is ahead of the track's [s].
+        longest_gap: Rows between two track points further apart in time than this are left out [s].
+        clock: How far the rows' clock is ahead of the track's [s].
     """
 
     file: str
@@ -78,306 +105,43 @@ class Track:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is done to a table before its rows are links; nothing by default.
+    """The steps that turn rows into links; none by default.
 
     Attributes:
-        wide: Name of the transmitter by column, of a table with one column a transmitter.
+        wide: Name of the transmitter by column, for a table with one column per transmitter.
+        track: Track that gives each row the columns `selection.TRACK_COLUMNS` [deg].
         where: Row filter.
-        track: Track that gives each row the columns `TRACKED` [deg].
+        transmitters: One row per transmitter; links get its other columns.
+        transmitter: Column of both tables that names the transmitter.
+        noise_floor_dbm: Noise floor [dBm]; missing powers count as below it.
+        censored: Whether links at or below the noise floor are kept, as censored links at the floor.
+        frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for metres.
         ground: Height of the ground, if heights are above it.
-        transmitters: File with a row for every transmitter, whose columns each link gets.
-        transmitter: Column, of both tables, that says which transmitter it is.
-        frame: Where the scene lies on the globe, for positions as longitude, latitude and height; None for metres.
-        noise_floor_dbm: Values at or below it, and missing ones, were not heard [dBm].
-        censored: Whether rows that were not heard are kept, at the floor, and marked in the column `CENSORED`.
         averaging: How samples are averaged.
-        keep: Columns that no average crosses, beside the transmitter.
-        inside: What becomes of receivers on what buildings cover; nothing if None.
-        outside: What leads positions outside.
+        keep: Columns that averages do not cross, in addition to the transmitter's.
+        inside: What to do with receivers inside buildings; nothing if None.
+        outside: Moves positions out of buildings; needed with `inside`.
     """
 
     wide: Mapping[str, str] = field(default_factory=dict)
-    where: str | None = None
     track: Track | None = None
-    ground: Ground | None = None
-    transmitters: str | None = None
+    where: str | None = None
+    transmitters: SourceTable | None = None
     transmitter: str = "transmitter"
-    frame: Frame | None = None
     noise_floor_dbm: float | None = None
     censored: bool = False
+    frame: Frame | None = None
+    ground: Ground | None = None
     averaging: Averaging | None = None
     keep: Sequence[str] = ()
-    inside: Inside | None = None
-    outside: Way | None = None
+    inside: Literal["drop", "move"] | None = None
+    outside: MoveOutside | None = None
 
     @property
-    def idle(self) -> bool:
-        """Whether rows are links as they are, but for the filter."""
+    def is_filter_only(self) -> bool:
+        """Whether rows are links already, except for the filter."""
         steps = (
-            self.wide,
-            self.track,
-            self.ground,
-            self.transmitters,
-            self.frame,
-            self.averaging,
-            self.inside,
+            *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
+            *(self.averaging, self.inside),
         )
-        return not any(steps) and self.noise_floor_dbm is None
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A table of links.
-
-    Attributes:
-        table: Its rows; each stands for the first of the rows that it was made of.
-        tx: Transmitter positions, numbers or columns [m].
-        rx: Receiver positions, likewise.
-        counts: What was left out, averaged or moved, and how many of them.
-    """
-
-    table: SourceTable
-    tx: Coordinates
-    rx: Coordinates
-    counts: dict[str, int]
-
-
-def prepare(
-    table: SourceTable,
-    steps: Preparation,
-    tx: Coordinates,
-    rx: Coordinates,
-    value: str,
-    sense: Sense = "power",
-) -> Prepared:
-    """Make links of the rows of a table.
-
-    The order is: transmitters in columns, the track, the filter, the transmitters' positions, the noise floor,
-    positions on the globe, averages, positions inside buildings. An average holds the samples not heard at half of the
-    floor, between nothing and the floor itself; where that leaves it open by more than 1 dB it is left out, because
-    those heard would only be the strong ones.
-
-    Args:
-        table: The rows.
-        steps: What is done.
-        tx: Transmitter position: x, y and z [m], or longitude, latitude [deg] and height [m]; numbers or columns.
-        rx: Receiver position, likewise.
-        value: Column of the values [dB] or [dBm]; with `wide` the new column of them.
-        sense: Whether more decibels are more power or less.
-
-    Returns:
-        The links. Averages have the columns `std_db`, the spread of their samples, and `count`.
-
-    Raises:
-        InputError: A column is missing or malformed, a transmitter is not known, or no row is left.
-    """
-    counts: dict[str, int] = {}
-    if steps.wide:
-        table = _long(table, steps, value, counts)
-    if steps.track is not None:
-        table = tracked(table, steps.track, counts)
-    if steps.where is not None:
-        table = _passed(table, steps.where)
-    if steps.idle:
-        return Prepared(table, tx, rx, counts)
-    if steps.transmitters is not None:
-        table = _with_transmitters(table, steps)
-    unheard = np.zeros(len(table), dtype=bool)
-    if steps.noise_floor_dbm is not None:
-        marked = marked_censored(table.frame, value, steps.noise_floor_dbm, mark=CENSORED)
-        unheard = (marked[CENSORED] if steps.censored else marked.pop(CENSORED)).to_numpy()
-        table = SourceTable(marked, table.row, table.source)
-        if steps.censored:
-            counts["at or below the noise floor, counted as censored"] = int(unheard.sum())
-        elif steps.averaging is None:
-            table = _kept(table, ~unheard, "at or below the noise floor, left out", counts)
-    table, tx, rx = _placed(table, steps, tx, rx)
-    if steps.averaging is not None:
-        table = _averaged(table, steps, steps.averaging, unheard, (tx, rx), value, sense, counts)
-    if steps.inside is not None and steps.outside is not None:
-        table = _outside(table, steps.inside, steps.outside, rx, counts)
-    return Prepared(table, tx, rx, counts)
-
-
-def positions(table: SourceTable, name: str, coordinates: Coordinates) -> NDArray[np.float64]:
-    """Positions from three numbers or columns.
-
-    Args:
-        table: The rows.
-        name: Which end, for messages.
-        coordinates: x, y and z, each a number [m] or a column.
-
-    Returns:
-        Positions [rows, 3], [m].
-
-    Raises:
-        InputError: There are not three, a column is missing, holds no numbers or is called like degrees.
-    """
-    if isinstance(coordinates, str) or len(coordinates) != 3:
-        raise InputError(f"{name} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
-    columns = []
-    for coordinate in coordinates:
-        if isinstance(coordinate, str):
-            if _DEGREES & set(re.split(r"[^a-z]+", coordinate.lower())):
-                raise InputError(
-                    f"{table.source}: column {coordinate!r} of {name} looks like degrees on the globe; "
-                    "give metres in the scene's frame, or say position = 'geographic' in a study"
-                )
-            columns.append(table.numbers(coordinate))
-        elif isinstance(coordinate, bool) or not np.isfinite(coordinate):
-            raise InputError(
-                f"{name} = {coordinates!r}: {coordinate!r} must be a finite number [m] or a column"
-            )
-        else:
-            columns.append(np.full(len(table), float(coordinate)))
-    return np.stack(columns, axis=1)
-
-
-def _long(table: SourceTable, steps: Preparation, value: str, counts: dict[str, int]) -> SourceTable:
-    place = table.frame.assign(**{_ROW: table.row})
-    long = long_table(place, steps.wide, value, steps.transmitter)
-    if empty := len(table) * len(steps.wide) - len(long):
-        counts["cells without a value"] = empty
-    row = long.pop(_ROW).to_numpy(dtype=np.int64)
-    return SourceTable(long, row, table.source)
-
-
-def tracked(table: SourceTable, track: Track, counts: dict[str, int]) -> SourceTable:
-    """Rows with the positions of a track.
-
-    Args:
-        table: The rows.
-        track: The track.
-        counts: Gets how many rows were left out, if any.
-
-    Returns:
-        The rows at times that the track covers, with the columns `TRACKED`. Altitudes are not taken: those of
-        satellite receivers are metres off.
-
-    Raises:
-        InputError: The track cannot be read, a time cannot, or no row lies on it.
-    """
-    rows = table.frame.assign(**{_ROW: table.row})
-    try:
-        found, lost = joined_by_time(rows, read_track(track.file), track.time, track.longest_gap, track.clock)
-    except InputError as error:
-        raise InputError(f"{table.source} with {track.file}: {error}") from None
-    if lost:
-        counts["rows at no time of the track, left out"] = lost
-    row = found.pop(_ROW).to_numpy(dtype=np.int64)
-    return SourceTable(found.drop(columns="track_height"), row, table.source)
-
-
-def _passed(table: SourceTable, where: str) -> SourceTable:
-    mask = table.where(where)
-    if not mask.any():
-        raise InputError(
-            f"{table.source}: where = {shortened(where)!r} lets none of {len(table)} rows pass; change the filter"
-        )
-    return table.select(mask)
-
-
-def _kept(table: SourceTable, mask: NDArray[np.bool_], reason: str, counts: dict[str, int]) -> SourceTable:
-    if not mask.any():
-        raise InputError(f"{table.source}: {reason}: all of {len(table)} rows; change [links] of the study")
-    if lost := int((~mask).sum()):
-        counts[reason] = lost
-    return table.select(mask)
-
-
-def _with_transmitters(table: SourceTable, steps: Preparation) -> SourceTable:
-    others = read_table(str(steps.transmitters))
-    name = steps.transmitter
-    if twice := [column for column in others.frame if column in table.frame and column != name]:
-        # The links' own columns keep their names: theirs are what filters and positions mean.
-        others = SourceTable(others.frame.rename(columns={each: f"{name}_{each}" for each in twice}))
-    try:
-        frame = with_transmitters(table.frame, others.frame, name)
-    except InputError as error:
-        raise InputError(f"{table.source} with {steps.transmitters}: {error}") from None
-    return SourceTable(frame, table.row, table.source)
-
-
-def _placed(
-    table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
-) -> tuple[SourceTable, Coordinates, Coordinates]:
-    """The positions of both ends as columns of metres."""
-    rows = table.frame
-    for end, place in (("tx", tx), ("rx", rx)):
-        try:
-            if steps.frame is not None:
-                longitude, latitude, height = place
-                rows = with_scene_positions(
-                    rows, end, steps.frame, longitude, latitude, height, ground=steps.ground
-                )
-                continue
-            position = positions(table, end, place)
-            if steps.ground is not None:
-                position[:, 2] += steps.ground(position[:, 0], position[:, 1])
-        except InputError as error:
-            raise InputError(f"{table.source}: {end}: {error}") from None
-        rows = rows.assign(**dict(zip(PREPARED[end], position.T, strict=True)))
-    return SourceTable(rows, table.row, table.source), PREPARED["tx"], PREPARED["rx"]
-
-
-def _averaged(
-    table: SourceTable,
-    steps: Preparation,
-    averaging: Averaging,
-    unheard: NDArray[np.bool_],
-    place: tuple[Coordinates, Coordinates],
-    value: str,
-    sense: Sense,
-    counts: dict[str, int],
-) -> SourceTable:
-    rows = table.frame.assign(**{_UNHEARD: unheard.astype(float)})
-    label = _labels(rows, averaging)
-    tx = [str(name) for name in place[0]]
-    known = [steps.transmitter] if steps.transmitter in rows and steps.transmitter not in steps.keep else []
-    keep = [*steps.keep, *known, *tx]
-    mean = averaged(rows, value, label, sense, keep, [*map(str, place[1]), _UNHEARD])
-    first = ~rows[keep].assign(**{_ROW: label}).duplicated().to_numpy()
-    named = {str(name): mean[name].to_numpy() for name in (value, *place[1], "std_db", "count")}
-    low = mean["low_db"].to_numpy() if averaging.unbiased else np.zeros(len(mean))
-    faint = np.zeros(len(mean), dtype=bool)
-    counts["samples averaged"] = len(table)
-    if steps.noise_floor_dbm is not None and unheard.any():
-        counts["of them at or below the noise floor"] = int(unheard.sum())
-        # Powers: with the samples not heard at the floor itself, and what they are of it.
-        most = 10 ** (named[value].astype(float) / 10)
-        theirs = mean[_UNHEARD].to_numpy() * 10 ** (steps.noise_floor_dbm / 10)
-        faint = most > np.maximum(most - theirs, 0.0) * 10 ** (MOST_UNHEARD_DB / 10)
-        named[value] = 10 * np.log10(most - theirs / 2)
-    named[value] = named[value] + (low if sense == "power" else -low)
-    joined = table.frame.loc[first].reset_index(drop=True).assign(**named)
-    made = SourceTable(joined, table.row[first], table.source)
-    return _kept(made, ~faint, "averages too near the noise floor, left out", counts)
-
-
-def _labels(rows: pd.DataFrame, averaging: Averaging) -> NDArray[np.int64]:
-    match averaging.by:
-        case "cell":
-            return by_cell(rows, averaging.size)
-        case "distance":
-            return by_distance(rows, averaging.size)
-        case _:
-            return by_time(rows, averaging.size, str(averaging.time))
-
-
-def _outside(
-    table: SourceTable, inside: Inside, way: Way, rx: Coordinates, counts: dict[str, int]
-) -> SourceTable:
-    names = [str(name) for name in rx]
-    places, moved = way(table.frame[names].to_numpy(dtype=float))
-    if inside == "drop":
-        return _kept(table, moved == 0, "receivers inside buildings, left out", counts)
-    lost = np.isnan(places).any(axis=1)
-    if went := int(((moved > 0) & ~lost).sum()):
-        counts["receivers inside buildings, moved out"] = went
-    frame = table.frame.assign(**dict(zip(names, places.T, strict=True)))
-    return _kept(
-        SourceTable(frame, table.row, table.source),
-        np.asarray(~lost),
-        "receivers deep inside buildings, left out",
-        counts,
-    )
+        return not self.wide and all(step is None for step in steps)

@@ -1,154 +1,51 @@
-"""Tables from CSV and Parquet files, with the line of every row kept for messages."""
+"""Read tables from CSV, Parquet and Excel files."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.excel import sheet_text
-from calibray.measurements.filters import evaluate
-from calibray.support.messages import did_you_mean, first_line, shortened
+from calibray.measurements.source_table import SourceTable
+from calibray.support.extras import library
+from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
-
-
-@dataclass(frozen=True, eq=False)
-class SourceTable:
-    """Rows of a table and where they stand in their file.
-
-    Attributes:
-        frame: The rows as a DataFrame.
-        row: Place [rows] of each row: its line in a CSV file (the header is line 1), else its number from 1.
-        source: Name of the file, or what stands for it in messages.
-    """
-
-    frame: pd.DataFrame
-    row: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
-    source: str = "table"
-
-    def __post_init__(self) -> None:
-        if self.row is None:
-            object.__setattr__(self, "row", np.arange(1, len(self.frame) + 1))
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, mask: NDArray[np.bool_]) -> SourceTable:
-        """The rows where a mask [rows] is true."""
-        return SourceTable(self.frame.loc[mask].reset_index(drop=True), self.row[mask], self.source)
-
-    def where(self, expression: str) -> NDArray[np.bool_]:
-        """Evaluate a row filter.
-
-        Args:
-            expression: A filter over the columns (see `filters`), for instance ``"gpsmode == 4 and rx_x_m < -55"``.
-
-        Returns:
-            The mask [rows] of the rows that pass; a row for which the answer is unknown does not.
-
-        Raises:
-            InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
-        """
-        try:
-            return evaluate(expression, self.frame)
-        except InputError as error:
-            raise InputError(f"{self.source}: where = {shortened(expression)!r}: {error}") from None
-
-    def column(self, name: str) -> pd.Series:
-        """One column.
-
-        Raises:
-            InputError: There is no such column.
-        """
-        if name not in self.frame:
-            raise InputError(
-                f"{self.source}: no column {shortened(name)!r}; {did_you_mean(name, map(str, self.frame))}"
-            )
-        return self.frame[name]
-
-    def numbers(self, name: str) -> NDArray[np.float64]:
-        """One column as finite numbers.
-
-        Args:
-            name: The column.
-
-        Returns:
-            Its values [rows].
-
-        Raises:
-            InputError: There is no such column, or a value is missing, infinite or no number.
-        """
-        column = self.column(name)
-        if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
-            raise InputError(f"{self.source}: column {name!r} holds {column.dtype}, must hold numbers")
-        if pd.api.types.is_bool_dtype(column):
-            raise InputError(f"{self.source}: column {name!r} holds true and false, must hold numbers")
-        values = pd.to_numeric(column, errors="coerce")
-        if (text := (values.isna() & column.notna()).to_numpy()).any():
-            first = int(np.flatnonzero(text)[0])
-            raise InputError(f"{self.place(first, name)}: {column.iloc[first]!r} is not a number; correct it")
-        numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
-        if (gaps := ~np.isfinite(numbers)).any():
-            rows = ", ".join(map(str, self.row[gaps][:5])) + (", ..." if gaps.sum() > 5 else "")
-            raise InputError(
-                f"{self.source}: column {name!r} is missing or not finite in {gaps.sum()} of {len(self)} "
-                f"rows (row {rows}); correct them, or leave them out with a where filter"
-            )
-        return numbers
-
-    def labels(self, name: str) -> NDArray[np.str_]:
-        """One column as labels [rows].
-
-        Raises:
-            InputError: There is no such column, or a label is missing.
-        """
-        column = self.column(name)
-        if (gaps := column.isna().to_numpy()).any():
-            first = int(np.flatnonzero(gaps)[0])
-            raise InputError(
-                f"{self.place(first, name)}: the label is missing ({gaps.sum()} in all); give one"
-            )
-        if pd.api.types.is_float_dtype(column) and (column % 1 == 0).all():
-            # A gap in a row that was left out makes whole numbers floats: label 5 must not become "5.0".
-            column = column.astype(np.int64)
-        return column.astype(str).to_numpy(dtype=np.str_)
-
-    def place(self, index: int, column: str) -> str:
-        """The words that say where a cell stands: file, row and column."""
-        return f"{self.source}, row {self.row[index]}, column {column!r}"
 
 
 def read_table(path: str | Path) -> SourceTable:
     """Read a CSV, Parquet or Excel file.
 
     Args:
-        path: The file; its ending, .csv, .parquet or .xlsx, says how it is read. CSV means UTF-8 and commas; of an
-            Excel file the first sheet is read.
+        path: A .csv (UTF-8, commas), .parquet or .xlsx file. Of a workbook the first sheet is read.
 
     Returns:
-        Its rows, blank lines left out.
+        Its rows without blank lines.
 
     Raises:
-        InputError: The file does not exist, is of another kind, is empty, or is malformed; or what reads
-            it, pyarrow or openpyxl, is not installed.
+        InputError: The file does not exist, has another ending, is empty or malformed, or the library that reads it
+            (pyarrow, openpyxl) is not installed.
     """
     path = Path(path)
     if not exists(path):
         raise InputError(f"{shortened(str(path), 300)}: no such file")
     match path.suffix.lower():
         case ".csv":
-            table = _read_csv(path)
+            table = _parse_csv(path, _utf8_text(path))
         case ".parquet":
             table = _read_parquet(path)
         case ".xlsx":
-            table = _read_excel(path)
+            numbers, text = sheet_text(path)
+            frame = _parse_csv(path, text).frame
+            table = SourceTable(frame, np.array(numbers[1:], dtype=np.int64), str(path))
         case suffix:
             raise InputError(
                 f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .parquet or .xlsx"
@@ -158,74 +55,135 @@ def read_table(path: str | Path) -> SourceTable:
     return table
 
 
-def _read_csv(path: Path) -> SourceTable:
+@final
+@dataclass(frozen=True, eq=False)
+class PiecedTable:
+    """A table that is read in pieces, so that a large Parquet file never lies in memory as a whole.
+
+    Attributes:
+        source: Name of the file.
+        rows: Number of rows.
+        whole: All rows, if the file's format can only be read at once; None for Parquet.
+    """
+
+    source: str
+    rows: int
+    whole: SourceTable | None
+
+    @classmethod
+    def open(cls, path: str | Path) -> PiecedTable:
+        """Open a CSV, Parquet or Excel file.
+
+        Args:
+            path: The file. CSV and Excel files are read immediately.
+
+        Returns:
+            The table.
+
+        Raises:
+            InputError: As `read_table`.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".parquet" or not exists(path):
+            table = read_table(path)
+            return cls(str(path), len(table), table)
+        library("pyarrow", "parquet")
+        with _open_parquet(path) as file:
+            rows = file.metadata.num_rows
+        if not rows:
+            raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
+        return cls(str(path), rows, None)
+
+    def pieces(self, size: int) -> Iterator[SourceTable]:
+        """Iterate over the rows in pieces.
+
+        Args:
+            size: Largest number of rows of a piece.
+
+        Yields:
+            The pieces in the order of the file. A column has the same type in every piece.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        if self.whole is not None:
+            for start in range(0, self.rows, size):
+                piece = slice(start, start + size)
+                frame = self.whole.frame.iloc[piece].reset_index(drop=True)
+                yield SourceTable(frame, self.whole.row[piece], self.source)
+            return
+        path = Path(self.source)
+        with _open_parquet(path) as file:
+            integers_with_gaps, start = _integer_columns_with_gaps(file), 0
+            batches = file.iter_batches(batch_size=size)
+            while (frame := _next_frame(path, batches)) is not None:
+                # NumPy has no missing integer, so pandas makes such a column float. A piece without a gap must agree.
+                numpy_columns = [
+                    name
+                    for name in integers_with_gaps
+                    if name in frame and isinstance(frame.dtypes[name], np.dtype)
+                ]
+                frame = frame.astype(dict.fromkeys(numpy_columns, np.float64))
+                yield SourceTable(frame, np.arange(start + 1, start + len(frame) + 1), self.source)
+                start += len(frame)
+
+
+def _utf8_text(path: Path) -> str:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            text = file.read()
+            return file.read()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
         ) from None
-    return _parsed(path, text)
 
 
-def _parsed(path: Path, text: str) -> SourceTable:
+def _parse_csv(path: Path, text: str) -> SourceTable:
     header, lines = _checked_layout(path, text)
     if not header:
         return SourceTable(pd.DataFrame())
     try:
         frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
     except ValueError as error:
-        # Reading from memory fails so for one reason only: pandas takes Ctrl-C in the midst of it for a failure.
+        # pandas reports Ctrl-C while it reads as "source failed"; reading from memory fails so for no other reason.
         if "source failed" in str(error):
             raise KeyboardInterrupt from None
         raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
     if len(frame) != len(lines):
-        raise InputError(f"{path}: {len(lines)} rows stand in it but {len(frame)} are read; check its quotes")
+        raise InputError(
+            f"{path}: the file has {len(lines)} rows, but {len(frame)} can be read; check its quotes"
+        )
     return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
 
 
 def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
-    """The header of a CSV text and the first line of each of its rows; pandas would mend faults silently."""
+    """Header and first line of each row of a CSV text, refused where pandas would repair a fault without notice."""
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     header: list[str] = []
     lines: list[int] = []
-    line = 1
+    next_line = 1
     try:
         for cells in reader:
-            line, start = reader.line_num + 1, line
+            line, next_line = next_line, reader.line_num + 1
             if len(cells) <= 1 and not "".join(cells).strip():
                 continue
             if not header:
                 header = cells
-                if len(header) == 1 and (other := next((mark for mark in ";\t" if mark in header[0]), "")):
-                    raise InputError(f"{path}, row {start}: columns are parted by {other!r}, must be by ','")
+                if len(header) == 1 and (mark := next((mark for mark in ";\t" if mark in header[0]), None)):
+                    raise InputError(f"{path}, row {line}: columns are separated by {mark!r}, must be by ','")
                 if repeated := [name for name, count in Counter(header).items() if count > 1]:
-                    raise InputError(f"{path}, row {start}: column {repeated[0]!r} stands twice; rename one")
+                    raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")
             elif len(cells) != len(header):
                 raise InputError(
-                    f"{path}, row {start}: {len(cells)} cells, the header has {len(header)}; correct the row"
+                    f"{path}, row {line}: {len(cells)} cells, the header has {len(header)}; correct the row"
                 )
             else:
-                lines.append(start)
+                lines.append(line)
     except csv.Error as error:
-        raise InputError(f"{path}, row {line}: malformed CSV ({error})") from None
+        raise InputError(f"{path}, row {next_line}: malformed CSV ({error})") from None
     return header, lines
-
-
-def damaged(path: Path, error: Exception) -> InputError:
-    """What is to be raised where a Parquet file cannot be read.
-
-    Args:
-        path: The file.
-        error: What the library says of it.
-
-    Returns:
-        The error.
-    """
-    return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")
 
 
 def _read_parquet(path: Path) -> SourceTable:
@@ -236,11 +194,43 @@ def _read_parquet(path: Path) -> SourceTable:
             f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
         ) from None
     except Exception as error:
-        raise damaged(path, error) from None
+        raise _damaged(path, error) from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 
-def _read_excel(path: Path) -> SourceTable:
-    numbers, text = sheet_text(path)
-    table = _parsed(path, text)
-    return SourceTable(table.frame, np.array(numbers[1:], dtype=np.int64), table.source)
+def _open_parquet(path: Path) -> Any:
+    from pyarrow import parquet
+
+    try:
+        # With pre_buffer, pyarrow reads ahead and keeps every row group in memory.
+        return parquet.ParquetFile(path, pre_buffer=False)
+    except Exception as error:
+        raise _damaged(path, error) from None
+
+
+def _next_frame(path: Path, batches: Iterator[Any]) -> Any:
+    try:
+        batch = next(batches, None)
+        return None if batch is None else batch.to_pandas().reset_index(drop=True)
+    except Exception as error:
+        raise _damaged(path, error) from None
+
+
+def _integer_columns_with_gaps(file: Any) -> list[str]:
+    """Integer columns with missing values, from the statistics of the row groups."""
+    from pyarrow import types
+
+    integers = {column.name for column in file.schema_arrow if types.is_integer(column.type)}
+    with_gaps = set()
+    for number in range(file.metadata.num_row_groups):
+        group = file.metadata.row_group(number)
+        for index in range(group.num_columns):
+            name, statistics = group.column(index).path_in_schema, group.column(index).statistics
+            if name in integers and statistics is not None and statistics.null_count:
+                with_gaps.add(name)
+    return sorted(with_gaps)
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    """The error for a Parquet file that its library cannot read."""
+    return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")

@@ -19,7 +19,7 @@ from calibray.coordinates import Frame
 from calibray.engines.cluster.workers import Crew
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
-from calibray.measurements.links import COINCIDENCE
+from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import piece_size, predicted
 from calibray.prediction.predict import as_links, opened
 from calibray.scenes.authoring.ground import ground_heights
@@ -148,7 +148,7 @@ def coverage_map(
     z = ground_heights(triangles, x, y) + height
     east, north = np.meshgrid(x, y)
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
-    wanted = np.flatnonzero(np.linalg.norm(rx - place, axis=1) > COINCIDENCE)
+    wanted = np.flatnonzero(np.linalg.norm(rx - place, axis=1) > MIN_DISTANCE)
     found = np.full((3, len(rx)), np.nan)
     size = piece_size(setup, crew)
     for start in range(0, len(wanted), size):
@@ -191,7 +191,7 @@ def _columns(result: Result, tx: NDArray[np.float64], given: Mapping[str, object
     per = study.offset.per if study.offset is not None else None
     if isinstance(per, str) and per not in held and {"group", "tx_x"} <= set(result.links):
         apart = np.abs(result.links[["tx_x", "tx_y", "tx_z"]].to_numpy(float) - tx).max(axis=1)
-        groups = set(result.links["group"].astype(str).to_numpy()[apart < COINCIDENCE])
+        groups = set(result.links["group"].astype(str).to_numpy()[apart < MIN_DISTANCE])
         held |= {per: groups.pop()} if len(groups) == 1 else {}
     needed = [*([per] if isinstance(per, str) else per or ())]
     for section in study.nuisance.values():

@@ -15,12 +15,16 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.measurements import Measurements, Track
-from calibray.measurements import column_names as guessing
-from calibray.measurements.column_names import Place, Value
-from calibray.measurements.preparation import TRACKED, tracked
-from calibray.measurements.received_power import long_table
-from calibray.measurements.table_files import SourceTable, read_table
+from calibray.measurements import (
+    TRACK_COLUMNS,
+    Measurements,
+    Preparation,
+    Track,
+    column_names,
+    read_table,
+    select_rows,
+)
+from calibray.measurements.column_names import PositionColumns, ValueColumn
 from calibray.scenes.authoring.scene_folder import read_frame
 from calibray.scenes.checks.crossings import crossings
 from calibray.scenes.checks.heights import Overhead
@@ -137,7 +141,7 @@ class _Drafting:
         self._position(section, tx, rx)
         section |= {"value": value.column, "quantity": value.quantity}
         if value.quantity == "received_power":
-            section["tx_power_dbm"] = guessing.transmitted(self.table.frame)
+            section["tx_power_dbm"] = column_names.find_transmit_power(self.table.frame)
         groups = self._groups(section, value)
         self._floor(section, value)
         self._averages(section, rx, groups, frequency)
@@ -180,7 +184,7 @@ class _Drafting:
         """The positions of a track."""
         if self.track is None:
             return
-        name = guessing.time(self.table.frame)
+        name = column_names.find_time(self.table.frame)
         if name is None:
             raise InputError(
                 f"{self.links}: no column looks like the times that {self.track} is joined by "
@@ -188,7 +192,7 @@ class _Drafting:
             )
         section["track"] = {"file": self._relative(self.track), "time": name}
         rows = len(self.table)
-        self.table = tracked(self.table, Track(str(self.track), name), {})
+        self.table = select_rows(self.table, Preparation(track=Track(str(self.track), name)))
         self._assume(
             "links.track",
             f"{self.track.name} by {name}",
@@ -200,13 +204,13 @@ class _Drafting:
         if self.sites is None:
             return
         section["transmitters"] = self._relative(Path(str(self.transmitters)))
-        name = guessing.shared_name(self.table.frame, self.sites.frame)
+        name = column_names.find_shared_key(self.table.frame, self.sites.frame)
         if name is not None:
             section["transmitter"] = self.key = name
             self._assume("links.transmitter", name, "a column of both tables, and every value is known")
             return
-        name = guessing.own_name(self.sites.frame)
-        columns = guessing.wide(self.table.frame, self.sites.labels(name).tolist())
+        name = column_names.find_transmitter_names(self.sites.frame)
+        columns = column_names.find_wide_columns(self.table.frame, self.sites.labels(name).tolist())
         if not columns:
             raise InputError(
                 f"{self.links}: no column says which transmitter of {self.transmitters} a row belongs to, and no "
@@ -217,11 +221,11 @@ class _Drafting:
         self._assume(
             "links.wide", ", ".join(columns), f"called like those in {Path(str(self.transmitters)).name}"
         )
-        long = long_table(self.table.frame, columns, guessing.common_value(columns), name)
-        self.table = SourceTable(long, source=str(self.links))
+        steps = Preparation(wide=columns, transmitter=name)
+        self.table = select_rows(self.table, steps, column_names.name_melted_values(columns))
 
     def _frequency(self, section: dict[str, Any]) -> float:
-        found = guessing.frequency(self.table.frame)
+        found = column_names.find_frequency(self.table.frame)
         if self.given_frequency is not None:
             self._assume("scene.frequency", f"{self.given_frequency:g} Hz", "given")
             return float(self.given_frequency)
@@ -243,11 +247,11 @@ class _Drafting:
             "of one carrier"
         )
 
-    def _places(self) -> tuple[Place, Place | None]:
+    def _places(self) -> tuple[PositionColumns, PositionColumns | None]:
         if self.track is None:
-            rx = guessing.place(self.table.frame, "rx", own=True)
+            rx = column_names.find_position(self.table.frame, "rx", unnamed=True)
         else:
-            rx = Place("geographic", *TRACKED, height=None)
+            rx = PositionColumns("geographic", *TRACK_COLUMNS, height=None)
         if rx is None:
             raise InputError(
                 f"{self.links}: no columns look like the receivers' positions "
@@ -256,22 +260,22 @@ class _Drafting:
         if self.given_tx is not None:
             return rx, None
         if self.sites is not None:
-            tx = guessing.place(self.sites.frame, "tx", own=True)
+            tx = column_names.find_position(self.sites.frame, "tx", unnamed=True)
             if tx is None:
                 raise InputError(
                     f"{self.transmitters}: no columns look like positions ({', '.join(map(str, self.sites.frame))})"
                 )
             return rx, self._renamed(tx)
-        return rx, guessing.place(self.table.frame, "tx", own=False)
+        return rx, column_names.find_position(self.table.frame, "tx", unnamed=False)
 
-    def _renamed(self, tx: Place) -> Place:
+    def _renamed(self, tx: PositionColumns) -> PositionColumns:
         """The columns of transmitters as links get them: under another name where links have one of that name."""
         x, y, height = (
             f"{self.key}_{each}" if each in self.table.frame else each for each in (tx.x, tx.y, tx.height)
         )
-        return Place(tx.position, str(x), str(y), height)
+        return PositionColumns(tx.position, str(x), str(y), height)
 
-    def _position(self, section: dict[str, Any], tx: Place | None, rx: Place) -> None:
+    def _position(self, section: dict[str, Any], tx: PositionColumns | None, rx: PositionColumns) -> None:
         section["tx"] = self._transmitter(tx, rx)
         up: float | str = RECEIVER_HEIGHT
         if rx.height is not None:
@@ -291,7 +295,7 @@ class _Drafting:
                 "links.position", "geographic", f"degrees, placed by the frame in {Path(self.scene).name}"
             )
 
-    def _transmitter(self, tx: Place | None, rx: Place) -> list[float | str]:
+    def _transmitter(self, tx: PositionColumns | None, rx: PositionColumns) -> list[float | str]:
         if tx is not None:
             if tx.position != rx.position:
                 raise InputError(
@@ -316,10 +320,10 @@ class _Drafting:
             return [float(part) for part in self.given_tx]
         return self._at_origin(rx)
 
-    def _at_origin(self, rx: Place) -> list[float | str]:
+    def _at_origin(self, rx: PositionColumns) -> list[float | str]:
         """The scene's origin, if the table's distances say so."""
-        frame, name = self.table.frame, guessing.distance(self.table.frame)
-        up = guessing.height(frame, "tx")
+        frame, name = self.table.frame, column_names.find_distance(self.table.frame)
+        up = column_names.find_transmitter_height(frame)
         if rx.position == "scene" and name is not None and up is not None and frame[up].nunique() == 1:
             z = frame[rx.height] if rx.height else pd.Series(np.full(len(frame), RECEIVER_HEIGHT))
             found = np.sqrt(frame[rx.x] ** 2 + frame[rx.y] ** 2 + (z - frame[up]) ** 2)
@@ -332,10 +336,13 @@ class _Drafting:
             "--transmitters FILE"
         )
 
-    def _value(self, section: dict[str, Any]) -> Value:
-        value = guessing.measured(self.table, str(self.links))
-        if value.quantity == "rsrp" and (power := guessing.transmitted(self.table.frame)) is not None:
-            value = Value(
+    def _value(self, section: dict[str, Any]) -> ValueColumn:
+        value = column_names.find_value(self.table)
+        if (
+            value.quantity == "rsrp"
+            and (power := column_names.find_transmit_power(self.table.frame)) is not None
+        ):
+            value = ValueColumn(
                 value.column, "received_power", f"{value.reason}; {power} tells what was transmitted"
             )
         self._assume("links.value", value.column, value.reason)
@@ -347,20 +354,20 @@ class _Drafting:
         self._assume("links.quantity", value.quantity, told)
         return value
 
-    def _groups(self, section: dict[str, Any], value: Value) -> list[str]:
+    def _groups(self, section: dict[str, Any], value: ValueColumn) -> list[str]:
         """The columns of the offset."""
         if value.quantity != "rsrp":
             self._assume("offset", "one for all links", "cables and antennas' gains are in the values")
             return []
         name = section.get("transmitter")
-        groups = [*([name] if name else []), *guessing.devices(self.table.frame)]
+        groups = [*([name] if name else []), *column_names.find_devices(self.table.frame)]
         groups = list(dict.fromkeys(groups))
         self._assume(
             "offset.per", ", ".join(groups) or "one", "each transmits, or receives, with its own gain"
         )
         return groups
 
-    def _floor(self, section: dict[str, Any], value: Value) -> None:
+    def _floor(self, section: dict[str, Any], value: ValueColumn) -> None:
         column = self.table.frame[value.column]
         if "wide" in section or not column.isna().any():
             return
@@ -373,7 +380,9 @@ class _Drafting:
         reason = f"{int(column.isna().sum())} values are missing, and none is lower"
         self._assume("links.noise_floor_dbm", f"{floor:g} dBm", reason)
 
-    def _averages(self, section: dict[str, Any], rx: Place, groups: list[str], frequency: float) -> None:
+    def _averages(
+        self, section: dict[str, Any], rx: PositionColumns, groups: list[str], frequency: float
+    ) -> None:
         frame = self.table.frame
         name = section.get("transmitter")
         keys = [rx.x, rx.y, *groups, *([name] if name and name not in groups else [])]
@@ -388,7 +397,7 @@ class _Drafting:
         reason = f"{taken}; {WAVELENGTHS} wavelengths even out fading"
         self._assume("links.average", f"cells of {size:g} m", reason)
 
-    def _heights(self, section: dict[str, Any], tx: Place | None, rx: Place) -> None:
+    def _heights(self, section: dict[str, Any], tx: PositionColumns | None, rx: PositionColumns) -> None:
         """Heights above the ground, where it is not level at zero and heights can be meant so."""
         given_in_scene = any(
             place is not None and place.position == "scene" and place.height is not None for place in (tx, rx)

@@ -16,12 +16,18 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator, model
 from calibray.engines.kinds import AnyEngine, default
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
-from calibray.measurements import LINK_COLUMNS, Measurements, links_from_table, measured_links
-from calibray.measurements.table_files import SourceTable, read_table
+from calibray.measurements import (
+    LINK_COLUMNS,
+    Measurements,
+    SourceTable,
+    links_from_table,
+    measured_links,
+    read_table,
+)
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import frequency_independent_law
 from calibray.study.engine_keys import part_engine
-from calibray.study.row_steps import AS_THEY_ARE, placing, preparation
+from calibray.study.row_steps import link_columns, placing, preparation
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -265,12 +271,7 @@ class Study(Section):
         Raises:
             InputError: What `measured_links` refuses, or nothing tells where the scene lies on the globe.
         """
-        return measured_links(
-            read_table(self.links_path),
-            steps=preparation(self),
-            group=self.offset.per if self.offset else None,
-            **self.links.model_dump(include=AS_THEY_ARE),
-        )
+        return measured_links(read_table(self.links_path), link_columns(self), preparation(self))
 
     def places(self, table: SourceTable) -> Measurements:
         """Links without measured values, to predict at, grouped as the offset is.

@@ -8,15 +8,31 @@ from typing import TYPE_CHECKING, Final
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements import Averaging, Preparation, Track
+from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
 from calibray.scenes.scene_file import find_scene
 
 if TYPE_CHECKING:
-    from calibray.measurements.preparation import Ground, Way
+    from calibray.measurements import Ground, MoveOutside
     from calibray.study.model import Study
 
-AS_THEY_ARE: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
-"""Keys of ``[links]`` that are arguments of `measured_links` themselves."""
+_COLUMNS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
+"""Keys of ``[links]`` that are fields of `LinkColumns`."""
+
+
+def link_columns(study: Study) -> LinkColumns:
+    """The columns of a study's table of links.
+
+    Args:
+        study: The study.
+
+    Returns:
+        The columns, with links grouped as the offset is.
+
+    Raises:
+        InputError: Keys of ``[links]`` contradict each other.
+    """
+    per = study.offset.per if study.offset else None
+    return LinkColumns(**study.links.model_dump(include=_COLUMNS), group=per)
 
 
 def preparation(study: Study) -> Preparation:
@@ -67,7 +83,7 @@ def placing(study: Study) -> Preparation:
     links, transmitters = study.links, study.transmitters_path
     return Preparation(
         ground=None if links.heights is None else _ground(study),
-        transmitters=None if transmitters is None else str(transmitters),
+        transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
         frame=scene_frame(study) if links.position == "geographic" else None,
     )
@@ -82,7 +98,7 @@ def _ground(study: Study) -> Ground:
     return Overhead.of(study.scene_source).ground
 
 
-def _led_outside(study: Study) -> Way:
+def _led_outside(study: Study) -> MoveOutside:
     from calibray.scenes.authoring.outlines import led_outside, outlines
 
     return partial(led_outside, covered=outlines(study.scene_source))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.table_files import SourceTable, read_table
+from calibray.measurements import SourceTable, read_table
 
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
@@ -137,7 +137,7 @@ def read_gain_table(path: str | Path) -> GainTable:
         if apart.max() > SEAM_TOLERANCE_DB:
             worst = np.flatnonzero((rows == apart.argmax()) & (columns == count - 1))[0]
             raise InputError(
-                f"{table.place(int(worst), 'gain_dbi')}: {gain[worst]:g} differs from the gain at azimuth "
+                f"{table.cell(int(worst), 'gain_dbi')}: {gain[worst]:g} differs from the gain at azimuth "
                 f"{first:g}, {gains[apart.argmax(), 0]:g}, which is the same direction; correct one"
             )
         gains = gains[:, :-1]
@@ -157,7 +157,7 @@ def _in_range(table: SourceTable, name: str) -> NDArray[np.float64]:
         first = int(np.flatnonzero(wrong)[0])
         remedy = "write a null as a low gain, such as -60" if values[first] < low else "check the unit"
         raise InputError(
-            f"{table.place(first, name)}: {values[first]:g} must be {low:g} to {high:g} ({wrong.sum()} of "
+            f"{table.cell(first, name)}: {values[first]:g} must be {low:g} to {high:g} ({wrong.sum()} of "
             f"{len(table)} rows); {remedy if name == 'gain_dbi' else 'give degrees'}"
         )
     return values
@@ -179,7 +179,7 @@ def _axis(
     if len(odd):
         at = int(np.flatnonzero(values == found[odd[0] + 1])[0])
         raise InputError(
-            f"{table.place(at, name)}: {found[odd[0] + 1]:g} follows {found[odd[0]]:g} where the other steps are "
+            f"{table.cell(at, name)}: {found[odd[0] + 1]:g} follows {found[odd[0]]:g} where the other steps are "
             f"{step:g}; give equal steps"
         )
     if step > LARGEST_STEP_DEG * (1 + _UNEVEN):

@@ -1,4 +1,4 @@
-"""Rows as phones write them become links: each step against what it must give, each loss counted."""
+"""The steps that a study names turn rows of a log into links."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ import pytest
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.measurements import LINK_COLUMNS
-from calibray.measurements.preparation import Averaging, Preparation, prepare
-from calibray.measurements.table_files import SourceTable
+from calibray.measurements import LINK_COLUMNS, SourceTable
 from calibray.scenes.authoring.footprints import Footprints
 from calibray.scenes.authoring.scene_folder import make_scene
-from calibray.study import Study
-from calibray.study import row_steps as preparing
+from calibray.study import Study, row_steps
 
 FRAME = Frame.local(9.99, 50.01)
 SITES = {"a": (0.0, 0.0, 20.0), "b": (60.0, 0.0, 15.0)}
@@ -75,18 +72,18 @@ def study(folder, **links) -> Study:
     return Study.from_content(content, folder / "study.toml")
 
 
-def test_positions_on_the_globe_become_the_scenes_metres(folder):
+def test_geographic_positions_become_metres_in_the_scene(folder):
     links = study(folder).measurements()
     assert len(links) == 16
     assert links.rx[0] == pytest.approx([5, 20, 1.5], abs=0.01)
     assert links.tx[2] == pytest.approx([60, 0, 15], abs=0.01)
     assert links.group_names == ("a p1", "a p2", "b p1", "b p2")
-    # What was transmitted is the offset's: a loss is less the power.
+    # The offset absorbs the transmitted power: the loss is minus the received power.
     assert links.path_loss_db[:2].tolist() == [80.5, 83.5]
     assert links.prepared == {}
 
 
-def test_the_studys_frame_counts_before_the_scene_files(folder):
+def test_the_frame_of_the_study_overrides_that_of_the_scene_file(folder):
     content = json.loads(json.dumps(STUDY))
     east = FRAME.to_geographic([(10.0, 0.0, 0.0)])[0]
     content["scene"]["origin"] = east[:2].tolist()
@@ -94,13 +91,13 @@ def test_the_studys_frame_counts_before_the_scene_files(folder):
     assert moved.rx[0] == pytest.approx([-5, 20, 1.5], abs=0.01)
     content["scene"]["crs"] = "EPSG:32632"
     in_zone = Study.from_content(content, folder / "study.toml").measurements()
-    # The zone's scale and convergence: centimetres and fractions of a degree so near its meridian.
+    # The zone's scale and convergence add centimetres and fractions of a degree this close to its meridian.
     assert in_zone.rx[0] == pytest.approx([-5, 20, 1.5], abs=0.3)
 
 
-def test_places_to_predict_at_are_read_as_measured_ones_were(folder, monkeypatch):
-    """The same columns mean the same, with nothing measured, and no row is left out."""
-    monkeypatch.setattr(preparing, "_ground", lambda _: lambda x, y: 0.1 * x + 2.0 * y)
+def test_positions_to_predict_at_are_read_as_measured_ones(folder, monkeypatch):
+    """The same columns mean the same without measured values, and no row is left out."""
+    monkeypatch.setattr(row_steps, "_ground", lambda _: lambda x, y: 0.1 * x + 2.0 * y)
     plan = study(folder, heights="ground", where="site == 'a'", inside="drop")
     measured, log = plan.measurements(), pd.read_csv(folder / "log.csv").drop(columns="rsrp")
     links = plan.places(SourceTable(log, source="new.csv"))
@@ -112,7 +109,7 @@ def test_places_to_predict_at_are_read_as_measured_ones_were(folder, monkeypatch
     assert links.group is not None
     assert links.group[:3].tolist() == ["a p1", "a p2", "b p1"]
     assert not links.measured
-    # Metres in the scene's frame, where a table gives them, are those.
+    # Columns in metres take precedence.
     metres = log.assign(**{name: k + 1.0 for k, name in enumerate(LINK_COLUMNS)})
     assert plan.places(SourceTable(metres)).rx[3].tolist() == [4.0, 5.0, 6.0]
     with pytest.raises(InputError, match=r"new\.csv.*no column 'site'"):
@@ -149,39 +146,6 @@ def test_averages_stay_within_transmitter_and_group(folder):
     assert first["std_db"] == pytest.approx(np.std([80.5, 80.8], ddof=1))
 
 
-def test_samples_below_the_floor_bound_an_average_or_leave_it_out():
-    """Of ten samples one is not heard: what it may add is between nothing and the floor."""
-    strong, weak = [-80.0] * 9, [-118.0] * 5
-    table = SourceTable(
-        pd.DataFrame(
-            {"x": [0.0] * 10 + [50.0] * 10, "p": [*strong, np.nan, *weak, *[np.nan] * 5], "y": 0.0, "z": 1.5}
-        )
-    )
-    steps = Preparation(noise_floor_dbm=-120.0, averaging=Averaging("cell", 5.0))
-    made = prepare(table, steps, [9.0, 9.0, 9.0], ["x", "y", "z"], "p")
-    assert len(made.table) == 1
-    assert made.table.frame["p"].iloc[0] == pytest.approx(10 * np.log10(0.9e-8 + 0.05e-12))
-    assert made.counts == {
-        "samples averaged": 20,
-        "of them at or below the noise floor": 6,
-        "averages too near the noise floor, left out": 1,
-    }
-    alone = prepare(table, Preparation(noise_floor_dbm=-120.0), [9.0, 9.0, 9.0], ["x", "y", "z"], "p")
-    assert (len(alone.table), alone.counts) == (14, {"at or below the noise floor, left out": 6})
-
-
-def test_a_wide_table_keeps_its_lines():
-    wide = SourceTable(
-        pd.DataFrame({"x": [1.0, 2.0], "y": 0.0, "ap1": [-40.0, -50.0], "ap2": [np.nan, -60.0]}),
-        np.array([2, 3]),
-        "rss.csv",
-    )
-    made = prepare(wide, Preparation({"ap1": "A", "ap2": "B"}), [0, 0, 2], ["x", "y", 1.5], "rss")
-    assert made.table.row.tolist() == [2, 3, 3]
-    assert made.table.frame["rss"].tolist() == [-40.0, -50.0, -60.0]
-    assert made.counts == {"cells without a value": 1}
-
-
 @pytest.mark.parametrize(
     ("links", "message"),
     [
@@ -189,12 +153,12 @@ def test_a_wide_table_keeps_its_lines():
         ({"noise_floor_dbm": -10.0}, "all of 16 rows"),
         ({"quantity": "path_loss", "noise_floor_dbm": -100.0}, "is a received power"),
         ({"average": {"by": "time", "size": 3.0}}, "needs time"),
-        ({"quantity": "received_power"}, "say quantity = 'rsrp' and give an \\[offset\\]"),
-        ({"position": "scene"}, "say position = 'geographic'"),
+        ({"quantity": "received_power"}, "set quantity = 'rsrp' and add an \\[offset\\]"),
+        ({"position": "scene"}, "set position = 'geographic'"),
         ({"transmitters": "nowhere.csv"}, "no such file"),
     ],
 )
-def test_what_cannot_be_prepared_is_named(folder, links, message):
+def test_faulty_links_sections_are_refused(folder, links, message):
     with pytest.raises(InputError, match=message):
         study(folder, **links).measurements()
 
@@ -205,7 +169,7 @@ def test_an_unknown_transmit_power_needs_an_offset(folder):
         Study.from_content(content, folder / "study.toml")
 
 
-def test_a_scene_without_a_place_on_the_globe(folder):
+def test_geographic_positions_need_a_scene_with_an_origin(folder):
     (folder / "bare.xml").write_text("".join(
         line for line in (folder / "scene.xml").read_text().splitlines(True) if "calibray frame" not in line
     ))  # fmt: skip

@@ -1,0 +1,68 @@
+"""Place both ends of every row in the scene's frame."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.measurements.preparation import Preparation
+from calibray.measurements.source_table import Coordinates, SourceTable
+
+TX_COLUMNS: Final = ("tx_x", "tx_y", "tx_z")
+"""The columns of transmitter positions in the scene's frame [m]."""
+
+RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
+"""The columns of receiver positions in the scene's frame [m]."""
+
+
+def place_rows(
+    table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
+) -> tuple[SourceTable, Coordinates, Coordinates]:
+    """Write the positions of both ends as columns in metres.
+
+    Args:
+        table: The rows.
+        steps: The steps; `frame` and `ground` are used here.
+        tx: Transmitter position: x, y, z [m], or with a frame longitude, latitude [deg] and height [m].
+        rx: Receiver position, likewise.
+
+    Returns:
+        The rows with the columns `TX_COLUMNS` and `RX_COLUMNS`, and these names; the arguments unchanged if the only
+        step is a filter.
+
+    Raises:
+        InputError: A column is missing or not numeric, or a position is not on the globe.
+    """
+    if steps.is_filter_only:
+        return table, tx, rx
+    tx_position, rx_position = _positions(table, steps, "tx", tx), _positions(table, steps, "rx", rx)
+    placed = table.assign(
+        **dict(zip(TX_COLUMNS, tx_position.T, strict=True)),
+        **dict(zip(RX_COLUMNS, rx_position.T, strict=True)),
+    )
+    return placed, TX_COLUMNS, RX_COLUMNS
+
+
+def _positions(
+    table: SourceTable, steps: Preparation, end: Literal["tx", "rx"], coordinates: Coordinates
+) -> NDArray[np.float64]:
+    """Positions [rows, 3], [m] of one end."""
+    if steps.frame is None:
+        positions = table.positions(end, coordinates)
+        height = positions[:, 2]
+    else:
+        longitude, latitude, height = (table.numbers(coordinate) for coordinate in coordinates)
+        try:
+            positions = steps.frame.to_scene(longitude, latitude, height)
+        except InputError as error:
+            raise InputError(f"{table.source}: {end}: {error}") from None
+    if steps.ground is not None:
+        try:
+            ground = steps.ground(positions[:, 0], positions[:, 1])
+        except InputError as error:
+            raise InputError(f"{table.source}: {end}: {error}") from None
+        positions[:, 2] = ground + height
+    return positions

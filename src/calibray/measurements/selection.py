@@ -1,0 +1,113 @@
+"""Select rows and complete their columns: wide tables, tracks, filters, transmitters, the noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from calibray.errors import InputError
+from calibray.measurements.preparation import Preparation
+from calibray.measurements.source_table import SourceTable
+from calibray.measurements.tracks import join_track
+from calibray.support.messages import did_you_mean, shortened
+
+
+def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
+    """Select the rows that become links.
+
+    The steps run in the order of the code, so that a filter sees the columns of the track but not those of the
+    transmitters.
+
+    Args:
+        table: The rows of the file.
+        steps: The steps; `wide`, `track`, `where`, `transmitters`, `noise_floor_dbm` and `censored` are used here.
+        value: Column of the measured values; with `wide`, the name of the new column of values.
+
+    Returns:
+        The rows that remain. Values at or below the noise floor, and missing ones, are set to the floor.
+
+    Raises:
+        InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
+
+    Example:
+        >>> wide = pd.DataFrame({"x": [0.0, 5.0], "ap1": [-40.0, -52.0], "ap2": [-61.0, np.nan]})
+        >>> steps = Preparation(wide={"ap1": "AP 1", "ap2": "AP 2"})
+        >>> select_rows(SourceTable(wide), steps, "rss").frame
+             x transmitter   rss
+        0  0.0        AP 1 -40.0
+        1  0.0        AP 2 -61.0
+        2  5.0        AP 1 -52.0
+    """
+    if steps.wide:
+        table = _melt(table, steps.wide, value, steps.transmitter)
+    if steps.track is not None:
+        table = join_track(table, steps.track)
+    if steps.where is not None:
+        mask = table.where(steps.where)
+        if not mask.any():
+            raise InputError(
+                f"{table.source}: where = {shortened(steps.where)!r} passes none of {len(table)} rows; "
+                "change the filter"
+            )
+        table = table.select(mask)
+    if steps.transmitters is not None:
+        table = _join_transmitters(table, steps.transmitters, steps.transmitter)
+    if steps.noise_floor_dbm is not None:
+        table = _apply_noise_floor(table, steps, steps.noise_floor_dbm, value)
+    return table
+
+
+def _melt(table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str) -> SourceTable:
+    """One row per link, from a table with one column per transmitter; cells without a value are left out."""
+    if len(set(columns.values())) != len(columns):
+        raise InputError(
+            f"wide = {dict(columns)}: two columns have the same transmitter; name each differently"
+        )
+    others = [name for name in table.frame if name not in columns]
+    for name in (value, transmitter):
+        if name in others:
+            raise InputError(f"{table.source}: column {name!r} exists already; choose another name")
+    values = np.column_stack([table.numbers(name, gaps=True) for name in columns])
+    # In row-major order: the links of one row stay together.
+    row, column = np.nonzero(~np.isnan(values))
+    if not len(row):
+        raise InputError(f"{table.source}: the columns {', '.join(columns)} hold no value")
+    frame = table.frame[others].iloc[row].reset_index(drop=True)
+    frame[transmitter] = np.array(list(columns.values()))[column]
+    frame[value] = values[row, column]
+    long = replace(table, frame=frame, row=table.row[row])
+    empty = values.size - len(row)
+    return long.note("cells without a value", empty) if empty else long
+
+
+def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
+    """Links with the other columns of their transmitters."""
+    label_of_link, labels = table.labels(key).tolist(), transmitters.labels(key).tolist()
+    if len(set(labels)) != len(labels):
+        raise InputError(f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one")
+    if unknown := sorted(set(label_of_link) - set(labels)):
+        raise InputError(
+            f"{table.source}: transmitter {unknown[0]!r} is not in {transmitters.source}; "
+            f"{did_you_mean(unknown[0], labels)}"
+        )
+    index_of_label = {label: index for index, label in enumerate(labels)}
+    joined = transmitters.frame.drop(columns=key).iloc[[index_of_label[label] for label in label_of_link]]
+    # A column that links have already keeps its name there, because filters and positions refer to it.
+    joined = joined.rename(columns={name: f"{key}_{name}" for name in joined if name in table.frame})
+    frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)
+    return replace(table, frame=frame)
+
+
+def _apply_noise_floor(table: SourceTable, steps: Preparation, floor: float, value: str) -> SourceTable:
+    """Set powers at or below the noise floor to it; leave these rows out unless a later step uses them."""
+    power = table.numbers(value, gaps=True)
+    below = ~(power > floor)  # A missing power counts as below the floor.
+    table = table.assign(**{value: np.where(below, floor, power)})
+    if steps.censored:
+        return table.note("at or below the noise floor, counted as censored", below.sum())
+    if steps.averaging is None:
+        return table.keep(~below, "at or below the noise floor, left out")
+    return table

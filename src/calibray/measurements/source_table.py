@@ -1,0 +1,203 @@
+"""Rows of a table with their lines in the file, so that messages can name file, row and column."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.measurements.filters import evaluate
+from calibray.support.messages import did_you_mean, shortened
+
+Coordinates = Sequence[float | str]
+"""x, y and z [m], or longitude, latitude [deg] and height [m]; each a number or the name of a column."""
+
+_DEGREES: Final = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
+
+
+@dataclass(frozen=True, eq=False)
+class SourceTable:
+    """Rows of a table.
+
+    Attributes:
+        frame: The rows.
+        row: Line [rows] of each row in a CSV file (the header is line 1) or in a sheet, otherwise its number from 1.
+        source: Name of the file, or another name for messages.
+        changes: What earlier steps left out, averaged or moved, each with the number of rows.
+    """
+
+    frame: pd.DataFrame
+    row: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
+    source: str = "table"
+    changes: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.row is None:
+            object.__setattr__(self, "row", np.arange(1, len(self.frame) + 1))
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def assign(self, **columns: Any) -> SourceTable:
+        """The same rows with columns [rows] added or replaced."""
+        return replace(self, frame=self.frame.assign(**columns))
+
+    def note(self, change: str, number: int) -> SourceTable:
+        """The same rows with one more entry in `changes`."""
+        return replace(self, changes={**self.changes, change: int(number)})
+
+    def select(self, mask: NDArray[np.bool_]) -> SourceTable:
+        """The rows where a mask [rows] is true."""
+        return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
+
+    def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
+        """The rows where a mask [rows] is true; the number of other rows is noted.
+
+        Args:
+            mask: The rows to keep.
+            reason: Entry of `changes` for the rows that are left out.
+
+        Returns:
+            The rows that remain.
+
+        Raises:
+            InputError: No row remains.
+        """
+        if not mask.any():
+            raise InputError(f"{self.source}: {reason}: all of {len(self)} rows; change [links] of the study")
+        lost = int((~mask).sum())
+        return (self.note(reason, lost) if lost else self).select(mask)
+
+    def where(self, expression: str) -> NDArray[np.bool_]:
+        """Evaluate a row filter.
+
+        Args:
+            expression: A filter over the columns (see `filters`), for instance ``"gpsmode == 4 and rx_x_m < -55"``.
+
+        Returns:
+            Mask [rows] of the rows that pass. A row with a missing value in a comparison does not pass.
+
+        Raises:
+            InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
+        """
+        try:
+            return evaluate(expression, self.frame)
+        except InputError as error:
+            raise InputError(f"{self.source}: where = {shortened(expression)!r}: {error}") from None
+
+    def column(self, name: str) -> pd.Series:
+        """One column.
+
+        Raises:
+            InputError: There is no such column.
+        """
+        if name not in self.frame:
+            raise InputError(
+                f"{self.source}: no column {shortened(name)!r}; {did_you_mean(name, map(str, self.frame))}"
+            )
+        return self.frame[name]
+
+    def numbers(self, source: str | float, gaps: bool = False) -> NDArray[np.float64]:
+        """One column as finite numbers, or one number for all rows.
+
+        Args:
+            source: Name of the column, or the number.
+            gaps: Whether values may be missing; these are NaN.
+
+        Returns:
+            Values [rows].
+
+        Raises:
+            InputError: There is no such column, or a value is missing, infinite or not a number.
+        """
+        if not isinstance(source, str):
+            if isinstance(source, bool) or not np.isfinite(source):
+                raise InputError(f"{self.source}: {source!r} must be a finite number or a column")
+            return np.full(len(self), float(source))
+        column = self.column(source)
+        missing = column.isna().to_numpy()
+        if gaps and missing.all():
+            return np.full(len(self), np.nan)
+        if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_string_dtype(column)):
+            raise InputError(f"{self.source}: column {source!r} holds {column.dtype}, must hold numbers")
+        if pd.api.types.is_bool_dtype(column):
+            raise InputError(f"{self.source}: column {source!r} holds true and false, must hold numbers")
+        parsed = pd.to_numeric(column, errors="coerce")
+        if (text := parsed.isna().to_numpy() & ~missing).any():
+            first = int(np.flatnonzero(text)[0])
+            raise InputError(
+                f"{self.cell(first, source)}: {column.iloc[first]!r} is not a number; correct it"
+            )
+        numbers = parsed.to_numpy(dtype=np.float64, na_value=np.nan)
+        unusable = np.isinf(numbers) if gaps else ~np.isfinite(numbers)
+        if unusable.any():
+            rows = ", ".join(map(str, self.row[unusable][:5])) + (", ..." if unusable.sum() > 5 else "")
+            raise InputError(
+                f"{self.source}: column {source!r} is missing or not finite in {unusable.sum()} of {len(self)} "
+                f"rows (row {rows}); correct them, or leave them out with a where filter"
+            )
+        return numbers
+
+    def labels(self, names: str | Sequence[str]) -> NDArray[np.str_]:
+        """One column as labels, or the labels of several columns joined by a space.
+
+        Args:
+            names: The column or columns.
+
+        Returns:
+            Labels [rows].
+
+        Raises:
+            InputError: There is no such column, or a label is missing.
+        """
+        if not isinstance(names, str):
+            parts = [self.labels(name).tolist() for name in names]
+            return np.array([" ".join(labels) for labels in zip(*parts, strict=True)], dtype=np.str_)
+        column = self.column(names)
+        if (missing := column.isna().to_numpy()).any():
+            first = int(np.flatnonzero(missing)[0])
+            raise InputError(
+                f"{self.cell(first, names)}: the label is missing ({missing.sum()} in all); give one"
+            )
+        if pd.api.types.is_float_dtype(column) and (column % 1 == 0).all():
+            # pandas stores whole numbers as floats if any row had a gap: label 5 must not become "5.0".
+            column = column.astype(np.int64)
+        return column.astype(str).to_numpy(dtype=np.str_)
+
+    def positions(self, end: str, coordinates: Coordinates) -> NDArray[np.float64]:
+        """Positions in the scene's frame from three numbers or columns.
+
+        Args:
+            end: "tx" or "rx", for messages.
+            coordinates: x, y and z [m].
+
+        Returns:
+            Positions [rows, 3], [m].
+
+        Raises:
+            InputError: There are not three coordinates, or a column is missing, not numeric or named like degrees.
+        """
+        if isinstance(coordinates, str) or len(coordinates) != 3:
+            raise InputError(f"{end} = {coordinates!r}: must be x, y and z, each a number [m] or a column")
+        for coordinate in coordinates:
+            if isinstance(coordinate, str):
+                if _DEGREES & set(re.split(r"[^a-z]+", coordinate.lower())):
+                    raise InputError(
+                        f"{self.source}: column {coordinate!r} of {end} looks like degrees; give metres in the "
+                        "scene's frame, or set position = 'geographic' in a study"
+                    )
+            elif isinstance(coordinate, bool) or not np.isfinite(coordinate):
+                raise InputError(
+                    f"{end} = {coordinates!r}: {coordinate!r} must be a finite number [m] or a column"
+                )
+        return np.stack([self.numbers(coordinate) for coordinate in coordinates], axis=1)
+
+    def cell(self, index: int, column: str) -> str:
+        """File, row and column of a cell, for messages."""
+        return f"{self.source}, row {self.row[index]}, column {column!r}"

@@ -1,0 +1,109 @@
+"""Averages of samples, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibray.errors import InputError
+from calibray.measurements import Averaging, LinkColumns, Preparation, SourceTable, measured_links
+from calibray.measurements.averaging import average_samples
+
+TX, RX = ("tx_x", "tx_y", "tx_z"), ("rx_x", "rx_y", "rx_z")
+
+
+def average(rows, by="cell", size=5.0, quantity="rsrp", time=None, **steps):
+    """Averages of the column `power`; positions that the rows lack are 0."""
+    frame = pd.DataFrame(dict.fromkeys((*TX, *RX), 0.0), index=range(len(next(iter(rows.values())))))
+    steps = Preparation(averaging=Averaging(by, size, time), **steps)
+    columns = LinkColumns(TX, RX, "power", quantity)
+    return average_samples(SourceTable(frame.assign(**rows)), steps, columns)
+
+
+def test_rayleigh_fading_averages_to_its_mean_power():
+    """The power is exponential: mean 0 dB, mean of the decibels -2.51 dB, standard deviation 5.57 dB."""
+    power = -90.0 + 10 * np.log10(np.random.default_rng(0).exponential(size=200_000))
+    (mean,) = average({"power": power}).frame.to_dict("records")
+    assert mean["power"] == pytest.approx(-90.0, abs=0.05)
+    assert power.mean() == pytest.approx(-92.51, abs=0.05)
+    assert mean["std_db"] == pytest.approx(5.57, abs=0.05)
+    assert mean["count"] == 200_000
+
+
+@pytest.mark.parametrize(("quantity", "sign"), [("rsrp", 1.0), ("path_gain", 1.0), ("path_loss", -1.0)])
+def test_powers_and_losses_are_averaged_in_linear_power(quantity, sign):
+    rows = {"rx_x": [0.0, 0.5, 7.0], "rx_z": [1.0, 2.0, 1.0], "power": sign * np.array([-80.0, -90.0, -70.0])}
+    mean = average(rows, quantity=quantity).frame
+    np.testing.assert_allclose(sign * mean["power"], [10 * np.log10((1e-8 + 1e-9) / 2), -70.0])
+    np.testing.assert_allclose(mean["rx_x"], [0.25, 7.0])
+    np.testing.assert_allclose(mean["rx_z"], [1.5, 1.0])
+    np.testing.assert_allclose(mean["std_db"], [np.sqrt(50.0), np.nan])
+    assert mean["count"].tolist() == [2, 1]
+
+
+def test_powers_below_the_smallest_float_are_averaged():
+    assert average({"power": [-5000.0, -5000.0]}).frame["power"].tolist() == [-5000.0]
+
+
+def test_averages_do_not_cross_transmitters_and_kept_columns():
+    rows = {"transmitter": list("baba"), "phone": [1, 1, 1, 1], "power": [-60.0, -80.0, -60.0, -90.0]}
+    mean = average(rows).frame
+    assert mean["transmitter"].tolist() == ["b", "a"]
+    assert mean["power"].tolist() == pytest.approx([-60.0, -82.596], abs=1e-3)
+    assert mean["count"].tolist() == [2, 2]
+    assert len(average(rows | {"phone": [1, 1, 2, 2]}, keep=("phone",))) == 4
+    with pytest.raises(InputError, match="no column 'phon'; did you mean 'phone'"):
+        average(rows, keep=("phon",))
+
+
+@pytest.mark.parametrize(
+    ("by", "size", "first_rows"),
+    [
+        ("cell", 10.0, [1, 2, 4]),
+        ("distance", 10.0, [1, 3]),
+        ("distance", 1e9, [1]),
+        ("time", 5.0, [1, 3, 4]),
+    ],
+)
+def test_cells_stretches_and_windows(by, size, first_rows):
+    times = ["10:00:00Z", "10:00:04Z", "12:00:05+02:00", "10:01:00Z"]
+    rows = {"rx_x": [-0.1, 0.1, 9.9, 10.1], "rx_y": 1.0, "power": -80.0}
+    rows["t"] = [f"2026-05-01T{time}" for time in times]
+    averages = average(rows, by, size, time="t")
+    assert averages.row.tolist() == first_rows
+    assert averages.changes == {"samples averaged": 4}
+    if by == "time":
+        seconds = [pd.Timestamp(time).timestamp() for time in rows["t"]]
+        assert average(rows | {"t": seconds}, by, size, time="t").row.tolist() == first_rows
+
+
+@pytest.mark.parametrize(
+    ("changes", "arguments", "message"),
+    [
+        ({}, {"size": 0.0}, "average.size = 0.0"),
+        ({}, {"by": "distance", "size": -1.0}, "average.size = -1.0"),
+        ({}, {"by": "time", "time": "t"}, "column 't': a time cannot be read"),
+        ({"t": ["2026-05-01", None]}, {"by": "time", "time": "t"}, "column 't': a time is missing"),
+        ({"rx_x": ["here", "there"]}, {}, "'here' is not a number"),
+        ({"power": [-80.0, np.nan]}, {}, "missing or not finite in 1 of 2 rows"),
+    ],
+)
+def test_samples_that_cannot_be_averaged_are_refused(changes, arguments, message):
+    with pytest.raises(InputError, match=message):
+        average({"t": ["noon", "one"], "power": [-80.0, -81.0]} | changes, **arguments)
+
+
+def test_samples_below_the_floor_count_half_or_their_average_is_left_out():
+    """One of ten samples below the floor adds between nothing and the floor; five of ten leave 1 dB open."""
+    strong, weak = [-80.0] * 9, [-118.0] * 5
+    frame = pd.DataFrame({"x": [0.0] * 10 + [50.0] * 10, "p": [*strong, np.nan, *weak, *[np.nan] * 5]})
+    columns = LinkColumns((9.0, 9.0, 9.0), ("x", 0.0, 1.5), "p", "rsrp")
+    steps = Preparation(noise_floor_dbm=-120.0, averaging=Averaging("cell", 5.0))
+    links = measured_links(SourceTable(frame), columns, steps)
+    assert links.path_loss_db.tolist() == pytest.approx([-10 * np.log10(0.9e-8 + 0.05e-12)])
+    assert links.prepared == {
+        "samples averaged": 20,
+        "of them at or below the noise floor": 6,
+        "averages too near the noise floor, left out": 1,
+    }
