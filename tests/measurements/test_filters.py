@@ -146,6 +146,16 @@ def test_a_refusal_names_the_piece_and_the_remedy(expression, piece, remedy):
     assert remedy in str(caught.value)
 
 
+def test_nested_filters_cost_no_more_than_their_length():
+    """A part that was evaluated twice at every level would take 2^22 times as long."""
+    frame = pd.DataFrame({"x": [1.0, -2.0]})
+    comparison = "x"
+    for _ in range(24):
+        comparison = f"(x < {comparison} < 9)"
+    assert evaluate(comparison, frame).tolist() == [False, True]
+    assert evaluate("x" + ".abs()" * 22 + " > 1", frame).tolist() == [False, True]
+
+
 def test_full_width_letters_are_not_taken_for_plain_ones():
     """Python normalizes a full-width x to x; a column is meant as it is written."""
     frame = FRAME.assign(**{"ｘ": 5})

@@ -96,15 +96,13 @@ def test_rows_left_out_by_the_filter_may_be_faulty(tmp_path):
         read(tmp_path, text)
 
 
-def test_split_refuses_an_empty_part(tmp_path):
-    links = read(tmp_path, group="set", weight="spread")
-    kept, held_out = links.split("x > 15 or y > 35")
-    assert (kept.row.tolist(), held_out.row.tolist()) == ([2, 4], [3, 5])
-    assert (kept.group.tolist(), held_out.weight.tolist()) == (["LOS", "NLOS"], [2, 4])
+def test_a_hold_out_filter_leaves_links_on_both_sides(tmp_path):
+    links = read(tmp_path)
+    assert links.held_out("x > 15 or y > 35").tolist() == [False, True, False, True]
     with pytest.raises(InputError, match="no link for the hold-out"):
-        links.split("x > 1000")
+        links.held_out("x > 1000")
     with pytest.raises(InputError, match="no link for calibration"):
-        links.split("x < 1000")
+        links.held_out("x < 1000")
 
 
 @given(st.lists(st.booleans(), min_size=5, max_size=5).filter(any))

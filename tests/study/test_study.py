@@ -138,16 +138,14 @@ def test_what_is_left_out_has_its_default(folder):
     assert (study.offset, study.holdout, study.overrides) == (None, None, {})
 
 
-def test_measurements_are_read_grouped_and_parted(folder):
+def test_measurements_are_read_with_their_groups(folder):
     study = load(folder)
     links = study.measurements()
     assert links.path_loss_db.tolist() == [80, 85, 90]
     assert links.weight.tolist() == [1 / 4, 1 / 4, 1 / 16]
     assert links.group.tolist() == ["A", "B", "B"]
-    kept, held_out = study.split(links)
-    assert (kept.row.tolist(), held_out.row.tolist()) == ([2, 3], [4])
-    whole = load(folder, MINIMAL.replace('"loss"', '"spread"').replace("4e9\n", "4e9\n"))
-    assert whole.split(links) == (links, None)
+    assert study.held_out(links).tolist() == [False, False, True]
+    assert not load(folder, MINIMAL).held_out(links).any()
 
 
 def test_parameters_keep_the_order_of_the_file_and_resolve_their_starts(folder):

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from math import inf, isfinite
-from typing import Any, Final, TypeGuard
+from typing import Any, Final, TypeGuard, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -37,6 +37,7 @@ MAX_DEPTH: Final = 50
 _MAX_INTEGER: Final = 2**63 - 1
 
 _Value = pd.Series | bool | int | float | str
+_Item = TypeVar("_Item")
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
@@ -103,13 +104,11 @@ def _parse(code: str, columns: Iterable[object]) -> ast.expr:
         raise InputError(
             f"not a valid filter ({fault}); compare as in \"x < 5 and set == 'LOS'\"; the columns are {names}"
         ) from None
-    parts, level = 0, [tree]
+    parts = 0
+    level: list[ast.AST] = [tree]
     for _ in range(MAX_DEPTH):
         parts += len(level)
-        # Operators are nodes too, but have no fields and so do not add to the depth.
-        level = [
-            child for node in level for child in ast.iter_child_nodes(node) if isinstance(child, ast.AST)
-        ]
+        level = [child for node in level for child in ast.iter_child_nodes(node)]
         if parts > MAX_PARTS:
             raise InputError(f"more than {MAX_PARTS} parts; shorten it, or add a column to filter by")
         if not level:
@@ -141,11 +140,7 @@ class _Interpreter:
                     number = self._number(node.operand)
                     return -number if isinstance(node.op, ast.USub) else number
                 case ast.Compare():
-                    sides = [node.left, *node.comparators]
-                    pairs = zip(node.ops, sides, sides[1:], strict=False)
-                    return reduce(
-                        operator.and_, [self._compare(node, type(op), *pair) for op, *pair in pairs]
-                    )
+                    return self._comparison(node)
                 case ast.BinOp():
                     return self._arithmetic(node)
                 case ast.Call():
@@ -227,21 +222,36 @@ class _Interpreter:
                 values.append(self._number(item) if negative else self._constant(constant))
         return values
 
+    def _comparison(self, node: ast.Compare) -> pd.Series | bool:
+        """A comparison, or a chain of them, each with its neighbours."""
+        # Each side is evaluated once. Twice, as both neighbours ask for it, would double the cost with every nesting.
+        sides = [node.left, *node.comparators]
+        values = [self.value(node.left), *(self._argument(side) for side in node.comparators)]
+        results = [
+            self._compare(node, type(node.ops[k]), sides[k : k + 2], values[k : k + 2])
+            for k in range(len(node.ops))
+        ]
+        return reduce(operator.and_, results)
+
     def _compare(
-        self, node: ast.Compare, kind: type[ast.cmpop], left: ast.expr, right: ast.expr
+        self, node: ast.Compare, kind: type[ast.cmpop], sides: list[ast.expr], values: list[Any]
     ) -> pd.Series | bool:
-        several = isinstance(right, ast.List | ast.Tuple)
+        left, right = values
+        several = isinstance(right, list | tuple)
         if kind in (ast.In, ast.NotIn) or (several and kind in (ast.Eq, ast.NotEq)):
-            column = self._column(left)
-            values = self._literals(right) if several else self.value(right)
-            values = [values] if isinstance(values, str) else values
-            if not isinstance(values, list | pd.Series):
-                raise self._refusal(right, "must be a list of values, as in ['A', 'B']")
-            contained = column.isin(values)
+            if not isinstance(left, pd.Series):
+                raise self._refusal(sides[0], "must be a column, or calculated from one")
+            choices = [right] if isinstance(right, str) else right
+            if not isinstance(choices, list | tuple | pd.Series):
+                raise self._refusal(sides[1], "must be a list of values, as in ['A', 'B']")
+            contained = left.isin(choices)
             return contained if kind in (ast.In, ast.Eq) else ~contained
         if kind not in COMPARISONS:
             raise self._refusal(node, "is and is not are not allowed; use ==, != or isna()")
-        return COMPARISONS[kind](self.value(left), self.value(right))
+        for side, value in zip(sides, values, strict=True):
+            if isinstance(value, list | tuple):
+                raise self._refusal(side, "a list of values can only be compared by in, not in, == and !=")
+        return COMPARISONS[kind](left, right)
 
     def _arithmetic(self, node: ast.BinOp) -> _Value:
         operation = ARITHMETIC.get(type(node.op))
@@ -262,34 +272,26 @@ class _Interpreter:
             # Written with letters that Python normalizes.
             raise self._refusal(node.func, f"write the method in plain letters, {name!r}")
         match node.func:
-            case ast.Name() if name in FUNCTIONS:
-                function = FUNCTIONS[name]
+            case ast.Name():
+                function = _allowed(name, FUNCTIONS)
                 if node.keywords or len(node.args) != function.nin:
                     raise self._refusal(node, f"takes {function.nin} number(s), nothing else")
                 return function(*(_as_floats(self._number(argument)) for argument in node.args))
-            case ast.Name():
-                raise InputError(f"{shortened(name)}() is not allowed; {did_you_mean(name, FUNCTIONS)}")
             case ast.Attribute(value=ast.Attribute(value=owner, attr="str")):
-                column = self._method_owner(owner, name, TEXT_METHODS)
+                method, column = _allowed(name, TEXT_METHODS), self._column(owner)
                 if not (pd.api.types.is_string_dtype(column.dtype) or column.dtype == object):
                     raise self._refusal(owner, f"must be a column of texts; leave .str.{name}() out")
-                return self._method(node, column, name, TEXT_METHODS)
+                return self._call_method(node, name, method, column)
             case ast.Attribute(value=owner):
-                column = self._method_owner(owner, name, METHODS)
-                if name == "abs":
-                    self._number(owner)
-                return self._method(node, column, name, METHODS)
+                method = _allowed(name, METHODS)
+                column = self._number(owner) if name == "abs" else self._column(owner)
+                return self._call_method(node, name, method, column)
         raise self._refusal(node, "not allowed in a filter; only columns' methods may be called")
 
-    def _method_owner(self, owner: ast.expr, name: str, methods: Mapping[str, Any]) -> pd.Series:
-        if name not in methods:
-            raise InputError(f"{shortened(name)}() is not allowed; {did_you_mean(name, methods)}")
-        return self._column(owner)
-
-    def _method(
-        self, node: ast.Call, column: pd.Series, name: str, methods: Mapping[str, Callable[..., pd.Series]]
-    ) -> pd.Series:
-        signature = inspect.signature(methods[name])
+    def _call_method(
+        self, node: ast.Call, name: str, method: Callable[..., Any], column: pd.Series | int | float
+    ) -> _Value:
+        signature = inspect.signature(method)
         keywords = {str(keyword.arg): self._argument(keyword.value) for keyword in node.keywords}
         try:
             arguments = signature.bind(column, *map(self._argument, node.args), **keywords)
@@ -297,15 +299,21 @@ class _Interpreter:
             parameters = ", ".join([*signature.parameters][1:]) or "no arguments"
             raise self._refusal(node, f"{name}() takes {parameters}; correct it") from None
         try:
-            return methods[name](*arguments.args, **arguments.kwargs)
+            return method(*arguments.args, **arguments.kwargs)
         except InputError as error:
             raise self._refusal(node, str(error)) from None
 
     def _argument(self, node: ast.expr) -> Any:
-        """The value of a method's argument; the values of a list or tuple keep their kind."""
+        """The value of a part that may also be a list or tuple of literals."""
         if isinstance(node, ast.Tuple):
             return tuple(self._literals(node))
         return self._literals(node) if isinstance(node, ast.List) else self.value(node)
+
+
+def _allowed(name: str, items: Mapping[str, _Item]) -> _Item:
+    if name not in items:
+        raise InputError(f"{shortened(name)}() is not allowed; {did_you_mean(name, items)}")
+    return items[name]
 
 
 def _is_column_of_truths(value: Any) -> TypeGuard[pd.Series]:

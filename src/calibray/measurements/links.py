@@ -188,21 +188,6 @@ class Measurements:
         """
         return self.table.where(expression)
 
-    def split(self, holdout: str) -> tuple[Measurements, Measurements]:
-        """Split into calibration and held-out links.
-
-        Args:
-            holdout: Filter over the source table's columns; the links that pass are held out.
-
-        Returns:
-            The calibration links and the held-out links.
-
-        Raises:
-            InputError: The filter is not valid, or one of the parts would be empty.
-        """
-        held_out = self.held_out(holdout)
-        return self.select(~held_out), self.select(held_out)
-
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
         """The mask [links] of the links that a filter holds out.
 

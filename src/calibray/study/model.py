@@ -315,22 +315,6 @@ class Study(Section):
 
         return Setup.open(self)
 
-    def split(self, measurements: Measurements) -> tuple[Measurements, Measurements | None]:
-        """Part links into those to calibrate on and those held out, None without ``[holdout]``.
-
-        Args:
-            measurements: Links with the columns that the hold-out's filter names.
-
-        Returns:
-            The links to calibrate on, and those held out.
-
-        Raises:
-            InputError: The filter is not valid, or one of the parts would be empty.
-        """
-        if self.holdout is None or self.holdout.where is None:
-            return measurements, None
-        return measurements.split(self.holdout.where)
-
     @property
     def priors(self) -> LogNormal:
         """What is known of the parameters beforehand, by their places in a candidate."""
