@@ -30,9 +30,9 @@ bench: setup
 	$(BIN)/python benchmarks/diffuse.py
 	$(BIN)/python benchmarks/launches.py
 	$(BIN)/python benchmarks/time_to_result.py
-	$(BIN)/python benchmarks/blocks.py speed-up --links 800
-	$(BIN)/python benchmarks/blocks.py links --blocks 10 100
-	$(BIN)/python benchmarks/blocks.py city --samples auto
+	$(BIN)/python benchmarks/chunks.py speed-up --links 800
+	$(BIN)/python benchmarks/chunks.py links --chunks 10 100
+	$(BIN)/python benchmarks/chunks.py city --samples auto
 
 docs: setup site
 	$(BIN)/python tools/check_docs.py

@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import programs
 import restarts
 from restarts import Harm
-from test_ledger import study_file
 
 INSIDE = "CALIBRAY_KILL_INSIDE"  # set within the mount namespace
 SIGNALS, DISKS = ("kill", "terminate", "interrupt"), ("full", "read-only")
@@ -64,7 +63,7 @@ def prepare(folder: Path, case: Case, mounts: bool) -> None:
     (folder / "out").mkdir(parents=True)
     if mounts:
         subprocess.run(["mount", "-t", "tmpfs", "-o", DISK, "tmpfs", str(folder / "out")], check=True)
-    study_file(folder, PAUSE, case.method, case.options)
+    programs.study_file(folder, PAUSE, case.method, case.options)
     file = folder / "study.toml"
     trace = "trace = { max_depth = 2, samples = 20_000, line_of_sight = false }"
     text = file.read_text().replace('name = "command"', f'name = "{case.engine}"')

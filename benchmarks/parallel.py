@@ -28,8 +28,8 @@ def seconds(folder: Path, workers: int | None, scheduler: str | None) -> float:
     """Time that a batch takes [s]."""
     study = programs.study(folder, "import time; time.sleep(1)")
     candidates = np.random.default_rng(0).uniform(1.5, 12.0, (CALLS, 3))
-    with engines.open_executor(workers, scheduler) as executor:
-        engine = engines.make(study, executor=executor)
+    with engines.open_workers(workers, scheduler) as opened:
+        engine = engines.make(study, workers=opened)
         started = time.perf_counter()
         engine.path_loss(candidates)
         return time.perf_counter() - started

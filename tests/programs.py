@@ -32,6 +32,17 @@ ANSWER = """
 with open(response_file, "w") as file:
     json.dump({"path_loss_db": losses}, file)
 """
+STUDY_TOML = """
+version = 1
+scene = {{ file = "sionna:simple_street_canyon", frequency = 3.5e9 }}
+links = {{ file = "links.csv", tx = ["tx_x", "tx_y", "tx_z"], rx = ["rx_x", "rx_y", "rx_z"], value = "path_loss_db" }}
+engine = {{ name = "command", command = {command}, retries = 0 }}
+method = {{ name = "{method}", options = {options} }}
+[parameters]
+"concrete.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
+"marble.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
+"wood.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
+"""
 TRUTH = np.array([3.2, 8.1, 2.6])
 
 
@@ -57,6 +68,16 @@ def content(folder: Path, before: str = "", after: str = ANSWER, **engine: Any) 
 def study(folder: Path, before: str = "", after: str = ANSWER, **engine: Any) -> Study:
     """The study itself."""
     return Study.from_content(content(folder, before, after, **engine), folder / "study.toml")
+
+
+def study_file(
+    folder: Path, before: str = "", method: str = "random", options: str = "{ budget = 6 }"
+) -> Study:
+    """A study in a file that calls the program."""
+    content(folder, before)
+    text = STUDY_TOML.format(command=[*PYTHON, "model.py"], method=method, options=options)
+    (folder / "study.toml").write_text(text)
+    return Study.load(folder / "study.toml")
 
 
 def calls(folder: Path) -> list[tuple[float, ...]]:

@@ -27,7 +27,7 @@ RUNNER = """
 import json, os, signal, sys, traceback
 from pathlib import Path
 from calibray.calibration import calibrate
-from calibray.engines import Retrace, open_executor
+from calibray.engines import Retrace, open_workers
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
 
@@ -39,7 +39,7 @@ def run(workers, folder):
         return answer(engine, part, candidate)
     Retrace._one = noted
     try:
-        with open_executor(int(workers) or None) as executor:
+        with open_workers(int(workers) or None) as executor:
             calibrate(Study.load(folder + "/study.toml"), out=folder + "/out", executor=executor)
         return 0
     except (InputError, EngineError) as error:

@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from test_bad_input import run, write
 
 import shown
-from calibray.engines.ledger.entry import LedgerEntry, read_entry
+from calibray.engines.ledger.answers import LedgerEntry, read_entry
 from calibray.errors import InputError
 from calibray.measurements import read_measurements, read_table
 from calibray.measurements.filters import evaluate
@@ -26,7 +27,6 @@ from calibray.tracing import gain_table
 from calibray.validation.validate import validate
 from fuzzing import geometry, inputs, stored, workbooks, world
 from fuzzing.outcome import ALLOWED, Watch, judge
-from test_bad_input import run, write
 
 LIGHT = (inputs.study, inputs.row_filter, inputs.table, workbooks.workbook, geometry.mesh, geometry.antenna)
 """Kinds that need nothing calibrated; cases that trace or run are the benchmark's."""

@@ -13,7 +13,7 @@ from test_cli_run import write_study
 
 import programs
 from calibray.engines import Ledger
-from calibray.engines.ledger.entry import LedgerEntry, key
+from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.result import Result
 from calibray.tracing.llvm import PATH_VARIABLE
 

@@ -86,12 +86,12 @@ def test_answers_that_can_be_read(tmp_path, content, num_links, loss):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "no JSON"),
-        ('{"path_loss_db": [70, 8', "no JSON"),
+        ("", "not JSON"),
+        ('{"path_loss_db": [70, 8', "not JSON"),
         ("[70, 80]", "no key 'path_loss_db'"),
         ('{"path_loss": [70, 80]}', "no key 'path_loss_db'"),
         ('{"path_loss_db": [70]}', r"shape \(1,\), must be \(2,\)"),
-        ('{"path_loss_db": [[70, 80]]}', r"holds \[70, 80\] in path_loss_db, which is no number"),
+        ('{"path_loss_db": [[70, 80]]}', r"holds \[70, 80\] in path_loss_db, which is not a number"),
         ('{"path_loss_db": [70, NaN]}', r"path_loss_db\[1\] = nan; must be a number"),
         ('{"path_loss_db": [-Infinity, 70]}', r"path_loss_db\[0\] = -inf"),
         ('{"path_loss_db": [70, true]}', "holds true in"),
@@ -110,7 +110,7 @@ def test_hdf5_answers_that_are_refused(tmp_path):
     with pytest.raises(Unusable, match="wrote no response file"):
         read_answer(path, "hdf5", 2)
     path.write_text("no HDF5")
-    with pytest.raises(Unusable, match="is no HDF5 file"):
+    with pytest.raises(Unusable, match="is not an HDF5 file"):
         read_answer(path, "hdf5", 2)
     with h5py.File(path, "w") as file:
         file["other"] = 1.0
@@ -124,9 +124,9 @@ def test_hdf5_answers_that_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("sys.exit('license server is down')", "", r"ended with exit status 1; it said:\nlicense server"),
-        ("os.abort()", "", "ended with signal SIGABRT; it said nothing"),
-        ("print('I forgot')", "", r"wrote no response file; it said:\nI forgot"),
+        ("sys.exit('license server is down')", "", r"ended with exit status 1; its output:\nlicense server"),
+        ("os.abort()", "", "ended with signal SIGABRT; it gave no output"),
+        ("print('I forgot')", "", r"wrote no response file; its output:\nI forgot"),
         ("losses[3] = math.nan", programs.ANSWER, r"path_loss_db\[3\] = nan"),
         ("losses.pop()", programs.ANSWER, r"shape \(11,\), must be \(12,\)"),
         ("import time; time.sleep(60)", "", "gave no answer within timeout = 0.5 s and was killed"),
@@ -190,7 +190,7 @@ def test_a_run_completes_in_spite_of_failures(tmp_path):
     failed, asked = table[table.status == "failed"], programs.calls(tmp_path)
     unlucky = sum(hash(candidate) % 5 == 0 for candidate in asked[1:])
     assert 3 <= unlucky < len(asked) / 2
-    assert sum("exit status 1; it said:\nout of luck" in text for text in failed.message) == unlucky
+    assert sum("exit status 1; its output:\nout of luck" in text for text in failed.message) == unlucky
     others = [text for text in failed.message if "out of luck" not in text]
     assert [text for text in others if "within timeout = 2 s" in text]
     assert [text for text in others if "path_loss_db[0] = nan" in text]
@@ -244,26 +244,29 @@ for _ in range(400):
 else: sys.exit("alone")
 """
     candidates = np.vstack([CANDIDATES, [[5.0, 5.0, 5.0]]])
-    with engines.open_executor(workers=4) as executor:
-        engine = engines.make(programs.study(tmp_path, wait, timeout=60.0), executor=executor)
+    with engines.open_workers(4) as workers:
+        engine = engines.make(programs.study(tmp_path, wait, timeout=60.0), workers=workers)
         assert engine.path_loss(candidates) == pytest.approx(programs.expected(candidates, planted.links()))
 
 
 def test_a_failure_does_not_lose_the_others(tmp_path):
     before = "if values[0] == 2.0: sys.exit('no')"
-    with engines.open_executor(workers=2) as executor:
-        engine = engines.make(programs.study(tmp_path, before), executor=executor)
+    with engines.open_workers(2) as workers:
+        engine = engines.make(programs.study(tmp_path, before), workers=workers)
         loss = engine.path_loss(CANDIDATES)
         answers = {answer.index: answer.failure for answer in engine.answers(CANDIDATES[:2])}
     assert np.isinf(loss).all(axis=1).tolist() == [False, True, False]
     assert answers[0] == ""
-    assert answers[1].endswith("ended with exit status 1; it said:\nno")
+    assert answers[1].endswith("ended with exit status 1; its output:\nno")
 
 
 class DyingWorkers(ThreadPoolExecutor):
-    """An executor of which the worker on the second call dies."""
+    """Workers of which the one on the second call dies."""
 
     submitted = 0
+
+    def executor(self):
+        return self
 
     def submit(self, function, /, *arguments):
         self.submitted += 1
@@ -275,8 +278,8 @@ class DyingWorkers(ThreadPoolExecutor):
 
 
 def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
-    with DyingWorkers(1) as executor:
-        engine = engines.make(programs.study(tmp_path), executor=executor)
+    with DyingWorkers(1) as workers:
+        engine = engines.make(programs.study(tmp_path), workers=workers)
         answers = {answer.index: answer for answer in engine.answers(CANDIDATES)}
     assert [bool(answers[k].failure) for k in range(3)] == [False, True, False]
     assert "lost with its worker (RuntimeError: worker was killed)" in answers[1].failure
@@ -288,7 +291,7 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
         (0, None, "must be at least 1"),
         (2, "tcp://here:1", "give one of them"),
         *(
-            (None, address, "--scheduler .*: is no address; give host and port, as tcp://")
+            (None, address, "--scheduler .*: not an address; give host and port, as tcp://")
             for address in (
                 *("", "x", "127.0.0.1", "tcp://", "tcp://127.0.0.1:0", "tcp://127.0.0.1:99999", "tcp://[::1"),
                 *("tcp://127.0.0.1:abc", "http://127.0.0.1:80", "inproc://1", "ucx://a:1", "a:b:c:d"),
@@ -300,21 +303,24 @@ def test_a_worker_that_dies_costs_its_candidate_alone(tmp_path):
     ],
 )
 def test_executors_that_are_refused(workers, scheduler, message, monkeypatch):
-    monkeypatch.setattr("calibray.engines.cluster.executors.PATIENCE", 0.1)
-    with pytest.raises(InputError, match=message), engines.open_executor(workers, scheduler):
+    monkeypatch.setattr("calibray.engines.cluster.dask_workers.SCHEDULER_WAIT", 0.1)
+    with pytest.raises(InputError, match=message), engines.open_workers(workers, scheduler):
         pass
 
 
-def test_an_executor_is_for_programs_only(tmp_path):
-    with ThreadPoolExecutor(1) as executor, pytest.raises(InputError, match="need engine 'command'"):
-        engines.make(programs.study(tmp_path), "replay", executor=executor)
+def test_retrace_takes_no_workers(tmp_path):
+    with (
+        engines.open_workers(1) as workers,
+        pytest.raises(InputError, match="need engine 'command' or 'replay'"),
+    ):
+        engines.make(programs.study(tmp_path), "retrace", workers=workers)
 
 
 def test_a_study_without_a_program_is_refused(tmp_path):
     content = programs.content(tmp_path)
     with pytest.raises(InputError, match="'command' needs command, the program"):
         Study.from_content(content | {"engine": {"name": "command"}})
-    with pytest.raises(InputError, match="must name the program"):
+    with pytest.raises(InputError, match="must not be empty"):
         Study.from_content(content | {"engine": {"command": []}})
     replay = Study.from_content(content | {"engine": {"name": "replay"}}, tmp_path / "study.toml")
     with pytest.raises(InputError, match="needs command, the program"):

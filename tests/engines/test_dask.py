@@ -18,7 +18,7 @@ import planted
 import programs
 import two_ray
 from calibray import calibrate, coverage_map, engines
-from calibray.engines.cluster.partition import of_blocks
+from calibray.engines.cluster.chunks import for_each_chunk
 from calibray.errors import InputError
 from calibray.measurements import Measurements, links_from_frame
 from calibray.study import Setup
@@ -46,9 +46,9 @@ def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
         victim = next(iter(client.run(os.getpid).values()))
     killer = threading.Thread(target=kill_one)
     candidates = np.random.default_rng(0).uniform(1.5, 12.0, (12, 3))
-    with engines.open_executor(scheduler=cluster.scheduler_address) as executor:
+    with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
         study = programs.study(tmp_path, "import time; time.sleep(0.2)")
-        engine = engines.make(study, ledger=tmp_path / "ledger.sqlite", executor=executor)
+        engine = engines.make(study, ledger=tmp_path / "ledger.sqlite", workers=workers)
         killer.start()
         loss = engine.path_loss(candidates)
     killer.join()
@@ -63,7 +63,7 @@ def test_a_worker_that_is_killed_costs_no_call(tmp_path, cluster):
 
 def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_path, cluster):
     few = {"method": {"name": "least-squares", "options": {"starts": 4}}, "offset": {"bounds": [-5.0, 5.0]}}
-    parted = {**few, "engine": {"name": "replay", "block_links": 15}}
+    parted = {**few, "engine": {"name": "replay", "chunk_links": 15}}
     killed: list[int] = []
 
     def kill_one(stage: str, done: int, total: int | None) -> None:
@@ -73,8 +73,8 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
             os.kill(killed[0], signal.SIGKILL)
 
     setup = Setup.open(two_ray.study(tmp_path, noise_db=1.0, **parted), two_ray.TwoRay)
-    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
-        found = calibrate(setup, executor=crew, progress=kill_one)
+    with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
+        found = calibrate(setup, executor=workers, progress=kill_one)
     assert killed
     # No block twice: those of the dead worker came from the cache.
     assert sorted((tmp_path / two_ray.TRACED).read_text().split()) == ["15", "15"]
@@ -86,11 +86,11 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
 
 
 def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster):
-    result = calibrate(two_ray.study(tmp_path, engine={"name": "replay", "block_links": 10}))
+    result = calibrate(two_ray.study(tmp_path, engine={"name": "replay", "chunk_links": 10}))
     where = {"tx": (0.0, 0.0, 10.0), "bounds": (20.0, -10.0, 80.0, 10.0), "cell": 5.0}
     alone = coverage_map(result, **where)
-    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
-        together = coverage_map(result, **where, crew=crew)
+    with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
+        together = coverage_map(result, **where, crew=workers)
     assert alone.path_loss_db.shape == (4, 12)
     assert np.isfinite(alone.path_loss_db).all()
     for name, values in alone.layers.items():
@@ -111,9 +111,9 @@ def doubled(folder: Path, links: Measurements) -> tuple[int, list[float]]:
 def test_a_block_that_is_killed_is_done_again_and_what_is_shared_is_sent(tmp_path, cluster):
     table = pd.DataFrame(np.zeros((12, 6)), columns=two_ray.COLUMNS).assign(rx_x=np.arange(1.0, 13.0))
     done: list[int] = []
-    with engines.open_crew(scheduler=cluster.scheduler_address) as crew:
-        found = of_blocks(
-            crew,
+    with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
+        found = for_each_chunk(
+            workers,
             doubled,
             tmp_path,
             links_from_frame(table),
@@ -130,9 +130,9 @@ def test_a_block_that_is_killed_is_done_again_and_what_is_shared_is_sent(tmp_pat
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setattr("calibray.engines.cluster.executors.PATIENCE", 0.5)
+    monkeypatch.setattr("calibray.engines.cluster.dask_workers.SCHEDULER_WAIT", 0.5)
     with (
         pytest.raises(InputError, match="no Dask scheduler answers there"),
-        engines.open_executor(scheduler="tcp://127.0.0.1:9"),
+        engines.open_workers(scheduler="tcp://127.0.0.1:9"),
     ):
         pass

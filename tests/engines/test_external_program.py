@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -19,9 +20,10 @@ import pytest
 import programs
 from calibray import engines
 from calibray.engines.external import program as external_program
-from calibray.engines.external.exchange import RESPONSE_BYTES, Request, Surroundings, Unusable, read_answer
+from calibray.engines.external.exchange import RESPONSE_BYTES, Request, Unusable, read_answer
 from calibray.engines.external.program import OWNER_FILE, PREFIX, ExternalProgram, Stopped
-from calibray.engines.ledger.owner import Owner
+from calibray.engines.process_owner import ProcessOwner
+from calibray.engines.section import RadioSettings
 from calibray.errors import EngineError, InputError
 from calibray.tracing.settings import Antenna
 
@@ -32,9 +34,8 @@ ANSWER = """echo '{"path_loss_db": [70, 80]}' > "$2";"""
 def request() -> Request:
     """What a program is asked about two links."""
     places = np.zeros((2, 3))
-    return Request(
-        Surroundings(3.5e9, None, "power", (Antenna(), Antenna()), places, places + 5), {}, {"a": 1.0}
-    )
+    radio = RadioSettings(3.5e9, None, "power", (Antenna(), Antenna()))
+    return Request(radio, places, places + 5, parameters={"a": 1.0})
 
 
 def shell(folder: Path, script: str, timeout: float = 20.0, retries: int = 0) -> ExternalProgram:
@@ -49,7 +50,7 @@ def temporary(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.setattr("tempfile.tempdir", None)
-    external_program._sweep.cache_clear()
+    external_program._remove_abandoned.cache_clear()
     return folder
 
 
@@ -88,7 +89,7 @@ echo first >&2; head -c 300000000 /dev/zero | tr '\\0' x >&2; echo last >&2
 grep VmHWM /proc/$PPID/status > peak; du -sk "$(dirname $1)" | cut -f1 > disk; exit 3
 """
     failure = shell(tmp_path, script).run(request()).failure
-    assert failure.startswith("ended with exit status 3; it said:\nfirst\nxxx")
+    assert failure.startswith("ended with exit status 3; its output:\nfirst\nxxx")
     assert failure.endswith("xxxlast")
     assert "bytes left out" in failure
     assert len(failure) < 2500
@@ -100,7 +101,7 @@ grep VmHWM /proc/$PPID/status > peak; du -sk "$(dirname $1)" | cut -f1 > disk; e
 def test_control_characters_do_not_reach_the_terminal(tmp_path):
     failure = shell(tmp_path, r"printf 'a\033[2Jb\000c\377' >&2; exit 1").run(request()).failure
     assert failure.isprintable() or set(filter(lambda letter: not letter.isprintable(), failure)) == {"\n"}
-    assert "it said:\na\ufffd[2Jb\ufffdc\ufffd" in failure
+    assert "its output:\na\ufffd[2Jb\ufffdc\ufffd" in failure
 
 
 @LINUX
@@ -140,7 +141,7 @@ for line in sys.stdin:
 @LINUX
 def test_when_calibray_is_killed_its_programs_and_folders_go_too(tmp_path, temporary):
     seconds = a_time()
-    command = [sys.executable, "-c", CALIBRAY, str(Path(__file__).parents[1]), str(tmp_path), seconds]
+    command = [sys.executable, "-c", CALIBRAY, str(Path(__file__).parent), str(tmp_path), seconds]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(command, text=True, **pipes) as runner:
         for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT):
@@ -167,7 +168,7 @@ def test_a_call_that_is_stopped_is_no_failure_of_the_program(tmp_path):
 def test_real_time_signals_have_names(tmp_path):
     number = signal.SIGRTMIN + 1
     failure = shell(tmp_path, f"kill -{int(number)} $$").run(request()).failure
-    assert failure == "ended with signal SIGRTMIN+1; it said nothing"
+    assert failure == "ended with signal SIGRTMIN+1; it gave no output"
     assert "signal SIGKILL" in shell(tmp_path, "kill -9 $$").run(request()).failure
 
 
@@ -177,7 +178,7 @@ def test_a_program_is_told_apart_from_its_absence(tmp_path):
     away = ExternalProgram(("true",), tmp_path / "no-such-folder", 5.0, 3, "json")
     assert away.run(request()).failure == "cannot be started (No such file or directory)"
     with pytest.raises(
-        InputError, match=r"engine.command\[1\] = 'a\\x00b': holds a NUL character.*remove it"
+        InputError, match=r"engine.command\[1\] = 'a\\x00b': contains a NUL character.*remove it"
     ):
         ExternalProgram(("true", "a\0b"), tmp_path, 5.0, 0, "json")
 
@@ -185,10 +186,10 @@ def test_a_program_is_told_apart_from_its_absence(tmp_path):
 @pytest.mark.parametrize(
     ("script", "message"),
     [
-        ('mkfifo "$2"', "is no file but a folder, a FIFO or a device"),
-        ('mkdir "$2"', "is no file but a folder, a FIFO or a device"),
-        ('ln -s /dev/zero "$2"', "must be a file, and no link to one"),
-        ('echo \'{"path_loss_db": [70, 80]}\' > elsewhere; ln -s "$PWD/elsewhere" "$2"', "no link to one"),
+        ('mkfifo "$2"', "is not a file but a folder, a FIFO or a device"),
+        ('mkdir "$2"', "is not a file but a folder, a FIFO or a device"),
+        ('ln -s /dev/zero "$2"', "must be a file, not a link to one"),
+        ('echo \'{"path_loss_db": [70, 80]}\' > elsewhere; ln -s "$PWD/elsewhere" "$2"', "not a link to one"),
         ('truncate -s 20G "$2"', "has 21,474,836,480 bytes, must have 16,785,408 or fewer"),
         (f'{sys.executable} -c \'print("[" * 1000000)\' > "$2"', "nests lists or objects too deeply"),
     ],
@@ -227,15 +228,15 @@ def test_hdf5_responses_that_lie_elsewhere_or_unfold_to_any_size(tmp_path):
     layout[:] = h5py.VirtualSource(tmp_path / "other.h5", "path_loss_db", (2,))
     cases: list[tuple[str, Callable[[h5py.File], object]]] = [
         (
-            "by a link",
+            "to another object",
             lambda file: file.__setitem__("path_loss_db", h5py.ExternalLink("other.h5", "path_loss_db")),
         ),
-        ("by a link", lambda file: file.__setitem__("path_loss_db", h5py.SoftLink("/away"))),
+        ("to another object", lambda file: file.__setitem__("path_loss_db", h5py.SoftLink("/away"))),
         ("in other files", lambda file: file.create_virtual_dataset("path_loss_db", layout)),
         ("shape", lambda file: file.create_dataset("path_loss_db", (1 << 40,), "f8", chunks=(1024,))),
-        ("no dataset of numbers", lambda file: file.create_group("path_loss_db")),
-        ("no dataset of numbers", lambda file: file.create_dataset("path_loss_db", data=["70", "80"])),
-        ("no dataset of numbers", lambda file: file.create_dataset("path_loss_db", data=[70 + 1j, 80])),
+        ("not a dataset of numbers", lambda file: file.create_group("path_loss_db")),
+        ("not a dataset of numbers", lambda file: file.create_dataset("path_loss_db", data=["70", "80"])),
+        ("not a dataset of numbers", lambda file: file.create_dataset("path_loss_db", data=[70 + 1j, 80])),
     ]
     for message, make in cases:
         with h5py.File(path, "w") as file:
@@ -246,26 +247,27 @@ def test_hdf5_responses_that_lie_elsewhere_or_unfold_to_any_size(tmp_path):
 
 def test_folders_of_calls_that_were_killed_are_removed_at_the_next_start(tmp_path, temporary):
     gone = subprocess.Popen(["sleep", "0"])
-    here = Owner.here()
-    dead = Owner(here.host, here.boot, here.namespace, gone.pid, "1")
+    current = ProcessOwner.current()
+    dead = replace(current, pid=gone.pid)
     gone.wait()
-    rebooted = Owner(here.host, "another boot", here.namespace, os.getpid(), here.started)
-    elsewhere = Owner("another host", here.boot, here.namespace, gone.pid, "1")
-    for name, owner in {"dead": dead, "boot": rebooted, "here": here, "else": elsewhere}.items():
+    reused = replace(current, started=current.started - 60.0)  # another process had this number before
+    elsewhere = replace(dead, host="another host")
+    owners = {"dead": dead, "reused": reused, "current": current, "elsewhere": elsewhere}
+    for name, owner in owners.items():
         (temporary / f"{PREFIX}{name}").mkdir()
         (temporary / f"{PREFIX}{name}" / OWNER_FILE).write_text(json.dumps(owner.record()))
     (temporary / f"{PREFIX}nobody").mkdir()
     (temporary / "calibray-other").mkdir()
     shell(tmp_path, ANSWER).run(request())
     left = sorted(folder.name.removeprefix(PREFIX) for folder in temporary.iterdir())
-    assert left == ["calibray-other", "else", "here", "nobody"]
+    assert left == ["calibray-other", "current", "elsewhere", "nobody"]
 
 
 @pytest.mark.parametrize("workers", [None, 2])
 def test_a_full_temporary_folder_is_not_the_programs_fault(tmp_path, monkeypatch, workers):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "no-such-folder"))
-    with engines.open_executor(workers) as executor:
-        engine = engines.make(programs.study(tmp_path), ledger=tmp_path / "ledger.sqlite", executor=executor)
+    with engines.open_workers(workers) as opened:
+        engine = engines.make(programs.study(tmp_path), ledger=tmp_path / "ledger.sqlite", workers=opened)
         with pytest.raises(EngineError, match=r"no-such-folder.*make room, or name another folder.*TMPDIR"):
             engine.path_loss(np.array([[3.0, 4.0, 5.0]]))
     assert engine.calls == 0
@@ -275,8 +277,8 @@ def test_what_was_answered_before_an_interruption_is_given(tmp_path):
     """The third of three programs at once is stopped; the two that have answered are not lost."""
     before = "import time; time.sleep(60 * (values[0] == 7.5))"
     candidates = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [7.5, 1.6, 11.0], [7.5, 2.0, 2.0]])
-    with engines.open_executor(workers=3) as executor:
-        engine = engines.make(programs.study(tmp_path, before), executor=executor)
+    with engines.open_workers(3) as opened:
+        engine = engines.make(programs.study(tmp_path, before), workers=opened)
         stop, found = Event(), []
         for answer in engine.answers(candidates, stop):
             found.append(answer.index)

@@ -29,7 +29,7 @@ from calibray.engines.section import EngineSection
 
 @final
 class FreeSpaceSection(EngineSection):
-    dear: ClassVar[bool] = False
+    expensive: ClassVar[bool] = False
     external: ClassVar[bool] = True
     name: Literal["free-space"] = "free-space"
     exponent: float
@@ -37,7 +37,7 @@ class FreeSpaceSection(EngineSection):
     def answers_by(self, setup):
         return None
 
-    def open(self, setup, paths, progress, executor):
+    def open(self, setup, paths, progress, workers):
         return FreeSpace(setup, self.exponent)
 
 
@@ -133,7 +133,7 @@ def test_keys_of_another_engine_wait_until_it_is_chosen(tmp_path):
     [
         ("timeout", -5, r"engine\.timeout = -5: must be greater than 0"),
         ("retries", 1.5, r"engine\.retries = 1\.5: must be a whole number"),
-        ("command", [], r"engine\.command = \[\]: must name the program"),
+        ("command", [], r"engine\.command = \[\]: must not be empty"),
     ],
 )
 def test_keys_of_another_engine_are_checked_all_the_same(tmp_path, key, value, message):

@@ -21,24 +21,13 @@ from calibray.calibration import calibrate
 from calibray.cli.app import app
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.fingerprint import fingerprint
-from calibray.engines.ledger.entry import LedgerEntry, key
+from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
 
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [3.0, 4.0, 5.0]])
 PARAMETERS = Parameters(tuple(Parameter(name, 1.0, 12.0, 5.0) for name in planted.TRUTH))
-STUDY = """
-version = 1
-scene = {{ file = "sionna:simple_street_canyon", frequency = 3.5e9 }}
-links = {{ file = "links.csv", tx = ["tx_x", "tx_y", "tx_z"], rx = ["rx_x", "rx_y", "rx_z"], value = "path_loss_db" }}
-engine = {{ name = "command", command = {command}, retries = 0 }}
-method = {{ name = "{method}", options = {options} }}
-[parameters]
-"concrete.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
-"marble.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
-"wood.relative_permittivity" = {{ bounds = [1.5, 12.0] }}
-"""
 SGWOIM = "{ population = 6, iterations = 8, full_iterations = 3, elites = 2 }"
 
 
@@ -142,8 +131,7 @@ def test_a_batch_that_is_interrupted_keeps_what_had_arrived(ledger):
 
 WRITER = """
 import sys, numpy as np
-from calibray.engines.ledger.entry import LedgerEntry, key
-from calibray.engines.ledger.ledger import Ledger
+from calibray.engines import Ledger, LedgerEntry, key
 name, first = sys.argv[2], int(sys.argv[3])
 ledger = Ledger(sys.argv[1])
 ledger.describe("shared", "command", ["a"])
@@ -165,14 +153,6 @@ def test_two_runs_write_to_one_ledger_at_once(tmp_path):
     assert (table.a == table.link_1).all()
     assert set(table.link_2[table.a < 100]) == {3.0}
     assert set(table.link_2[table.a >= 150]) == {5.0}
-
-
-def study_file(folder, before="", method="sgwo-im", options=SGWOIM) -> Study:
-    """A study on the disk, whose program is the one of `programs`."""
-    programs.content(folder, before)
-    command = [*programs.PYTHON, "model.py"]
-    (folder / "study.toml").write_text(STUDY.format(command=command, method=method, options=options))
-    return Study.load(folder / "study.toml")
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +177,7 @@ def test_a_run_that_is_killed_and_started_again_ends_as_an_undisturbed_one(
     folders = [tmp_path / "undisturbed", tmp_path / "killed"]
     for folder in folders:
         folder.mkdir()
-        study_file(folder, "import time; time.sleep(0.02)", method, options)
+        programs.study_file(folder, "import time; time.sleep(0.02)", method, options)
     undisturbed = restarts.finish(runner, folders[0], [], workers=workers)
     moments = sorted(random.Random(1).sample(range(1, len(undisturbed.asked) - workers), 5))
     killed = restarts.finish(runner, folders[1], moments, workers=workers)
@@ -211,7 +191,7 @@ def test_a_run_that_is_killed_and_started_again_ends_as_an_undisturbed_one(
 
 
 def test_calls_are_shared_by_methods_seeds_bounds_and_measured_values(tmp_path):
-    first = study_file(tmp_path, method="random", options="{ budget = 6 }")
+    first = programs.study_file(tmp_path, method="random", options="{ budget = 6 }")
     result = calibrate(first, out=tmp_path / "out")
     assert (result.rt_calls, result.ledger_hits) == (6, 0)
     again = calibrate(first, out=tmp_path / "out")
@@ -251,7 +231,7 @@ def problem(study: Study) -> str:
     ],
 )
 def test_what_makes_another_problem(tmp_path, old, new, shared):
-    study = study_file(tmp_path, method="random", options="{ budget = 6 }")
+    study = programs.study_file(tmp_path, method="random", options="{ budget = 6 }")
     text = (tmp_path / "study.toml").read_text()
     assert old in text
     text = text.replace(old, new).replace(
@@ -263,7 +243,7 @@ def test_what_makes_another_problem(tmp_path, old, new, shared):
 
 def test_the_command_lists_exports_and_takes_out(tmp_path):
     before = "if earlier == 3: sys.exit('no luck')"
-    calibrate(study_file(tmp_path, before, "random", "{ budget = 4 }"), out=tmp_path / "out")
+    calibrate(programs.study_file(tmp_path, before, "random", "{ budget = 4 }"), out=tmp_path / "out")
     run = CliRunner().invoke(app, ["ledger", str(tmp_path / "out")])
     assert run.exit_code == 0
     lines = run.stdout.splitlines()

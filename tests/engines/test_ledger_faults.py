@@ -20,10 +20,9 @@ import programs
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.engines import Answer, Ledger, Recorded
-from calibray.engines.ledger import claims, rescue
-from calibray.engines.ledger import database as schema
-from calibray.engines.ledger.entry import LedgerEntry, key
-from calibray.engines.ledger.owner import Owner
+from calibray.engines.ledger import claims, database
+from calibray.engines.ledger.answers import LedgerEntry, RescuedAnswer, key
+from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study
@@ -31,15 +30,6 @@ from calibray.study import Study
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [7.0, 7.0, 7.0]])
 LOSSES = [[72.0, np.inf], [72.5, np.inf], [81.0, np.inf]]
 PARAMETERS = Parameters(tuple(Parameter(name, 1.0, 12.0, 5.0) for name in planted.TRUTH))
-FIRST_VERSION = """
-CREATE TABLE problems (problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE answers (
-    id INTEGER PRIMARY KEY, problem TEXT NOT NULL REFERENCES problems, candidate BLOB NOT NULL,
-    path_loss_db BLOB NOT NULL, seconds REAL NOT NULL, failure TEXT NOT NULL, time TEXT NOT NULL,
-    UNIQUE (problem, candidate));
-PRAGMA user_version = 1;
-PRAGMA journal_mode = WAL;
-"""
 
 
 class Summing:
@@ -106,6 +96,7 @@ def doubles(*values: float) -> bytes:
         (("seconds", 0.25), "another checksum"),
         (("digest", b"0" * 32), "another checksum"),
         (("digest", "text"), "another checksum"),
+        (("digest", None), "another checksum"),
     ],
 )
 def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, change, message):
@@ -114,46 +105,8 @@ def test_a_damaged_entry_is_dropped_with_a_line_and_asked_again(path, caplog, ch
     assert resumed(path) == 2  # the damaged one, and one that was never run
     (record,) = caplog.records
     assert record.message.startswith(f"{path}: call 2 is damaged ({message}")
-    assert record.message.endswith("; dropped, and run again")
+    assert record.message.endswith("; deleted, and run again")
     assert resumed(path) == 0
-
-
-@pytest.fixture
-def first_version(path):
-    """The ledger as the first version wrote it, without digests and claims."""
-    with closing(sqlite3.connect(path)) as file:
-        problems = file.execute("SELECT * FROM problems").fetchall()
-        answers = [row[:-1] for row in file.execute("SELECT * FROM answers").fetchall()]
-    path.unlink()
-    with closing(sqlite3.connect(path)) as file, file:
-        file.executescript(FIRST_VERSION)
-        file.executemany("INSERT INTO problems VALUES (?, ?, ?)", problems)
-        file.executemany("INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?, ?)", answers)
-    return path
-
-
-def test_a_ledger_of_the_first_version_answers_and_takes_more(first_version):
-    assert resumed(first_version) == 1
-    assert resumed(first_version) == 0
-    with closing(Ledger(first_version)) as ledger:
-        assert ledger.table(path_loss=True).link_1.tolist() == [72.0, 72.5, 81.0]
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ((70.0,), "8 bytes of path loss for 2 links"),
-        ((-500.0, 70.0), "path loss -500 dB"),
-        ((np.nan, 70.0), "path loss nan dB"),
-        ((70.0, -np.inf), "path loss -inf dB"),
-        ((70.0, 1e300), r"path loss 1e+300 dB"),
-    ],
-)
-def test_entries_without_a_checksum_are_held_to_length_and_range(first_version, caplog, values, message):
-    with closing(sqlite3.connect(first_version)) as file, file:
-        file.execute("UPDATE answers SET path_loss_db = ? WHERE id = 1", (doubles(*values),))
-    assert resumed(first_version) == 2
-    assert f"call 1 is damaged ({message}); dropped, and run again" in caplog.text
 
 
 def test_damaged_entries_are_left_out_of_the_table(path, caplog):
@@ -168,13 +121,13 @@ def test_damaged_entries_are_left_out_of_the_table(path, caplog):
 @pytest.mark.parametrize(
     ("script", "message"),
     [
-        ("CREATE TABLE bookmarks (url TEXT)", "database of something else, with a table 'bookmarks'"),
+        ("CREATE TABLE bookmarks (url TEXT)", "not a ledger but a database with a table 'bookmarks'"),
         (
             "CREATE TABLE answers (id, text)",
-            "its table 'answers' has the columns id, text, digest, must have",
+            "its table 'answers' has the columns id, text, must have",
         ),
         ("CREATE TABLE claims (who)", "its table 'claims' has the columns who, must have"),
-        ("PRAGMA user_version = 3", "ledger of version 3, this Calibray writes 2"),
+        ("PRAGMA user_version = 3", "ledger of version 3, this Calibray uses 2"),
     ],
 )
 def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message):
@@ -207,7 +160,7 @@ def test_malformed_pages_are_refused_with_place_and_remedy(path, seed):
 
 
 def test_a_lock_that_is_held_for_long_costs_nothing(path, monkeypatch):
-    monkeypatch.setattr(schema, "PATIENCE", 0.2)
+    monkeypatch.setattr(database, "LOCK_WAIT", 0.2)
     with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path, isolation_level=None)) as other:
         engine = Recorded(Summing(), ledger, "p", "command")
         other.execute("BEGIN IMMEDIATE")
@@ -240,14 +193,14 @@ def fill(ledger: Ledger) -> None:
 def test_an_answer_that_was_paid_for_is_kept_beside_the_ledger_and_taken_up(path, monkeypatch, caplog, fault):
     """The ledger fails after the first of three calls; what is not in it is in a file, and not run again."""
     caplog.set_level(logging.WARNING)
-    monkeypatch.setattr(schema, "PATIENCE", 0.1)
+    monkeypatch.setattr(database, "LOCK_WAIT", 0.1)
     with closing(sqlite3.connect(path, isolation_level=None)) as other, closing(Ledger(path)) as ledger:
         faults = {"lock": lambda: other.execute("BEGIN IMMEDIATE"), "full": lambda: fill(ledger)}
         engine = Recorded(
             Summing(lambda index: faults[fault]() if index == 1 else None), ledger, "r", "command"
         )
         with pytest.raises(
-            EngineError, match=r"\. 1 answer is kept in .*ledger-rescue-\w+.jsonl, and taken up when"
+            EngineError, match=r"\. 1 answer is kept in .*ledger-rescue-\w+.jsonl, and used when"
         ):
             engine.path_loss(CANDIDATES)
         assert engine.calls == 2
@@ -258,17 +211,17 @@ def test_an_answer_that_was_paid_for_is_kept_beside_the_ledger_and_taken_up(path
         again = Recorded(Summing(), ledger, "r", "command")
         assert again.path_loss(CANDIDATES).tolist() == LOSSES
     assert again.calls == 1
-    assert "1 answers taken up from" in caplog.text
+    assert "1 answers read from the rescue file" in caplog.text
     assert list(path.parent.glob("ledger-rescue-*")) == []
 
 
 def test_answers_that_arrive_while_the_ledger_fails_are_kept_too(tmp_path, monkeypatch):
     """Three programs at once; the ledger is locked when the first answers, and the others have answered by then."""
-    monkeypatch.setattr(schema, "PATIENCE", 1.5)
+    monkeypatch.setattr(database, "LOCK_WAIT", 1.5)
     out = tmp_path / "out"
-    with engines.open_executor(workers=3) as executor:
+    with engines.open_workers(3) as workers:
         study = programs.study(tmp_path, "import time; time.sleep(0.5)")
-        engine = engines.make(study, ledger=out / "ledger.sqlite", executor=executor)
+        engine = engines.make(study, ledger=out / "ledger.sqlite", workers=workers)
         with closing(sqlite3.connect(out / "ledger.sqlite", isolation_level=None)) as other:
             original = Ledger.commit
 
@@ -299,7 +252,7 @@ def test_a_folder_that_is_removed_in_mid_run_is_noticed_and_nothing_is_lost(path
     with closing(Ledger(path)) as ledger:
         engine = Recorded(Summing(remove), ledger, "p", "command")
         with pytest.raises(
-            EngineError, match=r"was removed or replaced while the run went on; 3 answers are kept in"
+            EngineError, match=r"was removed or replaced during the run; 3 answers are kept in"
         ):
             engine.path_loss(CANDIDATES)
         calls = engine.calls
@@ -314,7 +267,7 @@ def test_a_folder_that_is_removed_in_mid_run_is_noticed_and_nothing_is_lost(path
 
 def test_rescued_lines_that_were_changed_are_told_and_kept_aside(path, caplog):
     entry = LedgerEntry(np.array([81.0, np.inf]), 0.5)
-    good = rescue.Rescued.of("p", "command", PARAMETERS.names, key(CANDIDATES[2]), entry).line()
+    good = RescuedAnswer("p", "command", json.dumps(PARAMETERS.names), key(CANDIDATES[2]), entry).line()
     bad = good.replace("81.0", "82.0")
     for lines in (bad, "[" * 100_000, "{}", "null", good):
         (path.parent / f"ledger-rescue-{len(lines)}-{lines[:1] == '{'}.jsonl").write_text(lines)
@@ -366,25 +319,28 @@ def test_two_runs_at_once_pay_for_each_candidate_once(path):
     assert np.array_equal(losses["0"], losses["2"])
 
 
-HERE = Owner.here()
+CURRENT = ProcessOwner.current()
 
 
 @pytest.mark.parametrize(
     ("owner", "expires", "waits"),
     [
-        (HERE, 100.0, True),
-        (HERE, -1.0, False),  # it gave no sign of life
-        (HERE, 1e9, False),  # no clock of ours wrote that
-        (replace(HERE, started="1"), 100.0, False),  # its number belongs to another process now
-        (replace(HERE, pid=2**22 + 1), 100.0, False),
-        (replace(HERE, boot="earlier"), 100.0, False),
-        (replace(HERE, namespace="a container"), 100.0, True),
-        (replace(HERE, host="elsewhere", pid=2**22 + 1), 100.0, True),
+        (CURRENT, 100.0, True),
+        (CURRENT, -1.0, False),  # it gave no sign of life
+        (CURRENT, 1e9, False),  # no clock of ours wrote that
+        (
+            replace(CURRENT, started=CURRENT.started - 60.0),
+            100.0,
+            False,
+        ),  # its number belongs to another process now
+        (replace(CURRENT, pid=2**22 + 1), 100.0, False),
+        (replace(CURRENT, namespace="a container"), 100.0, True),
+        (replace(CURRENT, host="elsewhere", pid=2**22 + 1), 100.0, True),
         (None, 100.0, False),
     ],
 )
 def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, owner, expires, waits):
-    monkeypatch.setattr(claims, "_at_work", {"another run"})
+    monkeypatch.setattr(claims, "_active_runs", {"another run"})
     text = "no owner" if owner is None else json.dumps(owner.record())
     with closing(Ledger(path)) as ledger:
         with closing(sqlite3.connect(path)) as file, file:
@@ -395,7 +351,7 @@ def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, ow
 
 
 def test_a_sign_of_life_renews_a_claim_and_the_end_of_work_gives_it_up(path, monkeypatch):
-    monkeypatch.setattr(claims, "BEAT", 0.01)
+    monkeypatch.setattr(claims, "RENEWAL", 0.01)
     with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path)) as file:
         ledger.claim("p", [key(CANDIDATES[2])], 2)
         (before,) = file.execute("SELECT expires FROM claims").fetchone()

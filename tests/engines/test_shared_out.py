@@ -18,9 +18,8 @@ import two_ray
 from calibray import Paths
 from calibray.calibration import calibrate
 from calibray.cli.app import app
-from calibray.engines.cluster.partition import cut
-from calibray.engines.cluster.traced_blocks import traced_in_blocks
-from calibray.engines.cluster.workers import Here
+from calibray.engines.cluster.chunks import cut, trace_in_chunks
+from calibray.engines.cluster.workers import InProcess
 from calibray.errors import InputError
 from calibray.measurements import Measurements, PiecedTable, links_from_frame
 from calibray.prediction import batches as shared_out
@@ -32,7 +31,7 @@ from calibray.validation.validate import validate
 
 OPTIONS = {"starts": 4}
 SECTIONS = {"method": {"name": "least-squares", "options": OPTIONS}, "offset": {"bounds": [-5.0, 5.0]}}
-PARTED = {**SECTIONS, "engine": {"name": "replay", "block_links": 7}}
+PARTED = {**SECTIONS, "engine": {"name": "replay", "chunk_links": 7}}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,9 @@ def test_predictions_in_blocks_are_those_of_one_piece(found, level):
     setup = Setup.open(found.study, two_ray.TwoRay, links_from_frame(new_links()))
     told: list[tuple[str, int, int | None]] = []
     whole = predicted(found, setup, level, remarked=True)
-    parts = predicted(found, setup, level, lambda *each: told.append(each), Here(at_most=1), remarked=True)
+    parts = predicted(
+        found, setup, level, lambda *each: told.append(each), InProcess(at_most=1), remarked=True
+    )
     assert any(np.diff(np.concatenate(cut(setup.links, 7))) < 0)
     assert list(parts) == list(whole)
     numbers = [name for name in whole if name.endswith("_db")]
@@ -78,7 +79,7 @@ def test_predictions_in_blocks_are_those_of_one_piece(found, level):
 def test_a_trace_in_blocks_is_that_of_one_piece(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     setup = Setup.open(two_ray.study(tmp_path, **PARTED), two_ray.TwoRay, links_from_frame(new_links()))
-    parts, unchecked = traced_in_blocks(setup, Here())
+    parts, unchecked = trace_in_chunks(setup, InProcess())
     assert (tmp_path / two_ray.TRACED).read_text().split() == ["7", "7", "7", "7", "6", "6"]
     whole = setup.tracer.trace(setup.links)
     for each in fields(Paths):
@@ -98,7 +99,7 @@ def test_rounds_of_the_worst_block_are_told(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Setup, "trace", rounds)
     distance = setup.links.distance
-    paths, _ = traced_in_blocks(setup, Here())
+    paths, _ = trace_in_chunks(setup, InProcess())
     nearest = max(distance[block].max() for block in cut(setup.links, 7))
     assert paths.settings["rays"] == int(nearest)
     assert paths.settings["last_round_db"] == max(1 / distance[block].max() for block in cut(setup.links, 7))
@@ -110,7 +111,7 @@ def test_a_validation_in_blocks_is_that_of_one_piece(tmp_path, monkeypatch):
     whole = validate(Setup.open(study, two_ray.TwoRay), blocks=2)
     (tmp_path / two_ray.TRACED).unlink()
     parted = two_ray.study(tmp_path, noise_db=1.0, **PARTED)
-    found = validate(Setup.open(parted, two_ray.TwoRay), blocks=2, crew=Here())
+    found = validate(Setup.open(parted, two_ray.TwoRay), blocks=2, crew=InProcess())
     assert len((tmp_path / two_ray.TRACED).read_text().split()) == 5
     assert set(found.errors) == set(whole.errors)
     for name, errors in whole.errors.items():
@@ -125,7 +126,7 @@ version = 1
 scene = {{ file = "sionna:simple_street_canyon", frequency = 3.5e9 }}
 links = {{ file = "links.csv", tx = {list(planted.COLUMNS[:3])}, rx = {list(planted.COLUMNS[3:])}, value = "loss" }}
 trace = {{ max_depth = 1, samples = 5_000, line_of_sight = true }}
-engine = {{ name = "replay", block_links = 6 }}
+engine = {{ name = "replay", chunk_links = 6 }}
 parameters = {{ "concrete.relative_permittivity" = {{ bounds = [1.5, 12.0] }} }}
 """
     )

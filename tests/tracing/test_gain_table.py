@@ -12,8 +12,7 @@ import pytest
 from sionna.rt import antenna_pattern
 
 import calibray as cb
-from calibray.engines.external.exchange import Request, Surroundings
-from calibray.engines.fingerprint import fingerprint
+from calibray.engines import RadioSettings, Request, fingerprint
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.scenes import read_scene
@@ -278,8 +277,8 @@ def test_file_lies_beside_the_study_and_counts_by_what_it_holds(study: Study, tm
 
 def test_program_is_told_where_the_file_lies(study: Study, tmp_path: Path) -> None:
     links = study.measurements()
-    around = Surroundings(FREQUENCY, None, "power", study.antenna_pair, links.tx, links.rx)
-    Request(around, {}, {}).write(tmp_path / "request.json", "json")
+    radio = RadioSettings(FREQUENCY, None, "power", study.antenna_pair)
+    Request(radio, links.tx, links.rx).write(tmp_path / "request.json", "json")
     assert f'"pattern": "{tmp_path / "horn.csv"}"' in (tmp_path / "request.json").read_text()
 
 

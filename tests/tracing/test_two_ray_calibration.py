@@ -35,7 +35,7 @@ def test_a_study_is_calibrated_with_another_tracer(study: Study, engine: str) ->
 
 
 def test_a_setup_opens_the_tracer_it_is_given(study: Study) -> None:
-    from calibray.study.setup import Setup
+    from calibray.study import Setup
 
     setup = Setup.open(study, tracer=TwoRay)
     assert setup.study is study

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Final
 
 from calibray import engines
 from calibray.calibration.outcome import outcome
-from calibray.engines.cluster.workers import Crew
+from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
 from calibray.fitting.cheap_replay import aid
@@ -45,7 +44,7 @@ def calibrate(
     out: str | Path | None = None,
     *,
     engine: Engine | None = None,
-    executor: Executor | Crew | None = None,
+    executor: Workers | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
     overwrite: bool = False,
@@ -60,8 +59,8 @@ def calibrate(
         out: Folder to save the result in; checked before anything is computed. The ledger of RT calls lies there,
             and a run that was killed repeats none of them when it is started again.
         engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
-        executor: What runs the calls of a batch on the engine "command" (`engines.open_executor`); where blocks of
-            links live on the engine "replay" (`engines.open_crew`).
+        executor: Run the calls of a batch on the engine "command", or keep chunks of links on "replay"
+            (`engines.open_workers`).
         progress: Called as the work goes on.
         overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.

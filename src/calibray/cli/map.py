@@ -74,7 +74,7 @@ def map(
     with progress_bars(log()) as progress:
         import numpy as np
 
-        from calibray.engines import open_crew
+        from calibray.engines import open_workers
         from calibray.prediction.coverage_map import coverage_map
         from calibray.report.map_files import FILES, save_map
         from calibray.result import Result
@@ -84,7 +84,7 @@ def map(
         inputs = result.study.files()
         # Before anything is traced.
         check_outputs(target, FILES, inputs, overwrite)
-        with open_crew(workers, scheduler) as crew:
+        with open_workers(workers, scheduler) as crew:
             coverage = coverage_map(
                 result,
                 tx,

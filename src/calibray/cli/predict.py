@@ -68,7 +68,7 @@ def predict(
         import numpy as np
         import pandas as pd
 
-        from calibray.engines import open_crew
+        from calibray.engines import open_workers
         from calibray.measurements import PiecedTable
         from calibray.prediction.batches import predicted_in_pieces
         from calibray.prediction.predict import as_links
@@ -86,7 +86,7 @@ def predict(
             check_table(out, [links_file, *study.files()], overwrite)
         odd: dict[str, array[int]] = {}
         with (
-            open_crew(workers, scheduler) as crew,
+            open_workers(workers, scheduler) as crew,
             _printed() if out is None else growing_table(out) as append,
         ):
             for links, told in predicted_in_pieces(result, table, level, progress, crew, anyway=anyway):

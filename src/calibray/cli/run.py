@@ -56,7 +56,7 @@ def run(
         with progress_bars(log()) as progress:
             from calibray.calibration import calibrate
             from calibray.cli.link_warnings import warn
-            from calibray.engines import open_crew, open_executor
+            from calibray.engines import open_workers
             from calibray.fitting.methods import check_method
             from calibray.result import FILES, tables
             from calibray.study import Study
@@ -68,8 +68,7 @@ def run(
             check_outputs(out, FILES, study.files(), overwrite)
             setup = study.opened()
             warn(study, setup.links)
-            opened = open_crew if study.engine.parted else open_executor
-            with opened(workers, scheduler) as executor:
+            with open_workers(workers, scheduler) as executor:
                 result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
         typer.echo(_kept(out), err=True)

@@ -38,9 +38,9 @@ def trace(
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.engines import open_crew
-        from calibray.engines.cluster.traced_blocks import given_size, traced_in_blocks
-        from calibray.engines.cluster.workers import Here
+        from calibray.engines import open_workers
+        from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks
+        from calibray.engines.cluster.workers import InProcess
         from calibray.report import trace_tables as report
         from calibray.study import Study
         from calibray.support.output_files import check_file
@@ -52,11 +52,11 @@ def trace(
             check_file(out, study.files(), overwrite)
         setup = study.opened()
         links, again = setup.links, check and not study.trace.adaptive
-        with open_crew(workers, scheduler) as crew:
-            if crew is None and given_size(setup) is None:
+        with open_workers(workers, scheduler) as opened:
+            if opened is None and stated_chunk_size(setup) is None:
                 paths, found = _traced(setup, out, again, progress)
             else:
-                paths, found = traced_in_blocks(setup, crew or Here(), check=again, progress=progress)
+                paths, found = trace_in_chunks(setup, opened or InProcess(), check=again, progress=progress)
                 if out is not None:
                     paths.save(out)
     typer.echo(render(report.found(paths, links.row, setup.enclosed)))

@@ -46,7 +46,7 @@ def validate(
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.engines import open_crew
+        from calibray.engines import open_workers
         from calibray.result.validation import FILE, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
@@ -56,7 +56,7 @@ def validate(
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (FILE,), study.files(), overwrite)
-        with open_crew(workers, scheduler) as crew:
+        with open_workers(workers, scheduler) as crew:
             found = judge(study, blocks=blocks, by=by, crew=crew, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
     if out is not None:

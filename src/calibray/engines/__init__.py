@@ -1,14 +1,14 @@
 """Engines: what turns candidates into path loss.
 
-- `Replay` evaluates stored paths: microseconds a candidate, with derivatives; `ReplayCarriers` at several carriers.
-- `Blocks` replays links in blocks, which live here or on the workers of a cluster; only sums come back.
-- `Retrace` runs the ray tracer anew for every candidate: the cost model of the paper, and replay's rival.
-- `Command` asks any external program.
-- `Recorded` puts a `Ledger` before one of the latter two, so that no RT call is paid for twice.
+- `Replay` evaluates stored paths, with derivatives, in microseconds per candidate.
+- `ReplayCarriers` does so at several carriers.
+- `ChunkedReplay` replays chunks of links in this process or on workers; only sums come back.
+- `Retrace` runs the ray tracer again for every candidate, as the paper does.
+- `Command` calls an external program.
+- `Recorded` puts a `Ledger` in front of the latter two, so that no RT call is paid for twice.
 
-A run of one candidate over all links is an RT call. It is counted here, where the engine runs. What a study may say
-of an engine stands in `engines.kinds`, light enough to be read with the study; the engines themselves are loaded when
-they are used.
+A run of one candidate over all links is an RT call. It is counted here, where the engine runs. `engines.kinds` states
+what a study file may say about engines and is imported with the study; engines themselves are loaded when used.
 """
 
 from typing import TYPE_CHECKING
@@ -16,42 +16,64 @@ from typing import TYPE_CHECKING
 from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
-    from calibray.engines.cluster.blocks import Blocks as Blocks
-    from calibray.engines.cluster.executors import open_executor as open_executor
-    from calibray.engines.cluster.workers import open_crew as open_crew
+    from calibray.engines.cluster.chunked_replay import ChunkedReplay as ChunkedReplay
+    from calibray.engines.cluster.workers import InProcess as InProcess
+    from calibray.engines.cluster.workers import Workers as Workers
+    from calibray.engines.cluster.workers import open_workers as open_workers
+    from calibray.engines.compression import compress as compress
     from calibray.engines.external.command import Command as Command
+    from calibray.engines.external.exchange import Request as Request
+    from calibray.engines.fingerprint import fingerprint as fingerprint
+    from calibray.engines.ledger.answers import LedgerEntry as LedgerEntry
+    from calibray.engines.ledger.answers import key as key
     from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
     from calibray.engines.ledger.ledger import Ledger as Ledger
     from calibray.engines.ledger.ledger import open_ledger as open_ledger
     from calibray.engines.ledger.recorded import Recorded as Recorded
     from calibray.engines.make_engine import make as make
     from calibray.engines.multi_carrier import ReplayCarriers as ReplayCarriers
+    from calibray.engines.observable import PATH_LOSS as PATH_LOSS
+    from calibray.engines.observable import Observable as Observable
     from calibray.engines.protocol import Answer as Answer
     from calibray.engines.protocol import Answering as Answering
+    from calibray.engines.protocol import Chunked as Chunked
     from calibray.engines.protocol import Differentiable as Differentiable
     from calibray.engines.protocol import Engine as Engine
     from calibray.engines.protocol import check_candidates as check_candidates
     from calibray.engines.replay import Replay as Replay
     from calibray.engines.retrace import Retrace as Retrace
+    from calibray.engines.section import OpenedStudy as OpenedStudy
+    from calibray.engines.section import RadioSettings as RadioSettings
 
 _HOMES = {
-    "LEDGER_FILE": "calibray.engines.ledger.ledger",
     "Answer": "calibray.engines.protocol",
     "Answering": "calibray.engines.protocol",
+    "Chunked": "calibray.engines.protocol",
+    "ChunkedReplay": "calibray.engines.cluster.chunked_replay",
     "Command": "calibray.engines.external.command",
     "Differentiable": "calibray.engines.protocol",
     "Engine": "calibray.engines.protocol",
+    "InProcess": "calibray.engines.cluster.workers",
+    "LEDGER_FILE": "calibray.engines.ledger.ledger",
     "Ledger": "calibray.engines.ledger.ledger",
+    "LedgerEntry": "calibray.engines.ledger.answers",
+    "Observable": "calibray.engines.observable",
+    "OpenedStudy": "calibray.engines.section",
+    "PATH_LOSS": "calibray.engines.observable",
+    "RadioSettings": "calibray.engines.section",
     "Recorded": "calibray.engines.ledger.recorded",
     "Replay": "calibray.engines.replay",
-    "Blocks": "calibray.engines.cluster.blocks",
     "ReplayCarriers": "calibray.engines.multi_carrier",
+    "Request": "calibray.engines.external.exchange",
     "Retrace": "calibray.engines.retrace",
+    "Workers": "calibray.engines.cluster.workers",
     "check_candidates": "calibray.engines.protocol",
+    "compress": "calibray.engines.compression",
+    "fingerprint": "calibray.engines.fingerprint",
+    "key": "calibray.engines.ledger.answers",
     "make": "calibray.engines.make_engine",
-    "open_crew": "calibray.engines.cluster.workers",
-    "open_executor": "calibray.engines.cluster.executors",
     "open_ledger": "calibray.engines.ledger.ledger",
+    "open_workers": "calibray.engines.cluster.workers",
 }
 
 __all__ = sorted(_HOMES)

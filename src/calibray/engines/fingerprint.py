@@ -1,4 +1,4 @@
-"""What an engine's answers depend on besides the candidate, as a fingerprint."""
+"""Fingerprint of everything that an engine's answers depend on besides the candidate."""
 
 from __future__ import annotations
 
@@ -6,55 +6,54 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
+from calibray.engines.section import OpenedStudy
 from calibray.materials import Material
 from calibray.scenes import Scene
 from calibray.tracing.cache import mesh_files
 
-if TYPE_CHECKING:
-    from calibray.study.setup import Setup
 
+def fingerprint(study: OpenedStudy) -> str:
+    """Fingerprint of the problem that an engine solves for each candidate.
 
-def fingerprint(setup: Setup) -> str:
-    """The problem that an engine solves for each candidate.
-
-    Method and seed do not count, nor do measured values, bounds and starts: calls are shared by all that vary them.
-    For re-tracing the versions of the tracer count; a program's own version cannot be known, its words count.
+    Method, seed, measured values, bounds and start values do not count: studies that differ only in these share their
+    calls. Re-tracing counts the tracer's versions. An external program's version is unknown, so its command line
+    counts.
 
     Args:
-        setup: The opened study; its engine counts.
+        study: The opened study, with its engine.
 
     Returns:
         SHA-256 in hexadecimal.
     """
-    study, scene, links, parameters = setup.study, setup.scene, setup.links, setup.parameters
+    links, parameters, radio = study.links, study.parameters, study.radio
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
     record = {
         "engine": study.engine.name,
-        "made by": study.engine.answers_by(setup),
-        "frequency": study.scene.frequency,
-        "bandwidth": study.scene.bandwidth,
-        "combining": study.objective.combining,
-        "antennas": [antenna.record() for antenna in study.antenna_pair],
-        "trace": study.trace.record(),
+        "made by": study.engine.answers_by(study),
+        "frequency": radio.frequency,
+        "bandwidth": radio.bandwidth,
+        "combining": radio.combining,
+        "antennas": [antenna.record() for antenna in radio.antennas],
+        "trace": study.trace_settings.record(),
         "parameters": list(parameters.names),
-        "materials": _fixed(scene.materials, free),
-        "objects": [asdict(entry) for entry in scene.objects],
+        "materials": _fixed_constants(study.scene.materials, free),
+        "objects": [asdict(entry) for entry in study.scene.objects],
     }
     if law := parameters.law_coefficients(parameters.start):
         record["law"] = {
             name: {key: value for key, value in entry.items() if f"{name}.{key}" not in parameters.names}
             for name, entry in law.items()
         }
-    if setup.carriers:
+    if study.carriers:
         record["carriers"] = {
-            str(each): _fixed(materials, free) for each, materials in setup.carriers.items()
+            str(frequency): _fixed_constants(materials, free)
+            for frequency, materials in study.carriers.items()
         }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
-    digest.update(_geometry(scene))
-    for mesh in mesh_files(scene):
+    digest.update(_geometry(study.scene))
+    for mesh in mesh_files(study.scene):
         digest.update(mesh.read_bytes())
     for positions in (links.tx, links.rx):
         digest.update(positions.astype("<f8").tobytes())
@@ -63,8 +62,8 @@ def fingerprint(setup: Setup) -> str:
     return digest.hexdigest()
 
 
-def _fixed(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
-    """The constants of materials that no parameter acts on."""
+def _fixed_constants(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[str, object]]:
+    """The constants of all materials that are not calibrated."""
     return {
         name: {
             constant: value
@@ -76,7 +75,7 @@ def _fixed(materials: Mapping[str, Material], free: set[str]) -> dict[str, dict[
 
 
 def _geometry(scene: Scene) -> bytes:
-    """The scene without its materials' constants, of which free parameters must not count."""
+    """The scene's XML without material constants: some of them are calibrated, and must not count."""
     root = ElementTree.fromstring(scene.xml)
     for constants in root.findall("bsdf"):
         root.remove(constants)

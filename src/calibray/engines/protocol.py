@@ -1,4 +1,4 @@
-"""What every engine offers, what no engine accepts, and answers as they arrive."""
+"""The interfaces of engines, the answers of expensive ones, and the check of candidates."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from calibray.support.progress import Progress
 
 @runtime_checkable
 class Engine(Protocol):
-    """What a calibration runs on."""
+    """What turns candidates into path loss."""
 
     @property
     def calls(self) -> int:
-        """RT calls so far: candidates that the engine has run over all links."""
+        """Number of RT calls so far: candidates that the engine has run over all links."""
         ...
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters that a candidate's components stand for."""
+        """The parameters that a candidate gives values to."""
         ...
 
     @property
@@ -46,12 +46,12 @@ class Differentiable(Engine, Protocol):
 
     @property
     def large(self) -> bool:
-        """Whether a candidate costs milliseconds rather than microseconds."""
+        """Whether a candidate takes milliseconds rather than microseconds."""
         ...
 
     @property
     def interactions(self) -> int:
-        """Interactions that a candidate is evaluated at."""
+        """Number of interactions that are evaluated for a candidate."""
         ...
 
     def path_loss_and_jacobian(
@@ -62,38 +62,38 @@ class Differentiable(Engine, Protocol):
 
 
 Reduction = Callable[[NDArray[np.float64], NDArray[np.float64] | None], Any]
-"""Path loss [n, l] of a block's links and its derivatives [n, l, d], if asked for, to what is wanted of them."""
+"""Reduces the path loss of a chunk's links [n, l], [dB], and its derivatives [n, l, d] or None, to a few sums."""
 
 Reduced = Callable[[NDArray[np.float64], bool], list[Any]]
-"""Candidates [n, d], and whether derivatives are taken, to what the reduction of every block gave."""
+"""From candidates [n, d] and whether derivatives are wanted to the result of the reduction for every chunk."""
 
 
 @runtime_checkable
-class Parted(Differentiable, Protocol):
-    """An engine whose links are parted into blocks, which may live on other machines."""
+class Chunked(Differentiable, Protocol):
+    """An engine whose links are split into chunks, which may be on other machines."""
 
     @property
-    def blocks(self) -> Sequence[NDArray[np.int64]]:
-        """Links of every block; together they hold every link once."""
+    def chunks(self) -> Sequence[NDArray[np.int64]]:
+        """Indices of every chunk's links; together they hold every link once."""
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """What reduces the path loss of every block where that lives, so that only what is wanted of it comes back.
+        """A function that reduces every chunk's path loss on its worker, so that little data comes back.
 
         Args:
-            reductions: One for every block, sent there once.
+            reductions: One for every chunk, sent to its worker once.
 
         Returns:
             The function of candidates in the fields' units.
         """
         ...
 
-    def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Parted:
+    def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
         """The same engine on paths traced with other materials.
 
         Args:
             materials: Constants in place of the scene's, by material name.
-            progress: Called with the stage "tracing" whenever a block is traced.
+            progress: Called with "tracing" after every chunk.
 
         Returns:
             Another engine.
@@ -103,13 +103,13 @@ class Parted(Differentiable, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What an engine answered to one candidate.
+    """An engine's answer to one candidate.
 
     Attributes:
-        index: Place of the candidate in the batch.
+        index: Index of the candidate in the batch.
         path_loss_db: Path loss [L], [dB]; +inf where a link has no path, and for all links of a failed call.
-        seconds: Time that the engine took [s].
-        failure: What went wrong, with the place; empty if nothing did.
+        seconds: Time of the call [s].
+        failure: Error message with engine and candidate; empty if the call succeeded.
     """
 
     index: int
@@ -120,7 +120,7 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine whose calls are dear: it gives each answer of a batch as soon as it is there."""
+    """An engine with expensive calls: it gives each answer of a batch as soon as it arrives."""
 
     @property
     def num_links(self) -> int:
@@ -128,20 +128,20 @@ class Answering(Engine, Protocol):
         ...
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """The answers to candidates [n, d] in the fields' units, in the order in which they arrive.
+        """Answer candidates [n, d] in the fields' units, in any order.
 
-        Where `stop` is set from outside, no further call is begun; what was answered by then is still given.
+        Once `stop` is set from outside, no further call is begun; answers that have already arrived are still given.
         """
         ...
 
 
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
-    """The path loss of a batch from its answers, in whatever order they arrive.
+    """Collect the path loss of a batch from its answers, in any order.
 
     Args:
         answers: One answer per candidate.
         shape: Number of candidates n and of links L.
-        first: Whether this is the first batch; if all of it fails, the engine is taken to be at fault.
+        first: Whether this is the first batch. If all of it fails, the engine itself must be at fault.
 
     Returns:
         Path loss [n, L], [dB]; +inf for all links of a candidate that failed.
@@ -161,7 +161,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 
 
 def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Candidates as an array, refused if they cannot be evaluated.
+    """Convert candidates to an array, and refuse those that cannot be evaluated.
 
     Args:
         candidates: Parameter values [n, d].
@@ -171,11 +171,11 @@ def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.
         The values [n, d].
 
     Raises:
-        InputError: The shape is another, or a value is not finite.
+        InputError: The shape differs, or a value is not finite.
     """
     values = np.asarray(candidates, dtype=float)
     if values.ndim != 2 or values.shape[1] != width or not len(values):
         raise InputError(f"candidates: shape {values.shape}, must be (n, {width}) with n at least 1")
     if not np.isfinite(values).all():
-        raise InputError("candidates: hold a value that is not finite; give numbers within the bounds")
+        raise InputError("candidates: a value is not finite; give numbers within the bounds")
     return values

@@ -1,67 +1,174 @@
-"""What every kind of engine states: its section of the study file, and how it is opened."""
+"""What a kind of engine states in the study file, and what it gets to work on: an opened study."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from concurrent.futures import Executor
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
 from calibray.engines.protocol import Engine
 from calibray.support.progress import Progress
 from calibray.support.strict_models import Section
 
 if TYPE_CHECKING:
-    from calibray.engines.cluster.workers import Crew
+    from calibray.engines.cluster.workers import Workers
+    from calibray.materials import Material
+    from calibray.measurements import Measurements
+    from calibray.parameters import Parameters
     from calibray.paths import Paths
-    from calibray.study.setup import Setup
+    from calibray.scenes import Scene
+    from calibray.tracing.protocol import Tracer
+    from calibray.tracing.settings import Antenna, TraceSettings
+
+
+@dataclass(frozen=True)
+class RadioSettings:
+    """Radio settings that all links of a study share.
+
+    Attributes:
+        frequency: Carrier frequency [Hz] of links without their own.
+        bandwidth: Bandwidth [Hz], or None.
+        combining: How a link's paths combine: "power", "coherent" or "band".
+        antennas: Transmit and receive antenna.
+    """
+
+    frequency: float
+    bandwidth: float | None
+    combining: str
+    antennas: tuple[Antenna, Antenna]
+
+
+class OpenedStudy(Protocol):
+    """A study whose files have been read, as engines need it; `calibray.Setup` is one."""
+
+    @property
+    def links(self) -> Measurements:
+        """All links, held-out links included."""
+        ...
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, with the parameters' start values."""
+        ...
+
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters that a candidate gives values to."""
+        ...
+
+    @property
+    def carriers(self) -> Mapping[float, Mapping[str, Material]]:
+        """Materials before calibration by carrier [Hz]; empty if all links have the study's carrier."""
+        ...
+
+    @property
+    def radio(self) -> RadioSettings:
+        """Carrier, bandwidth, combining and antennas."""
+        ...
+
+    @property
+    def trace_settings(self) -> TraceSettings:
+        """Settings of the ray tracer."""
+        ...
+
+    @property
+    def engine(self) -> EngineSection:
+        """The section ``[engine]``."""
+        ...
+
+    @property
+    def source(self) -> Path:
+        """The study file."""
+        ...
+
+    @property
+    def tracer(self) -> Tracer:
+        """The ray tracer with the scene at the study's carrier."""
+        ...
+
+    @property
+    def tracer_versions(self) -> Mapping[str, str]:
+        """Versions of the ray tracer's parts by name."""
+        ...
+
+    def tracer_at(self, frequency: float) -> Tracer:
+        """The ray tracer with the scene at another carrier [Hz]."""
+        ...
+
+    def trace(
+        self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
+    ) -> Paths:
+        """The paths of the links, with `materials` in place of the scene's."""
+        ...
+
+    def at(self, links: Measurements) -> Self:
+        """The same study with other links."""
+        ...
+
+    def replace(self, *, engine: str | None = None) -> Self:
+        """The same study with another engine."""
+        ...
+
+
+class Openable(Protocol):
+    """A study, opened or not."""
+
+    def opened(self) -> OpenedStudy:
+        """The opened study."""
+        ...
 
 
 class EngineSection(Section, ABC):
     """``[engine]``: what turns candidates into path loss, chosen by its name.
 
-    A kind of engine is a final class in a module of its own under `engines.kinds`, where it is found. It states its
-    keys as fields, its name as a literal, and imports what is heavy when it is opened.
+    To add a kind of engine, write one final subclass in a module of its own in `engines.kinds`: it is found there. Its
+    fields are its keys in the study file, and its name is a literal. Heavy imports belong into `open`, because every
+    study file that is read imports all kinds.
 
     Attributes:
         name: The kind's name in study files.
-        dear: Whether a call costs more than looking it up, so that calls are kept in a ledger.
-        external: Whether a program outside answers, which needs no ray tracer here.
-        parted: Whether its links can be parted into blocks that live elsewhere.
+        expensive: Whether a call costs more than a look-up, so that a ledger keeps the calls.
+        external: Whether an external program answers, so that no ray tracer is needed.
+        chunked: Whether chunks of links can be traced and replayed on workers.
     """
 
     name: str
-    dear: ClassVar[bool]
+    expensive: ClassVar[bool]
     external: ClassVar[bool]
-    parted: ClassVar[bool] = False
+    chunked: ClassVar[bool] = False
 
     @abstractmethod
-    def answers_by(self, setup: Setup) -> list[str] | None:
-        """What answers besides the study itself, as words or versions, so that a ledger can tell; None for nothing.
+    def answers_by(self, study: OpenedStudy) -> list[str] | None:
+        """What the answers depend on besides the study: versions or a command line, for the ledger's fingerprint.
 
         Args:
-            setup: The opened study.
+            study: The opened study.
+
+        Returns:
+            The texts; None if answers are not kept in a ledger.
         """
 
     @abstractmethod
     def open(
         self,
-        setup: Setup,
+        study: OpenedStudy,
         paths: Paths | None,
         progress: Progress | None,
-        executor: Executor | Crew | None,
+        workers: Workers | None,
     ) -> Engine:
         """The engine over all links of a study.
 
         Args:
-            setup: The opened study.
-            paths: Paths of its links that were traced already; traced, if the kind needs any, if None.
-            progress: Called as the work goes on.
-            executor: What runs the calls of a batch, for kinds that are `external`; where blocks live, for kinds
-                that are `parted`.
+            study: The opened study.
+            paths: Paths of its links, if they are already traced.
+            progress: Called as the work proceeds.
+            workers: Run the calls of a batch if the kind is `external`; keep chunks of links if it is `chunked`.
 
         Returns:
             The engine.
 
         Raises:
-            InputError: The study does not suit the kind.
+            InputError: The study does not suit this kind of engine.
         """

@@ -214,7 +214,7 @@ def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None 
     setup = problem.setup
     section = setup.study.method
     wanted = section.name in (AUTO, *HELPED) and section.model == "replay"
-    if not wanted or not setup.study.engine.dear or problem.observable is not PATH_LOSS:
+    if not wanted or not setup.study.engine.expensive or problem.observable is not PATH_LOSS:
         return Aid()
     try:
         scene = setup if scene is None else scene

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import ReplaySection, replay
-from calibray.engines.protocol import Parted
+from calibray.engines.protocol import Chunked
 from calibray.fitting.methods import AUTO, choose
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
@@ -42,7 +42,7 @@ def settle(
     for turn in range(study.fidelity.rounds):
         materials = parameters.materials(trail.best, problem.engine.materials)
         told = with_stage(progress, "checking")
-        if isinstance(problem.engine, Parted):
+        if isinstance(problem.engine, Chunked):
             again = problem.engine.traced_with(materials, told)
         else:
             again = replay(setup, setup.trace(materials, told), section.compress_db)

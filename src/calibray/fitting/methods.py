@@ -69,7 +69,7 @@ def check_fit(setup: Setup) -> None:
             be used.
     """
     check_method(setup.study.method.name)
-    differentiable = not setup.study.engine.dear
+    differentiable = not setup.study.engine.expensive
     _make(setup.study, setup.parameters, differentiable, 1 if differentiable else None)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.observable import PATH_LOSS, Observable
-from calibray.engines.protocol import Differentiable, Engine, Parted, Reduced
+from calibray.engines.protocol import Chunked, Differentiable, Engine, Reduced
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
@@ -214,9 +214,9 @@ class Problem:
     @cached_property
     def _blocks(self) -> tuple[Reduced, list[Share]] | None:
         """What reduces path loss to sums where it arises, where links are parted into blocks."""
-        if not isinstance(self.engine, Parted) or self.observable is not PATH_LOSS:
+        if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
-        shares = self.objective.shares(self.engine.blocks)
+        shares = self.objective.shares(self.engine.chunks)
         return self.engine.reducing(shares), shares
 
     def residuals(

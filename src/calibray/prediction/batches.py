@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pandas as pd
 
-from calibray.engines.cluster.partition import BLOCK_LINKS, chosen, of_blocks
-from calibray.engines.cluster.traced_blocks import given_size
-from calibray.engines.cluster.workers import Crew, Here
+from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
+from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.position_checks import remarks
 from calibray.prediction.predict import as_links, check_groups, interval, opened
@@ -41,7 +40,7 @@ class _Shared:
     remarked: bool
 
 
-def piece_size(setup: Setup, crew: Crew | None) -> int:
+def piece_size(setup: Setup, crew: Workers | None) -> int:
     """Links to predict at once, so that memory does not grow with their number.
 
     Args:
@@ -61,7 +60,7 @@ def predicted(
     setup: Setup,
     level: float | None,
     progress: Progress | None = None,
-    crew: Crew | None = None,
+    crew: Workers | None = None,
     *,
     remarked: bool = False,
 ) -> pd.DataFrame:
@@ -84,13 +83,13 @@ def predicted(
     """
     links = setup.links
     if crew is None and len(links) > piece_size(setup, None):
-        crew = Here(at_most=0)
+        crew = InProcess(at_most=0)
     if crew is None:
         return _predicted(_Shared(result, setup, level, remarked), links, progress)
     # Neither the steps of the search nor the paths have a say in predictions.
     light = replace(result, history=result.history.iloc[:0], paths=None, scene=None)
-    shared = _Shared(light, setup.at(chosen(links, np.array([0]))), level, remarked)
-    parts = of_blocks(crew, _predicted, shared, links, _block_size(setup), progress)
+    shared = _Shared(light, setup.at(select_links(links, np.array([0]))), level, remarked)
+    parts = for_each_chunk(crew, _predicted, shared, links, _block_size(setup), progress)
     place = np.concatenate([block for block, _ in parts])
     joined = pd.concat([told for _, told in parts], ignore_index=True)
     return joined.iloc[np.argsort(place)].reset_index(drop=True)
@@ -101,7 +100,7 @@ def predicted_in_pieces(
     table: PiecedTable,
     level: float | None,
     progress: Progress | None = None,
-    crew: Crew | None = None,
+    crew: Workers | None = None,
     *,
     anyway: bool = False,
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
@@ -146,7 +145,7 @@ def predicted_in_pieces(
 
 
 def _block_size(setup: Setup) -> int:
-    return given_size(setup) or (DIFFUSE_PIECE if setup.study.trace.diffuse_reflection else BLOCK_LINKS)
+    return stated_chunk_size(setup) or (DIFFUSE_PIECE if setup.study.trace.diffuse_reflection else CHUNK_LINKS)
 
 
 def _predicted(shared: _Shared, links: Measurements, progress: Progress | None = None) -> pd.DataFrame:

@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
-from calibray.engines.cluster.workers import Crew
+from calibray.engines.cluster.workers import Workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
@@ -99,7 +99,7 @@ def coverage_map(
     samples: int | Literal["auto"] | None = None,
     columns: Mapping[str, object] | None = None,
     progress: Progress | None = None,
-    crew: Crew | None = None,
+    crew: Workers | None = None,
     anyway: bool = False,
 ) -> CoverageMap:
     """Predict path loss over an area, with the interval that a measurement there would lie in.
@@ -118,7 +118,7 @@ def coverage_map(
         columns: What the study's columns of groups, carriers or nuisances hold for this transmitter, by name. The
             group of an offset is taken from the links measured there, where these have one.
         progress: Called with the stage "tracing" after every launch.
-        crew: Where blocks of cells are traced and predicted (`engines.open_crew`); here if None.
+        crew: Where blocks of cells are traced and predicted (`engines.open_workers`); here if None.
         anyway: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:

@@ -6,14 +6,14 @@ from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray.study.model import VERSION as VERSION
-    from calibray.study.model import Study as Study
-    from calibray.study.setup import Setup as Setup
+    from calibray.study.study import Setup as Setup
+    from calibray.study.study import Study as Study
     from calibray.study.toml_file import expand as expand
 
 _HOMES = {
     "VERSION": "calibray.study.model",
-    "Setup": "calibray.study.setup",
-    "Study": "calibray.study.model",
+    "Setup": "calibray.study.study",
+    "Study": "calibray.study.study",
     "expand": "calibray.study.toml_file",
 }
 

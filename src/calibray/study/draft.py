@@ -31,7 +31,8 @@ from calibray.scenes.checks.heights import Overhead
 from calibray.scenes.scene_file import find_scene
 from calibray.study.draft_parameters import calibratable
 from calibray.study.draft_text import toml
-from calibray.study.model import BUNDLED, VERSION, Study
+from calibray.study.model import BUNDLED, VERSION
+from calibray.study.study import Study
 
 RECEIVER_HEIGHT: Final = 1.5
 TRANSMITTER_HEIGHT: Final = 10.0

@@ -1,4 +1,4 @@
-"""Keys of ``[engine]`` that are another engine's: kept for when it is chosen, and checked all the same."""
+"""Keys of ``[engine]`` that belong to another engine: checked, and kept for when that engine is chosen."""
 
 from __future__ import annotations
 
@@ -10,44 +10,45 @@ from pydantic.fields import FieldInfo
 
 from calibray.engines.kinds import DEFAULT, KINDS
 from calibray.errors import InputError
-from calibray.study.validation_errors import words
+from calibray.study.validation_errors import describe_fault
 from calibray.support.messages import shortened
 from calibray.support.strict_models import CLOSED
 
 
-def part_engine(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
-    """Part the table ``[engine]`` into the keys of the engine named there and those of others.
+def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
+    """Split the table ``[engine]`` into the keys of the engine it names and those of other engines.
 
-    A study may say how its program is called and yet run on replay: `calibray run --engine command` takes it up.
+    A study may state how its program is called and yet use replay; `calibray run --engine command` then calls it.
 
     Args:
         content: The table as the file gives it.
         source: Name of the file, for messages.
 
     Returns:
-        What is the named engine's, the name put in where it is left out, and keys that only others know.
+        The keys of the named engine, with its name, and the keys of others.
 
     Raises:
-        InputError: A value that another engine would take up is impossible for it.
+        InputError: Another engine cannot use the value of its key.
     """
-    # What is no table, or names no kind, is refused by the study itself.
+    # The study's own validation refuses a value that is not a table, or names no engine.
     name = content.get("name", DEFAULT) if isinstance(content, dict) else None
     if not isinstance(name, str) or name not in KINDS:
         return content, {}
-    own = KINDS[name].model_fields
-    known = {key: field for kind in KINDS.values() for key, field in kind.model_fields.items()}
-    others = {key: value for key, value in content.items() if key not in own and key in known}
+    fields = {key: field for kind in KINDS.values() for key, field in kind.model_fields.items()}
+    others = {
+        key: value for key, value in content.items() if key in fields and key not in KINDS[name].model_fields
+    }
     for key, value in others.items():
-        _check(f"{source}: engine.{key} = {shortened(repr(value))}", known[key], value)
+        _check(f"{source}: engine.{key} = {shortened(repr(value))}", fields[key], value)
     rest = {key: value for key, value in content.items() if key not in others}
     return {"name": DEFAULT, **rest}, others
 
 
-def _check(place: str, field: FieldInfo, value: Any) -> None:
-    # Put together at run time, which no checker of types can follow.
+def _check(prefix: str, field: FieldInfo, value: Any) -> None:
+    # The type is composed at run time, which type checkers cannot follow.
     annotated: Any = Annotated
     checker = TypeAdapter[Any](annotated[field.annotation, Field(), *field.metadata], config=CLOSED)
     try:
         checker.validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        raise InputError(f"{place}: {words(error.errors()[0])}") from None
+        raise InputError(f"{prefix}: {describe_fault(error.errors()[0])}") from None

@@ -20,7 +20,7 @@ from calibray.scenes.checks.scene_check import Finding
 from calibray.tracing.gain_table import read_gain_table
 
 if TYPE_CHECKING:
-    from calibray.study.model import Study
+    from calibray.study.study import Study
     from calibray.tracing.settings import Antenna
 
 MOST_GAIN_DB: Final = {"iso": 0.0, "dipole": 1.8, "hw_dipole": 2.2, "tr38901": 8.0}

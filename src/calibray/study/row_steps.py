@@ -1,4 +1,4 @@
-"""What a study says of its links' rows, as the steps of their preparation."""
+"""The steps by which the rows of a study's table become links."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
 from calibray.scenes.scene_file import find_scene
+from calibray.study.model import StudyModel
 
 if TYPE_CHECKING:
     from calibray.measurements import Ground, MoveOutside
-    from calibray.study.model import Study
 
-_COLUMNS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
+_COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
 """Keys of ``[links]`` that are fields of `LinkColumns`."""
 
 
-def link_columns(study: Study) -> LinkColumns:
+def link_columns(study: StudyModel) -> LinkColumns:
     """The columns of a study's table of links.
 
     Args:
         study: The study.
 
     Returns:
-        The columns, with links grouped as the offset is.
+        The columns, with the groups of the offset.
 
     Raises:
         InputError: Keys of ``[links]`` contradict each other.
     """
-    per = study.offset.per if study.offset else None
-    return LinkColumns(**study.links.model_dump(include=_COLUMNS), group=per)
+    columns = study.links.model_dump(include=_COLUMN_KEYS)
+    return LinkColumns(**columns, group=study.offset_groups or None)
 
 
-def preparation(study: Study) -> Preparation:
-    """The steps that a study names.
+def row_steps(study: StudyModel) -> Preparation:
+    """The steps that a study states.
 
     Args:
         study: The study.
@@ -45,15 +45,12 @@ def preparation(study: Study) -> Preparation:
         The steps.
 
     Raises:
-        InputError: Nothing tells where the scene lies on the globe, or the scene cannot be read.
+        InputError: The scene's place on the globe is unknown, or the scene cannot be read.
     """
-    links = study.links
+    links, track = study.links, study.links.track
     inside = None if links.inside == "keep" else links.inside
-    per = study.offset.per if study.offset else None
-    groups = [per] if isinstance(per, str) else [*(per or ())]
-    track = links.track
     return replace(
-        placing(study),
+        position_steps(study),
         track=None
         if track is None
         else Track(str(study.track_path), track.time, track.longest_gap, track.clock),
@@ -62,14 +59,14 @@ def preparation(study: Study) -> Preparation:
         noise_floor_dbm=links.noise_floor_dbm,
         censored=links.below_floor == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
-        keep=list(dict.fromkeys([*groups, *([links.frequency] if links.frequency else [])])),
+        keep=list(dict.fromkeys([*study.offset_groups, *([links.frequency] if links.frequency else [])])),
         inside=inside,
-        outside=None if inside is None else _led_outside(study),
+        outside=None if inside is None else _move_outside(study),
     )
 
 
-def placing(study: Study) -> Preparation:
-    """Of these steps those that tell where a row's antennas stand, and leave none out.
+def position_steps(study: StudyModel) -> Preparation:
+    """The steps that position a row's antennas; they leave no row out.
 
     Args:
         study: The study.
@@ -78,7 +75,7 @@ def placing(study: Study) -> Preparation:
         The steps.
 
     Raises:
-        InputError: As for `preparation`.
+        InputError: As for `row_steps`.
     """
     links, transmitters = study.links, study.transmitters_path
     return Preparation(
@@ -89,23 +86,23 @@ def placing(study: Study) -> Preparation:
     )
 
 
-# What looks into a scene's meshes takes SciPy along; only studies whose rows need that load it.
+# Code that reads a scene's meshes imports SciPy; only studies that need it load it.
 
 
-def _ground(study: Study) -> Ground:
+def _ground(study: StudyModel) -> Ground:
     from calibray.scenes.checks.heights import Overhead
 
     return Overhead.of(study.scene_source).ground
 
 
-def _led_outside(study: Study) -> MoveOutside:
+def _move_outside(study: StudyModel) -> MoveOutside:
     from calibray.scenes.authoring.outlines import led_outside, outlines
 
     return partial(led_outside, covered=outlines(study.scene_source))
 
 
-def scene_frame(study: Study) -> Frame:
-    """Where a study's scene lies on the globe: as the study says, else as the scene's file does.
+def scene_frame(study: StudyModel) -> Frame:
+    """The place of a study's scene on the globe, stated by the study or else by the scene file.
 
     Args:
         study: The study.
@@ -114,28 +111,28 @@ def scene_frame(study: Study) -> Frame:
         The frame.
 
     Raises:
-        InputError: Neither says it, or the projection is not known.
+        InputError: Neither states it, or the projection is unknown.
     """
     frame = known_frame(study)
     if frame is None:
         raise InputError(
-            f"{study.path}: links.position = 'geographic': nothing tells where the scene lies; give "
+            f"{study.path}: links.position = 'geographic': the scene's place on the globe is unknown; give "
             "scene.origin = [longitude, latitude], and scene.crs if the scene is in a map projection"
         )
     return frame
 
 
-def known_frame(study: Study) -> Frame | None:
-    """Where a study's scene lies on the globe, if anything tells.
+def known_frame(study: StudyModel) -> Frame | None:
+    """The place of a study's scene on the globe, if it is known.
 
     Args:
         study: The study.
 
     Returns:
-        The frame; None if neither the study nor the scene's file says it.
+        The frame; None if neither the study nor the scene file states it.
 
     Raises:
-        InputError: The projection is not known.
+        InputError: The projection is unknown.
     """
     origin, crs = study.scene.origin, study.scene.crs
     if crs is not None:

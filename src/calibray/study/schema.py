@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from calibray.study.model import Study
+from calibray.study.study import Study
 
 
 def schema_text() -> str:

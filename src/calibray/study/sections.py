@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -305,8 +306,25 @@ def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
     return value
 
 
+@dataclass(frozen=True)
+class NuisanceTerm:
+    """A column of the links times an unknown coefficient, for all links or one per group.
+
+    Attributes:
+        by: "constant", "log_distance" (decades of distance) or a numeric column of the links.
+        per: Columns whose joined labels are the groups; one coefficient for all links if there are none.
+        bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None.
+    """
+
+    by: str
+    per: tuple[str, ...]
+    bounds: tuple[float, float] | None
+    prior: float | None
+
+
 class OffsetSection(Section):
-    """``[offset]``: a nuisance term, one offset [dB] for all links or one per group.
+    """``[offset]``: the nuisance term "offset", one [dB] for all links or one per group.
 
     Attributes:
         per: Column of group labels, or several whose labels are joined; one offset for all links if absent.
@@ -319,6 +337,11 @@ class OffsetSection(Section):
     prior_db: Annotated[float, Field(gt=0)] | None = None
 
     _ordered = field_validator("bounds")(_ordered)
+
+    def term(self) -> NuisanceTerm:
+        """The nuisance term that this section is the short form of."""
+        per = (self.per,) if isinstance(self.per, str) else self.per or ()
+        return NuisanceTerm("constant", per, self.bounds, self.prior_db)
 
 
 class NuisanceSection(Section):
@@ -337,6 +360,10 @@ class NuisanceSection(Section):
     prior: Annotated[float, Field(gt=0)] | None = None
 
     _ordered = field_validator("bounds")(_ordered)
+
+    def term(self) -> NuisanceTerm:
+        """The nuisance term."""
+        return NuisanceTerm(self.by, () if self.per is None else (self.per,), self.bounds, self.prior)
 
 
 class NoiseSection(Section):

@@ -11,8 +11,7 @@ from calibray.materials import Material
 from calibray.measurements import Measurements
 from calibray.paths import Paths
 from calibray.scenes import Scene
-from calibray.study.model import Study
-from calibray.study.setup import Setup
+from calibray.study.study import Setup, Study
 from calibray.support.progress import Progress
 from calibray.tracing import default_tracer
 from calibray.tracing.protocol import Links

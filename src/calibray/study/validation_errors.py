@@ -32,6 +32,7 @@ _WORDS: Final[Mapping[str, str]] = {
     "string_type": "must be text in quotes",
     "string_too_short": "must not be empty",
     "tuple_type": "must be a list",
+    "too_short": "must not be empty",
     "too_long": "must have {max_length} entries, has {actual_length}",
     "model_type": "must be a table",
     "dict_type": "must be a table",
@@ -71,7 +72,7 @@ def explain(
         elif fault["type"] == "missing":
             line = f"{key}: {_WORDS['missing']}"
         else:
-            text = words(fault)
+            text = describe_fault(fault)
             # A message about a whole table names the key itself.
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
         # A value that fits none of several types has one fault per type; the first says enough.
@@ -82,7 +83,7 @@ def explain(
     return InputError("\n".join(f"{source}: {line}" for line in told))
 
 
-def words(fault: Mapping[str, Any]) -> str:
+def describe_fault(fault: Mapping[str, Any]) -> str:
     """What is wrong with a value, without the value.
 
     Args:

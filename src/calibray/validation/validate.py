@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray import engines
-from calibray.engines.cluster.workers import Crew
+from calibray.engines.cluster.workers import Workers
 from calibray.errors import EngineError, InputError
 from calibray.fitting.noise_floor import heard
 from calibray.fitting.noise_level import weighed
@@ -39,7 +39,7 @@ def validate(
     *,
     blocks: int | None = None,
     by: str | None = None,
-    crew: Crew | None = None,
+    crew: Workers | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
 ) -> Validation:
@@ -49,7 +49,7 @@ def validate(
         study: The study, opened or not; on the engine "replay".
         blocks: Number of spatial blocks, each held out in turn; the study's, or 4, if None and `by` is None.
         by: Column whose labels are held out in turn; "tx" for the place of the transmitter.
-        crew: Where blocks of links live that are traced and replayed together (`engines.open_crew`).
+        crew: Where blocks of links live that are traced and replayed together (`engines.open_workers`).
         progress: Called with the stages "tracing" and "validating".
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.
 
@@ -68,7 +68,7 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, executor=crew))))
+    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, workers=crew))))
     return validated(problem, blocks, by, progress)
 
 

@@ -1,4 +1,7 @@
-"""A share of this machine's cores for every worker process, so that their threads do not stand in each other's way."""
+"""A Dask plugin that gives every worker process its share of this machine's cores.
+
+Without it, the thread pools of Dr.Jit and XLA in every process take all cores and slow each other down.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,15 @@ from typing import Final, final
 from distributed import Worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
-_PINS: Final = hasattr(os, "sched_setaffinity")
+_CAN_PIN: Final = hasattr(os, "sched_setaffinity")
 
 
 @final
 class Cores(WorkerPlugin):
-    """Pins a worker to its share of the cores before anything is loaded that counts them.
+    """Pins a worker to its share of the cores, before any library that counts cores is loaded.
 
     Args:
-        workers: Number of workers that share the cores; each is named by its number.
+        workers: Number of workers that share the cores; Dask names each by its number.
     """
 
     name = "calibray-cores"
@@ -25,12 +28,12 @@ class Cores(WorkerPlugin):
         self.workers = workers
 
     def setup(self, worker: Worker) -> None:
-        """Pin a worker, when it starts or is told of this.
+        """Pin a worker when it starts or receives this plugin.
 
         Args:
             worker: The worker.
         """
-        if _PINS:
+        if _CAN_PIN:
             cores = sorted(os.sched_getaffinity(0))
             share = cores[int(worker.name) % self.workers :: self.workers]
             os.sched_setaffinity(0, share or cores)

@@ -1,62 +1,56 @@
-"""Command: any external program, asked for every candidate with a file and answering with one."""
+"""Command: an external program that reads a request file for every candidate and writes a response file."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from threading import Event
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.external.exchange import Request, Surroundings
-from calibray.engines.external.program import GLANCE, ExternalProgram, Outcome
+from calibray.engines.external.exchange import Request
+from calibray.engines.external.program import POLL, ExternalProgram, Outcome
 from calibray.engines.protocol import Answer, check_candidates, gather
+from calibray.engines.section import OpenedStudy
 from calibray.errors import EngineError
-from calibray.materials import Material
-from calibray.parameters import Parameters
 from calibray.support.progress import Progress
 
 
+@final
 class Command:
     """An external program, called once for every candidate.
 
-    A call that fails in all its attempts costs that candidate alone: its links count as without a path. If every
-    candidate of the first batch fails, or many fail one after the other, the program is taken to be at fault and the
-    run ends.
+    If all attempts of a call fail, only that candidate is lost: its links count as links without a path. If every
+    candidate of the first batch fails, or many successive calls fail, the run ends, because the program must be at
+    fault.
 
     Args:
         program: How the program is called.
-        surroundings: What is the same for all candidates.
-        materials: The scene's materials before calibration.
-        parameters: What the candidates' components stand for.
-        executor: What runs the calls of a batch; one after the other if None.
-        progress: Called with the stage "running" after every candidate of a batch.
-        source: The study file, for messages.
-        carriers: The scene's materials before calibration at each carrier of the links [Hz]; none where all links have
-            the study's.
-        give_up_after: Failures one after the other that end the run.
+        study: The opened study.
+        give_up_after: Number of successive failed calls that ends the run.
+        executor: Runs the calls of a batch; one call after the other if None.
+        progress: Called with "running" after every candidate of a batch.
     """
 
     def __init__(
         self,
         program: ExternalProgram,
-        surroundings: Surroundings,
-        materials: dict[str, Material],
-        parameters: Parameters,
+        study: OpenedStudy,
+        give_up_after: int,
         executor: Executor | None = None,
         progress: Progress | None = None,
-        source: str = "study",
-        carriers: Mapping[float, Mapping[str, Material]] | None = None,
-        give_up_after: int = 10,
     ) -> None:
-        self.parameters, self.materials, self.calls = parameters, dict(materials), 0
-        self.num_links = len(surroundings.tx)
-        self._program, self._surroundings = program, surroundings
-        self._executor, self._progress, self._source = executor, progress, source
-        self._carriers = carriers or {}
-        self._failed, self._give_up_after = 0, give_up_after
+        links = study.links
+        self.parameters, self.materials, self.calls = study.parameters, dict(study.scene.materials), 0
+        self.num_links = len(links)
+        self._program, self._carriers, self._source = program, study.carriers, study.source
+        self._blank_request = Request(study.radio, links.tx, links.rx, link_frequency=links.frequency)
+        self._executor, self._progress = executor, progress
+        self._successive_failures, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates, as the program answers.
@@ -68,76 +62,79 @@ class Command:
             Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
 
         Raises:
-            InputError: The candidates have another width, or a value is outside physics.
-            EngineError: Every candidate of the first batch failed, or too many did one after the other.
+            InputError: The candidates have another width, or a value is unphysical.
+            EngineError: Every candidate of the first batch failed, or too many successive calls did.
         """
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """The answers to candidates, each as soon as it is there.
+        """Answer candidates, each as soon as its call ends.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
-            stop: Set from outside to begin no further call and to kill those under way; what was answered by then is
-                still given.
+            stop: Set from outside to begin no further call and to kill the running ones; answers that have already
+                arrived are still given.
 
         Yields:
             The answers, in the order in which they arrive.
 
         Raises:
-            InputError: A value is outside physics.
-            EngineError: Too many calls failed one after the other, or the files of a call could not be written; all
-                answers were given before.
+            InputError: A value is unphysical.
+            EngineError: Too many successive calls failed, or the files of a call cannot be written. All answers were
+                given before.
         """
         stop = stop or Event()
         requests = [self._request(candidate) for candidate in candidates]
         executor = self._executor
         outcomes = (
-            self._in_turn(requests, stop) if executor is None else self._at_once(requests, stop, executor)
+            self._sequential(requests, stop) if executor is None else self._parallel(requests, stop, executor)
         )
         for done, (index, outcome) in enumerate(outcomes, start=1):
             self.calls += 1
             if self._progress is not None:
                 self._progress("running", done, len(requests))
-            failure = self._place(requests[index], outcome.failure) if outcome.failure else ""
+            failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
             yield Answer(index, outcome.path_loss_db, outcome.seconds, failure)
-            self._failed = self._failed + 1 if failure else 0
-            if self._failed >= self._give_up_after:
+            self._successive_failures = self._successive_failures + 1 if failure else 0
+            if self._successive_failures >= self._give_up_after:
                 raise EngineError(
-                    f"{failure}; so did the {self._failed - 1} calls before it. What was answered is in the ledger: "
-                    "mend the program, take the failures out with `calibray ledger DIR --forget-failed`, and start "
-                    "again"
+                    f"{failure}; so did the {self._successive_failures - 1} calls before it. All answers are in the "
+                    "ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, and "
+                    "start again"
                 )
 
-    def _in_turn(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
+    def _sequential(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
         for index, request in enumerate(requests):
             if stop.is_set():
                 return
             yield index, self._program.run(request)
 
-    def _at_once(
+    def _parallel(
         self, requests: list[Request], stop: Event, executor: Executor
     ) -> Iterator[tuple[int, Outcome]]:
-        # An event reaches threads only; programs on other machines run on until their time is up.
-        near = stop if isinstance(executor, ThreadPoolExecutor) else None
-        futures = {executor.submit(self._program.run, request, near): k for k, request in enumerate(requests)}
-        left, interruption = set(futures), None
+        # An event reaches threads only; programs on other machines run until they end or exceed their time limit.
+        local_stop = stop if isinstance(executor, ThreadPoolExecutor) else None
+        futures = {
+            executor.submit(self._program.run, request, local_stop): index
+            for index, request in enumerate(requests)
+        }
+        pending, interruption = set(futures), None
         try:
-            while left and not stop.is_set():
-                for future in wait(left, GLANCE, FIRST_COMPLETED).done:
+            while pending and not stop.is_set():
+                for future in wait(pending, POLL, FIRST_COMPLETED).done:
                     outcome = self._outcome(future)
-                    left.remove(future)
+                    pending.remove(future)
                     yield futures[future], outcome
         except (Exception, KeyboardInterrupt) as error:
             interruption = error
         finally:
             stop.set()
-            for future in left:
+            for future in pending:
                 future.cancel()
-        # What others have answered by now is given before the run ends.
-        for future in wait(left, None if near else 0).done:
+        # Calls that have ended by now were paid for: their answers are given before the run ends.
+        for future in wait(pending, None if local_stop else 0).done:
             if not future.cancelled() and not future.exception():
                 yield futures[future], future.result()
         if interruption is not None:
@@ -148,21 +145,21 @@ class Command:
             return future.result()
         except EngineError:
             raise
-        except Exception as error:  # a worker that died costs the candidates it was on, not the batch
-            lost = np.full(self.num_links, np.inf)
-            return Outcome(lost, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
+        except Exception as error:  # a worker that dies loses its candidates, not the whole batch
+            no_path = np.full(self.num_links, np.inf)
+            return Outcome(no_path, 0.0, f"was lost with its worker ({type(error).__name__}: {error})")
 
     def _request(self, candidate: NDArray[np.float64]) -> Request:
-        return Request(
-            self._surroundings,
-            self.parameters.materials(candidate, self.materials),
-            dict(zip(self.parameters.names, candidate.tolist(), strict=True)),
-            {
+        return replace(
+            self._blank_request,
+            materials=self.parameters.materials(candidate, self.materials),
+            parameters=dict(zip(self.parameters.names, candidate.tolist(), strict=True)),
+            carriers={
                 frequency: self.parameters.materials(candidate, base, frequency)
                 for frequency, base in self._carriers.items()
             },
         )
 
-    def _place(self, request: Request, failure: str) -> str:
+    def _describe(self, request: Request, failure: str) -> str:
         values = ", ".join(f"{name} = {value:.6g}" for name, value in request.parameters.items())
         return f"{self._source}: engine.command `{shlex.join(self._program.words)}` at {values}: {failure}"

@@ -1,6 +1,6 @@
-"""What an external program is asked and what it answers: the files of the command engine, in JSON or HDF5.
+"""The files exchanged with an external program: the request of one RT call and its response, in JSON or HDF5.
 
-The formats are documented for programs' authors in `docs/command-engine.md`.
+`docs/command-engine.md` documents the formats for authors of programs.
 """
 
 from __future__ import annotations
@@ -19,59 +19,41 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.section import RadioSettings
 from calibray.materials import Material
-from calibray.tracing.settings import Antenna
 
 SCHEMA: Final = "calibray.request"
 VERSION: Final = 1
-FORMATS: Final = ("json", "hdf5")
 ANSWER: Final = "path_loss_db"
-PATH_LOSS_DB: Final = (20.0, 300.0)  # what a program's answers must lie within
-RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # that a response may have, and more for each link
+PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
+RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
 class Unusable(ValueError):
-    """An answer that is missing, malformed, of the wrong length, or no number."""
-
-
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What is the same for all candidates of a study.
-
-    Attributes:
-        frequency: Carrier frequency [Hz].
-        bandwidth: Bandwidth [Hz], or None.
-        combining: How a link's paths combine: "power", "coherent" or "band".
-        antennas: Transmit and receive antenna.
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-        link_frequency: Carrier of every link [L], [Hz], or None where all have `frequency`.
-    """
-
-    frequency: float
-    bandwidth: float | None
-    combining: str
-    antennas: tuple[Antenna, Antenna]
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    link_frequency: NDArray[np.float64] | None = None
+    """An answer that is missing, malformed, of the wrong length, or not a number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """One RT call asked of a program.
+    """One RT call, as it is sent to a program.
 
     Attributes:
-        surroundings: What is the same for all candidates.
-        materials: All materials of the scene with the candidate's values at `frequency`, by name.
+        radio: Carrier, bandwidth, combining and antennas.
+        tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+        materials: All materials of the scene with the candidate's values at the study's carrier, by name.
         parameters: The candidate's values by parameter name, in the fields' units.
-        carriers: The same materials at each carrier of the links [Hz]; none where all links have `frequency`.
+        link_frequency: Carrier of every link [L], [Hz]; None if all links have the study's carrier.
+        carriers: The materials at each carrier of the links [Hz]; empty if all links have the study's carrier.
     """
 
-    surroundings: Surroundings
-    materials: Mapping[str, Material]
-    parameters: Mapping[str, float]
+    radio: RadioSettings
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    materials: Mapping[str, Material] = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    link_frequency: NDArray[np.float64] | None = None
     carriers: Mapping[float, Mapping[str, Material]] = field(default_factory=dict)
 
     def write(self, path: Path, file_format: str) -> None:
@@ -82,66 +64,58 @@ class Request:
             file_format: "json" or "hdf5".
         """
         if file_format == "json":
-            path.write_text(json.dumps(self._content()) + "\n", encoding="utf-8")
+            path.write_text(json.dumps(self._json()) + "\n", encoding="utf-8")
         else:
             self._write_hdf5(path)
 
     def _head(self) -> dict[str, Any]:
-        around = self.surroundings
         return {
             "schema": SCHEMA,
             "version": VERSION,
-            "frequency": around.frequency,
-            "bandwidth": around.bandwidth,
-            "combining": around.combining,
+            "frequency": self.radio.frequency,
+            "bandwidth": self.radio.bandwidth,
+            "combining": self.radio.combining,
         }
 
-    def _content(self) -> dict[str, Any]:
-        # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and so would
-        # garble names such as "walls.relative_permittivity".
-        around = self.surroundings
-        return (
-            self._head()
-            | {
-                "antennas": {
-                    end: asdict(antenna) for end, antenna in zip(("tx", "rx"), around.antennas, strict=True)
-                },
-                "links": {"tx": around.tx.tolist(), "rx": around.rx.tolist()}
-                | ({} if around.link_frequency is None else {"frequency": around.link_frequency.tolist()}),
-                "materials": _listed(self.materials),
-                "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
-            }
-            | (
-                {
-                    "carriers": [
-                        {"frequency": frequency, "materials": _listed(materials)}
-                        for frequency, materials in self.carriers.items()
-                    ]
-                }
-                if self.carriers
-                else {}
-            )
-        )
+    def _json(self) -> dict[str, Any]:
+        # Materials and parameters are lists: MATLAB turns the keys of an object into identifiers, and would garble
+        # names such as "walls.relative_permittivity".
+        links = {"tx": self.tx.tolist(), "rx": self.rx.tolist()}
+        if self.link_frequency is not None:
+            links["frequency"] = self.link_frequency.tolist()
+        content = self._head() | {
+            "antennas": {
+                end: asdict(antenna) for end, antenna in zip(("tx", "rx"), self.radio.antennas, strict=True)
+            },
+            "links": links,
+            "materials": _list_materials(self.materials),
+            "parameters": [{"name": name, "value": value} for name, value in self.parameters.items()],
+        }
+        if self.carriers:
+            content["carriers"] = [
+                {"frequency": frequency, "materials": _list_materials(materials)}
+                for frequency, materials in self.carriers.items()
+            ]
+        return content
 
     def _write_hdf5(self, path: Path) -> None:
-        around = self.surroundings
         with h5py.File(path, "w") as file:
             file.attrs.update({key: value for key, value in self._head().items() if value is not None})
-            for end, antenna in zip(("tx", "rx"), around.antennas, strict=True):
+            for end, antenna in zip(("tx", "rx"), self.radio.antennas, strict=True):
                 file.create_group(f"antennas/{end}").attrs.update(asdict(antenna))
-            file["links/tx"], file["links/rx"] = around.tx, around.rx
-            if around.link_frequency is not None:
-                file["links/frequency"] = around.link_frequency
+            file["links/tx"], file["links/rx"] = self.tx, self.rx
+            if self.link_frequency is not None:
+                file["links/frequency"] = self.link_frequency
             _write_materials(file.create_group("materials", track_order=True), self.materials)
-            for place, (frequency, materials) in enumerate(self.carriers.items()):
-                group = file.create_group(f"carriers/{place}")
+            for number, (frequency, materials) in enumerate(self.carriers.items()):
+                group = file.create_group(f"carriers/{number}")
                 group.attrs["frequency"] = frequency
                 _write_materials(group.create_group("materials", track_order=True), materials)
             file["parameters/names"] = list(self.parameters)
             file["parameters/values"] = list(self.parameters.values())
 
 
-def _listed(materials: Mapping[str, Material]) -> list[dict[str, Any]]:
+def _list_materials(materials: Mapping[str, Material]) -> list[dict[str, Any]]:
     return [{"name": name, **asdict(material)} for name, material in materials.items()]
 
 
@@ -151,7 +125,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
 
 
 def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.float64]:
-    """Read the path loss that a program answered.
+    """Read the path loss from a program's response.
 
     Args:
         path: The file.
@@ -162,41 +136,43 @@ def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.floa
         Path loss [L], [dB]; +inf where a link has no path.
 
     Raises:
-        Unusable: The file is missing or malformed, or its values are not one path loss per link.
+        Unusable: The file is missing or malformed, or does not hold one path loss per link.
     """
-    content = _content(path, num_links)
-    values = _read_json(content) if file_format == "json" else _read_hdf5(content, num_links)
-    if values.shape != (num_links,):
-        raise Unusable(
-            f"its response holds {ANSWER} of shape {values.shape}, must be ({num_links},): one per link"
-        )
+    response = _read_bytes(path, num_links)
+    values = _read_json(response) if file_format == "json" else _read_hdf5(response, num_links)
+    _check_shape(values.shape, num_links)
     lower, upper = PATH_LOSS_DB
     wrong = ~((values >= lower) & (values <= upper) | np.isposinf(values))
     if wrong.any():
         link = int(np.argmax(wrong))
-        sign = "; path loss is positive: does it answer gains?" if -upper <= values[link] < 0 else ""
+        hint = "; path loss is positive: does it answer gains?" if -upper <= values[link] < 0 else ""
         raise Unusable(
             f"its response holds {ANSWER}[{link}] = {values[link]:g}; must be a number between {lower:g} and "
-            f"{upper:g} dB, or infinite without a path{sign}"
+            f"{upper:g} dB, or infinite without a path{hint}"
         )
     return values
 
 
-def _content(path: Path, num_links: int) -> bytes:
-    """The bytes of a response; of a plain file alone, for a program may leave anything there."""
+def _check_shape(shape: tuple[int, ...], num_links: int) -> None:
+    if shape != (num_links,):
+        raise Unusable(f"its response holds {ANSWER} of shape {shape}, must be ({num_links},): one per link")
+
+
+def _read_bytes(path: Path, num_links: int) -> bytes:
+    """The bytes of a response. Only a regular file is read, because a program may leave anything there."""
     try:
-        # Neither follows a link nor waits for the other end of a FIFO.
+        # O_NOFOLLOW does not follow a link; O_NONBLOCK does not wait for the writer of a FIFO.
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
         raise Unusable("it wrote no response file") from None
     except OSError as error:
         raise Unusable(
-            f"its response cannot be read ({error.strerror}); it must be a file, and no link to one"
+            f"its response cannot be read ({error.strerror}); it must be a file, not a link to one"
         ) from None
     status, limit = os.fstat(handle), RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise Unusable("its response is no file but a folder, a FIFO or a device")
+        raise Unusable("its response is not a file but a folder, a FIFO or a device")
     with os.fdopen(handle, "rb") as file:
         if status.st_size > limit:
             raise Unusable(f"its response has {status.st_size:,} bytes, must have {limit:,} or fewer")
@@ -207,7 +183,7 @@ def _read_json(response: bytes) -> NDArray[np.float64]:
     try:
         content = json.loads(response.decode("utf-8"))
     except ValueError as error:
-        raise Unusable(f"its response is no JSON ({error})") from None
+        raise Unusable(f"its response is not JSON ({error})") from None
     except RecursionError:
         raise Unusable("its response nests lists or objects too deeply") from None
     if not isinstance(content, dict) or ANSWER not in content:
@@ -222,7 +198,7 @@ def _number(entry: Any) -> float:
         return np.inf
     if isinstance(entry, bool) or not isinstance(entry, int | float):
         text = json.dumps(entry) if isinstance(entry, str | bool) else reprlib.repr(entry)
-        raise Unusable(f"its response holds {text[:80]} in {ANSWER}, which is no number")
+        raise Unusable(f"its response holds {text[:80]} in {ANSWER}, which is not a number")
     try:
         return float(entry)
     except OverflowError:
@@ -237,20 +213,20 @@ def _read_hdf5(response: bytes, num_links: int) -> NDArray[np.float64]:
                 raise Unusable(f"its response has no dataset {ANSWER!r}")
             if not isinstance(link, h5py.HardLink):
                 raise Unusable(
-                    f"its response has {ANSWER!r} by a link to elsewhere; write the numbers themselves"
+                    f"its response links {ANSWER!r} to another object; write the numbers themselves"
                 )
             dataset = file[ANSWER]
             if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
-                raise Unusable(f"its response has {ANSWER!r}, which is no dataset of numbers")
+                raise Unusable(f"its response has {ANSWER!r}, which is not a dataset of numbers")
             if dataset.is_virtual or dataset.external:
                 raise Unusable(f"its response has {ANSWER!r} in other files; write the numbers themselves")
-            if dataset.size != num_links:  # looked at before it is read: a small file may unfold to any size
-                raise Unusable(
-                    f"its response holds {ANSWER} of shape {dataset.shape}, must be ({num_links},): one per link"
-                )
+            # Checked before it is read, because a small compressed file may unpack to any size.
+            if dataset.size != num_links:
+                _check_shape(dataset.shape, num_links)
             values = np.asarray(dataset[()], dtype=float)
     except Unusable:
         raise
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise Unusable(f"its response is no HDF5 file with the numbers {ANSWER!r} ({error})") from None
+        raise Unusable(f"its response is not an HDF5 file with the numbers {ANSWER!r} ({error})") from None
+    # MATLAB writes a vector as a matrix with one row or column.
     return values.reshape(-1) if values.size == max(values.shape, default=1) else values

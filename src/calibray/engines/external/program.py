@@ -1,4 +1,4 @@
-"""An external program, run for one candidate: its files, its time limit, its attempts."""
+"""An external program, run for one candidate: its files, its time limit, and its attempts."""
 
 from __future__ import annotations
 
@@ -19,22 +19,30 @@ from threading import Event
 from typing import Final
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
-from calibray.engines.external import guard
 from calibray.engines.external.exchange import Request, Unusable, read_answer
-from calibray.engines.ledger.owner import Owner
+from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 
 PLACEHOLDERS: Final = ("{request}", "{response}")
-GLANCE: Final = 0.5  # how often a waiting thread looks whether it shall stop [s]
-GUARD: Final = str(Path(guard.__file__).resolve())
+POLL: Final = 0.5  # interval at which a waiting thread checks whether to stop [s]
+GUARD_WAIT: Final = 10.0  # longest wait for a guard that kills its program [s]; twice its own limit
 PREFIX: Final = "calibray-call-"  # of the temporary folders of calls
 OWNER_FILE: Final = "owner.json"
 
+# `python -I -S guard.py LIBRARIES`: see `guard`.
+GUARD: Final = (
+    "-I",
+    "-S",
+    str(Path(__file__).resolve().with_name("guard.py")),
+    str(Path(psutil.__file__).parents[1]),
+)
+
 
 class Unstartable(Unusable):
-    """A program that is not there, or cannot be executed: no attempt will differ."""
+    """A program that does not exist or cannot be executed: another attempt would fail too."""
 
 
 class Stopped(Exception):
@@ -46,9 +54,9 @@ class Outcome:
     """How the attempts at one candidate ended.
 
     Attributes:
-        path_loss_db: Path loss [L], [dB], +inf without a path; all of it where the attempts failed.
-        seconds: Time that all attempts took together.
-        failure: What went wrong in the last attempt; empty if it succeeded.
+        path_loss_db: Path loss [L], [dB]; +inf without a path, and for all links if the attempts failed.
+        seconds: Time of all attempts together [s].
+        failure: Error of the last attempt; empty if it succeeded.
     """
 
     path_loss_db: NDArray[np.float64]
@@ -58,18 +66,18 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """How an external program is called. It can be sent to other processes and machines.
+    """How an external program is called; it can be sent to other processes and machines.
 
     Attributes:
-        words: The program and its arguments; `{request}` and `{response}` stand for the files' paths, and are
-            appended where absent.
+        words: The program and its arguments. `{request}` and `{response}` are replaced by the files' paths, and
+            appended if absent.
         folder: Folder to run it in.
-        timeout: Time that one attempt may take [s].
+        timeout: Time limit of one attempt [s].
         retries: How often to try again after a failure.
         file_format: "json" or "hdf5".
 
     Raises:
-        InputError: A word holds a NUL character, which no program can be given.
+        InputError: A word contains a NUL character, which the system does not pass to programs.
     """
 
     words: tuple[str, ...]
@@ -79,28 +87,28 @@ class ExternalProgram:
     file_format: str
 
     def __post_init__(self) -> None:
-        for place, word in enumerate(self.words):
+        for index, word in enumerate(self.words):
             if "\0" in word:
                 raise InputError(
-                    f"engine.command[{place}] = {word[:80]!r}: holds a NUL character, which no program can be given; "
-                    "remove it"
+                    f"engine.command[{index}] = {word[:80]!r}: contains a NUL character, which cannot be passed to a "
+                    "program; remove it"
                 )
 
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
-        """Ask the program for one candidate, again after every failure while attempts are left.
+        """Call the program for one candidate, and again after a failure until no attempts are left.
 
         Args:
-            request: What is asked.
+            request: The request.
             stop: Set from outside to kill the program.
 
         Returns:
-            How it ended; a failure is told, not raised, so that it costs one candidate and not the batch.
+            The outcome. A failure is returned, not raised, so that it costs one candidate and not the batch.
 
         Raises:
             Stopped: `stop` was set before there was an answer.
             EngineError: The files cannot be written, which is not the program's fault.
         """
-        num_links = len(request.surroundings.tx)
+        num_links = len(request.tx)
         started, failure, attempt = time.perf_counter(), "", 0
         while attempt <= self.retries:
             if stop is not None and stop.is_set():
@@ -115,112 +123,112 @@ class ExternalProgram:
                 failure = str(error)
             else:
                 return Outcome(loss, time.perf_counter() - started)
-        tries = "" if attempt < 2 else f" (attempt {attempt} of {self.retries + 1})"
-        lost = np.full(num_links, np.inf)
-        return Outcome(lost, time.perf_counter() - started, failure + tries)
+        attempts = "" if attempt < 2 else f" (attempt {attempt} of {self.retries + 1})"
+        no_path = np.full(num_links, np.inf)
+        return Outcome(no_path, time.perf_counter() - started, failure + attempts)
 
     def _attempt(self, request: Request, num_links: int, stop: Event | None) -> NDArray[np.float64]:
         ending = "json" if self.file_format == "json" else "h5"
-        with _call_folder() as place:
-            files = place / f"request.{ending}", place / f"response.{ending}"
+        with _call_folder() as folder:
+            request_file, response_file = folder / f"request.{ending}", folder / f"response.{ending}"
             try:
-                request.write(files[0], self.file_format)
+                request.write(request_file, self.file_format)
             except OSError as error:
                 raise _unwritable(error) from None
-            told = self._guarded(place, self._arguments(files), stop)
-            if told["ended"] == "unstarted":
-                raise Unstartable(f"cannot be started ({told['said']})")
-            if told["ended"] == "stopped" and stop is not None and stop.is_set():
+            report = self._run_guarded(folder, self._command_line(request_file, response_file), stop)
+            if report["ended"] == "unstarted":
+                raise Unstartable(f"cannot be started ({report['output']})")
+            if report["ended"] == "stopped" and stop is not None and stop.is_set():
                 raise Stopped
             try:
-                if told["ended"] == "stopped":
+                if report["ended"] == "stopped":
                     raise Unusable("was stopped from outside")
-                if told["ended"] == "timeout":
+                if report["ended"] == "timeout":
                     raise Unusable(f"gave no answer within timeout = {self.timeout:g} s and was killed")
-                if told["status"]:
-                    raise Unusable(f"ended with {_status(told['status'])}")
-                return read_answer(files[1], self.file_format, num_links)
+                if report["status"]:
+                    raise Unusable(f"ended with {_describe_status(report['status'])}")
+                return read_answer(response_file, self.file_format, num_links)
             except Unusable as error:
-                said = told["said"]
+                output = report["output"]
                 raise Unusable(
-                    f"{error}; it said:\n{said}" if said else f"{error}; it said nothing"
+                    f"{error}; its output:\n{output}" if output else f"{error}; it gave no output"
                 ) from None
 
-    def _arguments(self, files: tuple[Path, Path]) -> list[str]:
+    def _command_line(self, request_file: Path, response_file: Path) -> list[str]:
         words = [
             *self.words,
             *(mark for mark in PLACEHOLDERS if not any(mark in word for word in self.words)),
         ]
-        for mark, file in zip(PLACEHOLDERS, files, strict=True):
+        for mark, file in zip(PLACEHOLDERS, (request_file, response_file), strict=True):
             words = [word.replace(mark, str(file)) for word in words]
         return words
 
-    def _guarded(self, place: Path, arguments: list[str], stop: Event | None) -> dict:
-        """Run the program under its guard (see `guard`), and give what that tells."""
-        words = [sys.executable, "-I", "-S", GUARD, repr(float(self.timeout)), str(place), *arguments]
-        # The guard ends the program when nobody holds the other end of its standard input any more.
-        held, leash = os.pipe()
+    def _run_guarded(self, folder: Path, words: list[str], stop: Event | None) -> dict:
+        """Run the program under its guard (see `guard`), and return the guard's report."""
+        # The guard kills the program once the other end of its standard input is closed.
+        guard_input, leash = os.pipe()
         try:
             process = subprocess.Popen(
-                words,
+                [sys.executable, *GUARD, repr(float(self.timeout)), str(folder), *words],
                 cwd=self.folder,
-                stdin=held,
+                stdin=guard_input,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # an interrupt from the keyboard is for Calibray, not for the guard
+                start_new_session=True,  # Ctrl-C is meant for Calibray, not for the guard
             )
         except OSError as error:
             os.close(leash)
             raise Unstartable(f"cannot be started ({error.strerror or error})") from None
         finally:
-            os.close(held)
-        output = None
+            os.close(guard_input)
+        report = None
         try:
-            while output is None and not (stop is not None and stop.is_set()):
+            while report is None and not (stop is not None and stop.is_set()):
                 with suppress(subprocess.TimeoutExpired):
-                    output, _ = process.communicate(timeout=GLANCE)
+                    report, _ = process.communicate(timeout=POLL)
         finally:
             os.close(leash)
-            if output is None:
-                output = _last_words(process)
+            if report is None:
+                report = _last_report(process)
         try:
-            return json.loads(output)
+            return json.loads(report)
         except ValueError:
             raise Unusable(
-                f"was lost with its guard, which ended with {_status(process.returncode)}"
+                f"was lost with its guard, which ended with {_describe_status(process.returncode)}"
             ) from None
 
 
-def _last_words(process: subprocess.Popen) -> bytes:
-    """What a guard says that was let loose; it has killed its program by then."""
+def _last_report(guard: subprocess.Popen) -> bytes:
+    """The report of a guard that was asked to end; it kills its program first."""
     try:
-        return process.communicate(timeout=2 * guard.PATIENCE)[0]
+        return guard.communicate(timeout=GUARD_WAIT)[0]
     except subprocess.TimeoutExpired:
-        process.kill()
-        return process.communicate()[0]
+        guard.kill()
+        return guard.communicate()[0]
 
 
-def _status(status: int) -> str:
+def _describe_status(status: int) -> str:
     if status >= 0:
         return f"exit status {status}"
     try:
         return f"signal {signal.Signals(-status).name}"
-    except ValueError:  # real-time signals have no names but the first and the last
+    except ValueError:  # only the first and the last real-time signal have names
         return f"signal SIGRTMIN+{-status - signal.SIGRTMIN}"
 
 
 @contextmanager
 def _call_folder() -> Iterator[Path]:
-    """A temporary folder for one call, with the mark of its owner; those of processes that are gone are removed."""
+    """A temporary folder for one call, with a file that names its owner; folders of ended processes are removed."""
     try:
         parent = Path(tempfile.gettempdir())
-        _sweep(parent)
+        _remove_abandoned(parent)
         folder = tempfile.TemporaryDirectory(prefix=PREFIX, dir=parent, ignore_cleanup_errors=True)
     except OSError as error:
         raise _unwritable(error) from None
     with folder as name:
         try:
-            (Path(name) / OWNER_FILE).write_text(json.dumps(Owner.here().record()), encoding="utf-8")
+            owner = json.dumps(ProcessOwner.current().record())
+            (Path(name) / OWNER_FILE).write_text(owner, encoding="utf-8")
         except OSError as error:
             raise _unwritable(error) from None
         yield Path(name)
@@ -234,15 +242,15 @@ def _unwritable(error: OSError) -> EngineError:
 
 
 @cache
-def _sweep(parent: Path) -> None:
-    """Remove, once a process, the folders of calls that were left by processes that were killed with their guards."""
+def _remove_abandoned(parent: Path) -> None:
+    """Remove, once per process, folders of calls whose process was killed together with its guard."""
     for folder in parent.glob(f"{PREFIX}*"):
         try:
             mark = folder / OWNER_FILE
             if mark.is_symlink() or folder.is_symlink() or folder.stat().st_uid != os.geteuid():
                 continue
-            owner = Owner.from_record(json.loads(mark.read_text(encoding="utf-8")))
+            owner = ProcessOwner.from_record(json.loads(mark.read_text(encoding="utf-8")))
         except (OSError, ValueError, RecursionError):
             continue
-        if owner is not None and owner.gone:
+        if owner is not None and owner.is_gone:
             shutil.rmtree(folder, ignore_errors=True)

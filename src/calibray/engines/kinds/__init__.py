@@ -1,4 +1,4 @@
-"""The kinds of engines, one module each; a module that is put here is found, and its section belongs to study files."""
+"""The kinds of engines, one module each; a new module here adds a kind, and its section, to study files."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from pydantic import Field
 from calibray.engines.section import EngineSection
 
 
-def _found() -> dict[str, type[EngineSection]]:
-    """The sections by name, those of one module after another."""
+def _sections() -> dict[str, type[EngineSection]]:
+    """The section that each module here defines, by name."""
     modules = [import_module(f"{__name__}.{entry.name}") for entry in iter_modules(__path__)]
     sections = [
-        each
+        value
         for module in modules
-        for each in vars(module).values()
-        if isinstance(each, type) and issubclass(each, EngineSection) and each.__module__ == module.__name__
+        for value in vars(module).values()
+        if isinstance(value, type)
+        and issubclass(value, EngineSection)
+        and value.__module__ == module.__name__
     ]
-    return {each.model_fields["name"].default: each for each in sections}
+    return {section.model_fields["name"].default: section for section in sections}
 
 
-KINDS: Final = _found()
+KINDS: Final = _sections()
 """The sections of all kinds of engines by name."""
 
 DEFAULT: Final = "replay"
@@ -41,4 +43,4 @@ if TYPE_CHECKING:
     AnyEngine = EngineSection
 else:
     AnyEngine = Annotated[reduce(or_, KINDS.values()), Field(discriminator="name")]
-"""The section of any kind of engine, told apart by its name."""
+"""The section of any kind of engine; its name decides which."""

@@ -1,20 +1,18 @@
-"""Re-trace: the ray tracer runs anew for every candidate, as in the paper."""
+"""Re-trace: the ray tracer runs again for every candidate, as in the paper."""
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from typing import TYPE_CHECKING, ClassVar, Literal, final
 
 import numpy as np
 
-from calibray.engines.section import EngineSection
+from calibray.engines.section import EngineSection, OpenedStudy
 from calibray.support.progress import Progress
 
 if TYPE_CHECKING:
-    from calibray.engines.cluster.workers import Crew
+    from calibray.engines.cluster.workers import Workers
     from calibray.engines.retrace import Retrace
     from calibray.paths import Paths
-    from calibray.study.setup import Setup
 
 
 @final
@@ -25,33 +23,33 @@ class RetraceSection(EngineSection):
         name: "retrace".
     """
 
-    dear: ClassVar[bool] = True
+    expensive: ClassVar[bool] = True
     external: ClassVar[bool] = False
 
-    # Sections are frozen, so that a narrower type is safe.
+    # Sections are frozen, so a narrower type is safe.
     name: Literal["retrace"] = "retrace"  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def answers_by(self, setup: Setup) -> list[str]:
+    def answers_by(self, study: OpenedStudy) -> list[str]:
         """The versions of the ray tracer."""
-        return list(setup.factory.versions.values())
+        return list(study.tracer_versions.values())
 
     def open(
         self,
-        setup: Setup,
+        study: OpenedStudy,
         paths: Paths | None,
         progress: Progress | None,
-        executor: Executor | Crew | None,
+        workers: Workers | None,
     ) -> Retrace:
         """The ray tracer over a study's links; see `EngineSection.open`."""
         from calibray.engines.retrace import CarrierTracer, Retrace
 
-        study, links = setup.study, setup.links
+        links = study.links
         if links.frequency is None:
-            parts = [CarrierTracer(setup.tracer, links, np.arange(len(links)))]
+            tracers = [CarrierTracer(study.tracer, links, np.arange(len(links)))]
         else:
-            parts = [
-                CarrierTracer(setup.tracer_at(frequency), links.select(links.frequency == frequency), index)
+            tracers = [
+                CarrierTracer(study.tracer_at(frequency), links.select(links.frequency == frequency), index)
                 for frequency, index in links.carriers
             ]
-        options = study.objective.combining, study.scene.bandwidth
-        return Retrace(parts, setup.scene.materials, setup.parameters, *options, progress)
+        options = study.radio.combining, study.radio.bandwidth
+        return Retrace(tracers, study.scene.materials, study.parameters, *options, progress)

@@ -1,1 +1,1 @@
-"""The ledger: every RT call that was ever paid for."""
+"""The ledger: a file that keeps every RT call that was paid for."""

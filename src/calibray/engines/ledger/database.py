@@ -1,4 +1,4 @@
-"""The SQLite file of a ledger: its tables, what makes it no ledger, and what its errors mean."""
+"""The SQLite file of a ledger: its tables, its transactions, and its errors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Final
 from calibray.engines.ledger import claims
 from calibray.errors import InputError
 
-VERSION: Final = 2  # the first had neither digests nor claims
-PATIENCE: Final = 60.0  # how long to wait for others to finish writing [s]
+VERSION: Final = 2
+LOCK_WAIT: Final = 60.0  # longest wait for other writers [s]
 _PROBLEMS: Final = """CREATE TABLE IF NOT EXISTS problems (
     problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID"""
 _ANSWERS: Final = """CREATE TABLE IF NOT EXISTS answers (
@@ -28,23 +28,23 @@ _COLUMNS: Final = {
 
 
 def set_up(connection: sqlite3.Connection, path: Path) -> None:
-    """Make the tables of a new ledger, and those that an old one lacks; refuse what is no ledger.
+    """Create the tables of a new ledger, and refuse a file that is not a ledger.
 
     Args:
         connection: The file.
         path: Its path, for messages.
 
     Raises:
-        InputError: The file is a database of something else, or of another version.
-        sqlite3.OperationalError: Others have locked the file for too long, or it cannot be used.
+        InputError: The file is another database, or a ledger of another version.
+        sqlite3.OperationalError: Other programs lock the file for too long, or it cannot be used.
         sqlite3.DatabaseError: The file is damaged.
     """
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + LOCK_WAIT
     while True:
         try:
             _set_up(connection, path)
         except sqlite3.OperationalError as error:
-            # SQLite does not wait by itself for others that are about to switch to write-ahead logging too.
+            # SQLite itself does not wait while another process switches to write-ahead logging.
             if "locked" not in str(error) or time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
@@ -56,36 +56,31 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     run = connection.execute
     version = run("PRAGMA user_version").fetchone()[0]
     tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if version not in (0, 1, VERSION):
+    if version not in (0, VERSION):
         raise InputError(
-            f"{path}: is a ledger of version {version}, this Calibray writes {VERSION}; name another folder"
+            f"{path}: is a ledger of version {version}, this Calibray uses {VERSION}; name another folder"
         )
     if version == 0 and tables - set(_COLUMNS):
         raise InputError(
-            f"{path}: is a database of something else, with a table {min(tables - set(_COLUMNS))!r}; "
+            f"{path}: is not a ledger but a database with a table {min(tables - set(_COLUMNS))!r}; "
             "name another folder"
         )
     if tables and (fault := run("PRAGMA integrity_check(1)").fetchone()[0]) != "ok":
         raise sqlite3.DatabaseError(f"database disk image is malformed: {fault.splitlines()[-1]}")
     run("PRAGMA journal_mode = WAL")
-    run("PRAGMA synchronous = FULL")  # committed answers survive a loss of power too
+    run("PRAGMA synchronous = FULL")  # committed answers survive a power failure
     with transaction(connection):
         for table in (_PROBLEMS, _ANSWERS, claims.TABLE):
             run(table)
-        if "digest" not in _columns(connection, "answers"):
-            run("ALTER TABLE answers ADD COLUMN digest BLOB")
         for table, columns in _COLUMNS.items():
-            if (found := _columns(connection, table)) != columns:
+            names = [row[1] for row in run(f"PRAGMA table_info({table})")]
+            if names != columns:
                 raise InputError(
-                    f"{path}: is no ledger, its table {table!r} has the columns {', '.join(found)}, must have "
+                    f"{path}: is not a ledger, its table {table!r} has the columns {', '.join(names)}, must have "
                     f"{', '.join(columns)}; name another folder"
                 )
         if version != VERSION:
             run(f"PRAGMA user_version = {VERSION}")
-
-
-def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
-    return [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
 
 
 @contextmanager
@@ -107,24 +102,24 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def explain(error: sqlite3.Error | OSError) -> str:
-    """What went wrong with a ledger, and what to do about it.
+    """An error of a ledger and its remedy.
 
     Args:
         error: The error.
 
     Returns:
-        Its text and the remedy.
+        The text.
     """
-    # The lower byte is the kind of error, the others tell it in detail.
+    # The lower byte is the kind of error; the upper ones are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
-    whole = "move it away and start again, or save what is whole with `sqlite3 FILE .recover`"
+    damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"
     remedy = {
         sqlite3.SQLITE_FULL: "make room on the disk and start again",
-        sqlite3.SQLITE_IOERR: "make room on the disk, or mend it, and start again",
-        sqlite3.SQLITE_BUSY: f"another program has locked it for {PATIENCE:g} s: end that and start again",
+        sqlite3.SQLITE_IOERR: "make room on the disk, or repair it, and start again",
+        sqlite3.SQLITE_BUSY: f"another program has locked it for {LOCK_WAIT:g} s: end that and start again",
         sqlite3.SQLITE_LOCKED: "another program has locked it: end that and start again",
         sqlite3.SQLITE_READONLY: "make it and its folder writable and start again",
         sqlite3.SQLITE_CANTOPEN: "make its folder writable and start again",
-        sqlite3.SQLITE_CORRUPT: whole,
-    }.get(code, whole if "malformed" in str(error) else "name another folder")
+        sqlite3.SQLITE_CORRUPT: damaged,
+    }.get(code, damaged if "malformed" in str(error) else "name another folder")
     return f"{error}; {remedy}"

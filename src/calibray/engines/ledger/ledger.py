@@ -1,8 +1,8 @@
-"""The ledger: every RT call that was ever paid for, in one SQLite file.
+"""The ledger: every RT call that was paid for, in one SQLite file.
 
-An answer is committed before anyone sees it, so that a run that was killed finds it when it is started again. Several
-runs may write to one ledger at once; it must lie on a local disk, because SQLite's write-ahead log needs one. Where the
-ledger cannot take an answer, a file beside it does (see `rescue`).
+An answer is committed before the optimizer sees it, so a run that was killed finds its answers when it is started
+again. Several runs may write to one ledger at once. It must be on a local disk, because SQLite's write-ahead log needs
+one. If the ledger cannot take an answer, a rescue file does (see `answers`).
 """
 
 from __future__ import annotations
@@ -18,35 +18,40 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, final
 
 import numpy as np
 import pandas as pd
 
-from calibray.engines.ledger import claims, rescue
-from calibray.engines.ledger import database as schema
+from calibray.engines.ledger import claims, database
+from calibray.engines.ledger.answers import (
+    LedgerEntry,
+    RescuedAnswer,
+    read_entry,
+    read_rescue_files,
+    write_rescue_file,
+)
 from calibray.engines.ledger.database import explain, set_up, transaction
-from calibray.engines.ledger.entry import LedgerEntry, read_entry
-from calibray.engines.ledger.rescue import Rescued
 from calibray.errors import EngineError, InputError
 
 LEDGER_FILE: Final = "ledger.sqlite"
 COLUMNS: Final = ("problem", "engine", "time", "seconds", "status", "message")
 ENTRY: Final = "path_loss_db, seconds, failure, digest"
-log = logging.getLogger(__name__)
+_LOG: Final = logging.getLogger(__name__)
 
 
+@final
 class Ledger:
     """RT calls by problem and candidate.
 
     Args:
-        path: The SQLite file; made if absent, with its folder. One that cannot be written is read.
+        path: The SQLite file; created with its folder if absent. A file that cannot be written is only read.
 
     Attributes:
         read_only: Whether the file cannot be written.
 
     Raises:
-        InputError: The file cannot be opened, is no ledger, is damaged, or one of another version.
+        InputError: The file cannot be opened, is not a ledger, is damaged, or has another version.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -56,7 +61,7 @@ class Ledger:
         )
         self._run, self._copy = uuid.uuid4().hex, None
         try:
-            self._connection = self._opened()
+            self._connection = self._connect()
             try:
                 set_up(self._connection, self.path)
                 self._file = _identity(self.path)
@@ -66,11 +71,11 @@ class Ledger:
         except (sqlite3.Error, OSError) as error:
             raise InputError(f"{self.path}: cannot be used as a ledger ({explain(error)})") from None
         if not self.read_only:
-            self._take_up()
+            self._insert_rescued()
 
-    def _opened(self) -> sqlite3.Connection:
+    def _connect(self) -> sqlite3.Connection:
         file = self.path
-        if self.read_only:  # even to read it, SQLite would write files beside it
+        if self.read_only:  # SQLite writes files next to a database even to read it, so a copy is read
             self._copy = tempfile.TemporaryDirectory(prefix="calibray-ledger-", ignore_cleanup_errors=True)
             file = Path(self._copy.name) / LEDGER_FILE
             for ending in ("", "-wal"):
@@ -78,12 +83,12 @@ class Ledger:
                     shutil.copyfile(f"{self.path}{ending}", f"{file}{ending}")
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
-        # Every statement is a transaction of its own, committed when `execute` returns.
-        return sqlite3.connect(file, timeout=schema.PATIENCE, isolation_level=None)
+        # Without an isolation level, every statement is a transaction and committed when `execute` returns.
+        return sqlite3.connect(file, timeout=database.LOCK_WAIT, isolation_level=None)
 
-    def _take_up(self) -> None:
-        for file, answers in rescue.waiting(self.path):
-            with self._told():
+    def _insert_rescued(self) -> None:
+        for file, answers in read_rescue_files(self.path):
+            with self._errors():
                 for answer in answers:
                     self._connection.execute(
                         "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)",
@@ -92,7 +97,7 @@ class Ledger:
                     self._insert(answer.problem, answer.candidate, answer.entry)
             with suppress(OSError):
                 file.unlink()
-            log.warning("%s: %d answers taken up from %s", self.path, len(answers), file)
+            _LOG.warning("%s: %d answers read from the rescue file %s", self.path, len(answers), file)
 
     def close(self) -> None:
         """Close the file."""
@@ -101,7 +106,7 @@ class Ledger:
             self._copy.cleanup()
 
     def describe(self, problem: str, engine: str, parameters: Sequence[str]) -> None:
-        """Say what a problem's candidates stand for.
+        """Write the names that a problem's candidates are listed with.
 
         Args:
             problem: Fingerprint of the problem.
@@ -111,14 +116,14 @@ class Ledger:
         Raises:
             EngineError: The ledger cannot be written.
         """
-        with self._told():
+        with self._errors():
             self._connection.execute(
                 "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)",
                 (problem, engine, json.dumps(list(parameters))),
             )
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> LedgerEntry | None:
-        """The entry of a candidate; one that is damaged is told, and dropped.
+        """The entry of a candidate; a damaged entry is deleted with a warning.
 
         Args:
             problem: Fingerprint of the problem.
@@ -126,12 +131,12 @@ class Ledger:
             num_links: Number of links L.
 
         Returns:
-            The entry, or None if the candidate was never run.
+            The entry, or None if there is none.
 
         Raises:
             EngineError: The ledger cannot be read.
         """
-        with self._told():
+        with self._errors():
             row = self._connection.execute(
                 f"SELECT id, {ENTRY} FROM answers WHERE problem = ? AND candidate = ?", (problem, candidate)
             ).fetchone()
@@ -140,12 +145,12 @@ class Ledger:
             entry = read_entry(problem, candidate, row[1:], num_links)
             if isinstance(entry, LedgerEntry):
                 return entry
-            log.warning("%s: call %d is damaged (%s); dropped, and run again", self.path, row[0], entry)
+            _LOG.warning("%s: call %d is damaged (%s); deleted, and run again", self.path, row[0], entry)
             self._connection.execute("DELETE FROM answers WHERE id = ?", (row[0],))
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
-        """Claim candidates that this run shall pay for; `commit` and `release` end the claims.
+        """Claim candidates that this run will pay for; `commit` and the end of `working` end the claims.
 
         Args:
             problem: Fingerprint of the problem, described before.
@@ -153,33 +158,35 @@ class Ledger:
             num_links: Number of links L.
 
         Returns:
-            Those that are not answered, and that no other run is on.
+            The candidates without an answer that no other run has claimed.
 
         Raises:
-            InputError: The ledger cannot be written at all.
-            EngineError: The ledger cannot be written now.
+            InputError: The ledger is read-only.
+            EngineError: The ledger cannot be written at present.
         """
         if self.read_only:
             raise InputError(
                 f"{self.path}: cannot be written, and {len(candidates)} candidates are not in it; "
                 "make it and its folder writable, or name another folder"
             )
-        self._check_place()
-        with self._told(), transaction(self._connection):
-            missing = [each for each in candidates if self.find(problem, each, num_links) is None]
+        self._check_identity()
+        with self._errors(), transaction(self._connection):
+            missing = [
+                candidate for candidate in candidates if self.find(problem, candidate, num_links) is None
+            ]
             return claims.claim(self._connection, self._run, problem, missing)
 
     @contextmanager
     def working(self) -> Iterator[None]:
-        """Keep this run's claims while its engine works, and give them up afterwards."""
+        """Renew this run's claims while its engine works, and give them up afterwards."""
         try:
-            with claims.beating(self.path, self._run):
+            with claims.renewing(self.path, self._run):
                 yield
         finally:
             claims.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
-        """Write an entry, unless another run was faster.
+        """Write an entry, unless another run has written one first.
 
         Args:
             problem: Fingerprint of the problem, described before.
@@ -187,19 +194,19 @@ class Ledger:
             entry: The entry.
 
         Returns:
-            What the ledger holds, on disk, when this returns: the entry, or the other run's.
+            The entry that the ledger holds on disk: this one, or the other run's.
 
         Raises:
-            EngineError: The ledger cannot take it; `rescue` keeps it elsewhere.
+            EngineError: The ledger cannot take it; `rescue` keeps it in a file.
         """
-        with self._told(), transaction(self._connection):
+        with self._errors(), transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
             if earlier is None:
                 self._insert(problem, candidate, entry)
             self._connection.execute(
                 "DELETE FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
             )
-        self._check_place()
+        self._check_identity()
         return earlier or entry
 
     def _insert(self, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
@@ -210,54 +217,43 @@ class Ledger:
             (problem, candidate, entry.blob, entry.seconds, entry.failure, now, digest),
         )
 
-    def rescue(self, answers: Sequence[Rescued]) -> str:
-        """Keep answers that the ledger could not take in a file elsewhere.
+    def rescue(self, answers: Sequence[RescuedAnswer]) -> str:
+        """Keep answers that the ledger could not take in a rescue file.
 
         Args:
             answers: The answers.
 
         Returns:
-            A sentence that says where they are.
+            A sentence that names the file.
         """
         answers_are = "1 answer is" if len(answers) == 1 else f"{len(answers)} answers are"
-        file = rescue.keep(self.path, answers)
+        file = write_rescue_file(self.path, answers)
         if file is None:
-            return f"{answers_are} lost, for no other place could be written either"
-        return f"{answers_are} kept in {file}, and taken up when the run is started again"
-
-    def _all(self) -> list[Rescued]:
-        rows = self._connection.execute(
-            f"SELECT problem, engine, parameters, candidate, {ENTRY} FROM answers JOIN problems USING (problem)"
-        ).fetchall()
-        entries = [(row, read_entry(row[0], row[3], row[4:])) for row in rows]
-        return [
-            Rescued(problem, engine, parameters, candidate, entry)
-            for (problem, engine, parameters, candidate, *_), entry in entries
-            if isinstance(entry, LedgerEntry)
-        ]
+            return f"{answers_are} lost, because no other folder could be written either"
+        return f"{answers_are} kept in {file}, and used when the run is started again"
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Take out failed calls, so that they are run again.
+        """Delete failed calls, so that they are run again.
 
         Args:
             problem: Fingerprint of the problem; all problems if None.
 
         Returns:
-            How many there were.
+            Number of calls deleted.
 
         Raises:
-            InputError: The ledger cannot be written at all.
-            EngineError: The ledger cannot be written now.
+            InputError: The ledger is read-only.
+            EngineError: The ledger cannot be written at present.
         """
         if self.read_only:
             raise InputError(f"{self.path}: cannot be written; make it and its folder writable")
-        with self._told():
+        with self._errors():
             return self._connection.execute(
                 "DELETE FROM answers WHERE failure <> '' AND (?1 IS NULL OR problem = ?1)", (problem,)
             ).rowcount
 
     def table(self, path_loss: bool = False) -> pd.DataFrame:
-        """All RT calls in the order in which they were committed; damaged ones are told and left out.
+        """All RT calls in the order of their commits; damaged calls are left out with a warning.
 
         Args:
             path_loss: Add one column per link: `link_1`, `link_2`, ... [dB].
@@ -269,7 +265,7 @@ class Ledger:
         Raises:
             EngineError: The ledger cannot be read.
         """
-        with self._told():
+        with self._errors():
             rows = self._connection.execute(
                 f"""SELECT id, problem, engine, time, parameters, candidate, {ENTRY}
                 FROM answers JOIN problems USING (problem) ORDER BY id"""
@@ -283,7 +279,7 @@ class Ledger:
             except (TypeError, ValueError):
                 entry, values = "no candidate", {}
             if not isinstance(entry, LedgerEntry):
-                log.warning("%s: call %d is damaged (%s); left out", self.path, number, entry)
+                _LOG.warning("%s: call %d is damaged (%s); left out", self.path, number, entry)
                 continue
             status = "failed" if entry.failure else "ok"
             texts = (problem[:12], engine, when, entry.seconds, status, entry.failure)
@@ -294,22 +290,34 @@ class Ledger:
         return pd.DataFrame(records, columns=None if records else COLUMNS)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _errors(self) -> Iterator[None]:
+        """Turn errors of SQLite into errors with a remedy."""
         try:
             yield
         except sqlite3.Error as error:
             raise EngineError(f"{self.path}: the ledger cannot be used ({explain(error)})") from None
 
-    def _check_place(self) -> None:
-        if not self.read_only and _identity(self.path) != self._file:
-            # What was removed can still be read, for as long as it is held open.
-            with self._told():
-                kept = self.rescue(self._all())
-            raise EngineError(f"{self.path}: was removed or replaced while the run went on; {kept}")
+    def _check_identity(self) -> None:
+        """Rescue all answers and end the run if the file was removed or replaced."""
+        if self.read_only or _identity(self.path) == self._file:
+            return
+        # A removed file can still be read while it is open.
+        with self._errors():
+            rows = self._connection.execute(
+                f"SELECT problem, engine, parameters, candidate, {ENTRY} FROM answers JOIN problems USING (problem)"
+            ).fetchall()
+            entries = [read_entry(problem, candidate, tuple(row)) for problem, _, _, candidate, *row in rows]
+            answers = [
+                RescuedAnswer(*row[:4], entry)
+                for row, entry in zip(rows, entries, strict=True)
+                if isinstance(entry, LedgerEntry)
+            ]
+            rescued = self.rescue(answers)
+        raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")
 
 
 def open_ledger(folder: str | Path) -> Ledger:
-    """The ledger of a folder that `calibray run` writes into.
+    """The ledger of a folder that `calibray run` has written to.
 
     Args:
         folder: The folder.
@@ -329,7 +337,7 @@ def open_ledger(folder: str | Path) -> Ledger:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What file lies at a path."""
+    """Device and inode of the file at a path."""
     try:
         status = path.stat()
     except OSError:

@@ -2,39 +2,42 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from threading import Event
-from typing import Final
+from typing import Final, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.ledger.entry import LedgerEntry, key
+from calibray.engines.ledger.answers import LedgerEntry, RescuedAnswer, key
 from calibray.engines.ledger.ledger import Ledger
-from calibray.engines.ledger.rescue import Rescued
 from calibray.engines.protocol import Answer, Answering, check_candidates, gather
 from calibray.errors import EngineError
 from calibray.materials import Material
 from calibray.parameters import Parameters
 from calibray.support.progress import Progress
 
-GLANCES: Final = (0.02, 1.0)  # shortest and longest wait between two looks for another run's answers [s]
+SHORTEST_WAIT: Final = 0.02
+LONGEST_WAIT: Final = 1.0
+"""Intervals between checks for the answers of another run [s]."""
 
 
+@final
 class Recorded:
-    """An engine behind a ledger: what was run once, by any run, is not run again.
+    """An engine behind a ledger: a candidate that any run has paid for is not run again.
 
     Args:
         engine: The engine.
         ledger: The ledger.
-        problem: Fingerprint of all that the engine's answers depend on besides the candidate.
+        problem: Fingerprint of everything that the engine's answers depend on besides the candidate.
         name: Name of the engine.
-        progress: Called with "waiting", answers that another run gave and answers waited for.
+        progress: Called with "waiting", the answers that came from another run and the answers waited for.
 
     Attributes:
-        hits: Candidates that the ledger answered so far; they are no RT calls.
+        hits: Number of candidates answered by the ledger so far; they are not RT calls.
     """
 
     def __init__(
@@ -46,12 +49,12 @@ class Recorded:
 
     @property
     def calls(self) -> int:
-        """RT calls so far: candidates that the engine itself has run."""
+        """Number of RT calls so far: candidates that the engine itself has run."""
         return self._engine.calls
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters that a candidate's components stand for."""
+        """The parameters that a candidate gives values to."""
         return self._engine.parameters
 
     @property
@@ -69,10 +72,9 @@ class Recorded:
             Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
 
         Raises:
-            InputError: The candidates have another width, a value is outside physics, or the ledger holds no answer
-                and cannot be written.
-            EngineError: Every candidate of the first batch failed; these failures are taken out of the ledger. Or the
-                ledger could not be used; what was answered is kept elsewhere.
+            InputError: The candidates have another width, a value is unphysical, or a read-only ledger lacks an answer.
+            EngineError: Every candidate of the first batch failed; these failures are deleted from the ledger. Or the
+                ledger cannot be used; answers are kept in a rescue file.
         """
         values = check_candidates(candidates, len(self.parameters))
         first = self.calls + self.hits == 0
@@ -82,65 +84,72 @@ class Recorded:
         return gather(answers, (len(values), self._engine.num_links), first)
 
     def _answers(self, values: NDArray[np.float64]) -> Iterator[Answer]:
-        places: dict[bytes, list[int]] = {}
+        # The same candidate may occur several times in one batch, and is run once.
+        missing: dict[bytes, list[int]] = {}
         for index, value in enumerate(values):
-            places.setdefault(key(value), []).append(index)
-        yield from self._known(places)
-        wait, awaited = GLANCES[0], 0
-        while places:
+            missing.setdefault(key(value), []).append(index)
+        yield from self._from_ledger(missing)
+        pause, awaited = SHORTEST_WAIT, 0
+        while missing:
             self._describe()
-            if claimed := self._ledger.claim(self._problem, list(places), self._engine.num_links):
-                yield from self._paid(values, {each: places.pop(each) for each in claimed})
-                wait, awaited = GLANCES[0], len(places)
-            before = len(places)
-            yield from self._known(places)
-            if len(places) == before and places:
+            if claimed := self._ledger.claim(self._problem, list(missing), self._engine.num_links):
+                yield from self._from_engine(
+                    values, {candidate: missing.pop(candidate) for candidate in claimed}
+                )
+                pause, awaited = SHORTEST_WAIT, len(missing)
+            before = len(missing)
+            yield from self._from_ledger(missing)
+            if len(missing) == before and missing:
+                # Another run has claimed these candidates and pays for them.
                 if self._progress is not None:
-                    self._progress("waiting", max(0, awaited - len(places)), max(awaited, len(places)))
-                time.sleep(wait)  # for another run that pays for them
-                wait = min(2 * wait, GLANCES[1])
+                    self._progress("waiting", max(0, awaited - len(missing)), max(awaited, len(missing)))
+                time.sleep(pause)
+                pause = min(2 * pause, LONGEST_WAIT)
 
     def _describe(self) -> None:
         if not self._described and not self._ledger.read_only:
             self._ledger.describe(self._problem, self._name, self.parameters.names)
             self._described = True
 
-    def _known(self, places: dict[bytes, list[int]]) -> Iterator[Answer]:
-        """The answers that the ledger holds, which are taken out of `places`."""
-        for candidate in list(places):
+    def _from_ledger(self, missing: dict[bytes, list[int]]) -> Iterator[Answer]:
+        """The answers in the ledger; their candidates are removed from `missing`."""
+        for candidate in list(missing):
             entry = self._ledger.find(self._problem, candidate, self._engine.num_links)
             if entry is not None:
-                indices = places.pop(candidate)
+                indices = missing.pop(candidate)
                 self.hits += len(indices)
                 yield from (_answer(index, entry) for index in indices)
 
-    def _paid(self, values: NDArray[np.float64], places: dict[bytes, list[int]]) -> Iterator[Answer]:
-        """The engine's answers to candidates that this run has claimed."""
-        keys, stop = list(places), Event()
+    def _from_engine(self, values: NDArray[np.float64], indices: dict[bytes, list[int]]) -> Iterator[Answer]:
+        """The engine's answers to candidates that this run has claimed, given by their indices in the batch."""
+        keys, stop = list(indices), Event()
         with self._ledger.working():
-            answers = self._engine.answers(values[[places[each][0] for each in keys]], stop)
+            answers = self._engine.answers(values[[indices[candidate][0] for candidate in keys]], stop)
             for answer in answers:
                 candidate, entry = keys[answer.index], _entry(answer)
                 try:
                     entry = self._ledger.commit(self._problem, candidate, entry)
                 except (EngineError, KeyboardInterrupt) as error:
+                    # Calls that are running were paid for: collect their answers before the run ends.
                     stop.set()
-                    kept = [(candidate, entry)]
+                    unsaved = [(candidate, entry)]
                     with suppress(EngineError):
-                        kept += [(keys[other.index], _entry(other)) for other in answers]
+                        unsaved += [(keys[other.index], _entry(other)) for other in answers]
                     if isinstance(error, KeyboardInterrupt):
-                        for each in kept:
-                            self._ledger.commit(self._problem, *each)
+                        for paid in unsaved:
+                            self._ledger.commit(self._problem, *paid)
                         raise
-                    raise EngineError(f"{error}. {self._rescue(kept)}") from None
-                indices = places[candidate]
-                self.hits += len(indices) - 1  # asked for twice in one batch
-                yield from (_answer(index, entry) for index in indices)
+                    raise EngineError(f"{error}. {self._rescue(unsaved)}") from None
+                self.hits += len(indices[candidate]) - 1
+                yield from (_answer(index, entry) for index in indices[candidate])
 
-    def _rescue(self, kept: list[tuple[bytes, LedgerEntry]]) -> str:
-        names = self.parameters.names
+    def _rescue(self, unsaved: list[tuple[bytes, LedgerEntry]]) -> str:
+        names = json.dumps(list(self.parameters.names))
         return self._ledger.rescue(
-            [Rescued.of(self._problem, self._name, names, candidate, entry) for candidate, entry in kept]
+            [
+                RescuedAnswer(self._problem, self._name, names, candidate, entry)
+                for candidate, entry in unsaved
+            ]
         )
 
 

@@ -1,10 +1,10 @@
-"""Links in blocks: speed-up by a second worker, bytes that come back, and memory and time against the number of links.
+"""Links in chunks: speed-up by a second worker, bytes that come back, and memory and time against the number of links.
 
-    python benchmarks/blocks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
-    python benchmarks/blocks.py validate            # the same of a validation by two blocks held out
-    python benchmarks/blocks.py bytes               # what a candidate moves, by number of links
-    python benchmarks/blocks.py links               # memory and time of a step, blocks repeated up to a million links
-    python benchmarks/blocks.py city --links 100000 # a campaign in Munich end to end, in one process
+    python benchmarks/chunks.py speed-up            # tracing and search in Munich, 2 workers of one thread against 1
+    python benchmarks/chunks.py validate            # the same of a validation by two blocks held out
+    python benchmarks/chunks.py bytes               # what a candidate moves, by number of links
+    python benchmarks/chunks.py links               # memory and time of a step, chunks repeated up to a million links
+    python benchmarks/chunks.py city --links 100000 # a campaign in Munich end to end, in one process
 
 Each has processes and a cache of its own. Measured values are a law of the distance with noise of 6 dB: how well they
 fit is no matter here.
@@ -28,11 +28,10 @@ import numpy as np
 
 import calibray as cb
 from calibray import engines
-from calibray.engines.cluster.blocks import Blocks
-from calibray.engines.cluster.executors import open_local_client
-from calibray.engines.cluster.partition import block_size, cut, seconds_to_trace
-from calibray.engines.cluster.workers import Cluster, Crew, Here
-from calibray.engines.kinds import replay
+from calibray.engines import ChunkedReplay, InProcess, Workers
+from calibray.engines.cluster.chunks import chunk_size, cut, seconds_to_trace
+from calibray.engines.cluster.dask_workers import DaskWorkers, local_cluster
+from calibray.engines.kinds.replay import trace_and_replay
 from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
@@ -40,11 +39,11 @@ from calibray.study import Setup, Study
 
 MASTS = np.array([[8.5, 21.0, 27.0], [45.0, 90.0, 40.0]])  # [m]
 COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
-STEPS, CANDIDATES = 3, 32  # of a search over repeated blocks
+STEPS, CANDIDATES = 3, 32  # of a search over repeated chunks
 PARAMETERS = ("concrete", "marble", "brick")
 
-Work = Callable[[Setup, "Crew | None"], tuple[float, float]]
-"""An opened study, and where its blocks live, to the seconds of tracing and of the rest."""
+Work = Callable[[Setup, "Workers | None"], tuple[float, float]]
+"""From an opened study and its workers to the seconds of tracing and of the rest."""
 
 
 def study(engine: dict, starts: int, samples: int | str) -> Study:
@@ -81,19 +80,19 @@ def resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def searched(setup: Setup, crew: Crew | None) -> tuple[float, float]:
+def searched(setup: Setup, workers: Workers | None) -> tuple[float, float]:
     """Seconds of tracing and of search."""
     started = time.perf_counter()
-    problem = Problem.of(setup, engines.make(setup, executor=crew))
+    problem = Problem.of(setup, engines.make(setup, workers=workers))
     traced = time.perf_counter()
     search(problem, choose(problem))
     return traced - started, time.perf_counter() - traced
 
 
-def validated(setup: Setup, crew: Crew | None) -> tuple[float, float]:
+def validated(setup: Setup, workers: Workers | None) -> tuple[float, float]:
     """Seconds of tracing and of judging by two blocks."""
     started, told = time.perf_counter(), []
-    cb.validate(setup, blocks=2, crew=crew, progress=lambda *_: told.append(time.perf_counter()))
+    cb.validate(setup, blocks=2, crew=workers, progress=lambda *_: told.append(time.perf_counter()))
     traced = told[-3]
     return traced - started, time.perf_counter() - traced
 
@@ -116,16 +115,16 @@ def speed_up(links: int, work: Work) -> None:
         with (
             tempfile.TemporaryDirectory() as cache,
             pinned(CALIBRAY_CACHE=cache, JAX_COMPILATION_CACHE_DIR=None),
-            open_local_client(workers) as client,
+            local_cluster(workers) as client,
         ):
             # Dr.Jit and XLA would take every core for a single worker.
             for core, worker in enumerate(client.scheduler_info()["workers"]):
                 client.run(on_core, core % (os.cpu_count() or 1), workers=[worker])
-            crew = Cluster(client)
+            opened = DaskWorkers(client)
             # Libraries and the scene are loaded before the clock starts.
-            engines.make(campaign(2, {"block_links": 1}, seed=9), executor=crew)
+            engines.make(campaign(2, {"chunk_links": 1}, seed=9), workers=opened)
             before, here = client.run(time.process_time), time.process_time()
-            tracing, searching = work(campaign(links, {"block_links": -(-links // 8)}), crew)
+            tracing, searching = work(campaign(links, {"chunk_links": -(-links // 8)}), opened)
             after, lead = client.run(time.process_time), time.process_time() - here
             busy = [after[worker] - before[worker] for worker in after]
         together, critical = tracing + searching, max(busy) + lead
@@ -162,28 +161,28 @@ def moved(links: int) -> None:
     import pickle
 
     for count in (links // 4, links):
-        setup = campaign(count, {"block_links": -(-count // 4)})
+        setup = campaign(count, {"chunk_links": -(-count // 4)})
         problem = Problem.of(setup, engines.make(setup))
-        engine = cast(Blocks, problem.engine)
-        shares = problem.objective.shares(engine.blocks)
+        engine = cast(ChunkedReplay, problem.engine)
+        shares = problem.objective.shares(engine.chunks)
         parts = engine.reducing(shares)(np.repeat(problem.parameters.start[None], 64, axis=0), True)
         size = sum(len(pickle.dumps(part)) for part in parts)
         whole = 64 * count * 8 * (1 + len(problem.parameters))
         print(
-            f"{count} links in {len(parts)} blocks: {size / 64:.0f} bytes a candidate come back with derivatives; "
+            f"{count} links in {len(parts)} chunks: {size / 64:.0f} bytes a candidate come back with derivatives; "
             f"path loss and derivatives of the links themselves would be {whole / 64:,.0f}"
         )
 
 
-def repeated(blocks: int, links: int) -> None:
-    """One block's links again and again, two blocks of them open at once; steps of a search over all."""
-    one = campaign(links, {"block_links": links})
-    tx, rx = (np.tile(end, (blocks, 1)) for end in (one.links.tx, one.links.rx))
-    loss, mast = (np.tile(each, blocks) for each in (one.links.path_loss_db, one.links.group_index))
+def repeated(chunks: int, links: int) -> None:
+    """One chunk's links again and again, two chunks open at once; steps of a search over all."""
+    one = campaign(links, {"chunk_links": links})
+    tx, rx = (np.tile(end, (chunks, 1)) for end in (one.links.tx, one.links.rx))
+    loss, mast = (np.tile(each, chunks) for each in (one.links.path_loss_db, one.links.group_index))
     setup = one.at(cb.Measurements(tx=tx, rx=rx, path_loss_db=loss, group=mast))
-    parts = [np.arange(links) + links * k for k in range(blocks)]
+    parts = [np.arange(links) + links * k for k in range(chunks)]
     started = time.perf_counter()
-    engine = Blocks(Here(at_most=2), setup, parts, partial(replay._traced, None))
+    engine = ChunkedReplay(InProcess(at_most=2), setup, parts, partial(trace_and_replay, None))
     problem = Problem.of(setup, engine)
     opened = time.perf_counter() - started
     lower, upper = problem.parameters.search_bounds
@@ -191,9 +190,9 @@ def repeated(blocks: int, links: int) -> None:
     for _ in range(STEPS):
         problem.squares(points, derivatives=True)
     seconds = time.perf_counter() - started - opened
-    each = 1e6 * seconds / STEPS / CANDIDATES / blocks / links
+    each = 1e6 * seconds / STEPS / CANDIDATES / chunks / links
     print(
-        f"{blocks * links:>9,} links in {blocks:>4} blocks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} times "
+        f"{chunks * links:>9,} links in {chunks:>4} chunks: {opened:.1f} s to open, {seconds:.1f} s for {STEPS} times "
         f"{CANDIDATES} candidates with derivatives, {each:.3f} us a link and candidate, peak memory "
         f"{resident():.2f} GiB",
         flush=True,
@@ -202,9 +201,11 @@ def repeated(blocks: int, links: int) -> None:
 
 def city(links: int, samples: int | str) -> None:
     """Calibrate end to end in one process."""
-    setup = campaign(links, {"block_links": block_size(None, links)}, samples=samples)
-    blocks = cut(setup.links, block_size(None, links))
-    print(f"{links:,} links in {len(blocks)} blocks; told {seconds_to_trace(setup, blocks):.0f} s of tracing")
+    setup = campaign(links, {"chunk_links": chunk_size(None, links)}, samples=samples)
+    chunks = cut(setup.links, chunk_size(None, links))
+    print(
+        f"{links:,} links in {len(chunks)} chunks; predicted {seconds_to_trace(setup, chunks):.0f} s of tracing"
+    )
     with tempfile.TemporaryDirectory() as cache, pinned(CALIBRAY_CACHE=cache):
         started = time.perf_counter()
         result = cb.calibrate(setup)
@@ -216,8 +217,8 @@ def main() -> None:
     """Run what was asked for, each size in a process of its own."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("speed-up", "validate", "bytes", "links", "city"))
-    parser.add_argument("--links", type=int, default=None, help="number of links, of a block with `links`")
-    parser.add_argument("--blocks", type=int, nargs="+", default=[1, 10, 100])
+    parser.add_argument("--links", type=int, default=None, help="number of links, of a chunk with `links`")
+    parser.add_argument("--chunks", type=int, nargs="+", default=[1, 10, 100])
     parser.add_argument(
         "--samples",
         type=lambda word: word if word == "auto" else int(word),
@@ -228,8 +229,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.what == "links" and not options.child:
         with tempfile.TemporaryDirectory() as cache:
-            for blocks in options.blocks:
-                words = ["links", "--child", "--blocks", str(blocks), "--links", str(options.links or 10_000)]
+            for chunks in options.chunks:
+                words = ["links", "--child", "--chunks", str(chunks), "--links", str(options.links or 10_000)]
                 environment = os.environ | {"CALIBRAY_CACHE": cache}
                 subprocess.run([sys.executable, Path(__file__), *words], check=True, env=environment)
         return
@@ -237,7 +238,7 @@ def main() -> None:
         "speed-up": lambda: speed_up(options.links or 2000, searched),
         "validate": lambda: speed_up(options.links or 400, validated),
         "bytes": lambda: moved(options.links or 400),
-        "links": lambda: repeated(options.blocks[0], options.links),
+        "links": lambda: repeated(options.chunks[0], options.links),
         "city": lambda: city(options.links or 100_000, options.samples),
     }[options.what]()
 

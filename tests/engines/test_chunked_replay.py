@@ -1,4 +1,4 @@
-"""Links in blocks: the same sums, and the same calibration, as in one piece. Worker processes: `test_dask.py`."""
+"""Chunked replay gives the same sums and the same calibration as replay of all links; `test_dask.py` has workers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pytest
 
 import two_ray
 from calibray import engines
-from calibray.engines.cluster.blocks import Blocks
-from calibray.engines.cluster.partition import cut
-from calibray.engines.cluster.workers import Here, open_crew
-from calibray.engines.kinds.replay import _traced
+from calibray.engines import ChunkedReplay, InProcess
+from calibray.engines.cluster.chunks import cut
+from calibray.engines.kinds.replay import trace_and_replay
 from calibray.errors import InputError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
@@ -43,20 +42,20 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_sums_of_blocks_are_those_of_all_links(tmp_path, name):
-    whole, parted = (
+def test_sums_over_chunks_equal_sums_over_all_links(tmp_path, name):
+    whole, chunked = (
         Problem.of(setup, engines.make(setup))
         for setup in (
             Setup.open(
                 two_ray.study(tmp_path, noise_db=3.0, free=2, **VARIANTS[name], **engine), two_ray.TwoRay
             )
-            for engine in ({}, {"engine": {"name": "replay", "block_links": 12}})
+            for engine in ({}, {"engine": {"name": "replay", "chunk_links": 12}})
         )
     )
-    assert len(parted.engine.blocks) == 3
+    assert len(chunked.engine.chunks) == 3
     lower, upper = whole.parameters.search_bounds
     points = lower + np.random.default_rng(1).random((6, len(lower))) * (upper - lower)
-    expected, found = whole.evaluate(points, derivatives=True), parted.squares(points, derivatives=True)
+    expected, found = whole.evaluate(points, derivatives=True), chunked.squares(points, derivatives=True)
     assert found.value == pytest.approx(expected.value, rel=1e-12)
     assert found.rmse_db == pytest.approx(expected.rmse_db, rel=1e-12)
     assert found.residuals.shape == (6, len(lower) + 1)
@@ -67,13 +66,13 @@ def test_sums_of_blocks_are_those_of_all_links(tmp_path, name):
         assert share * told.T @ told == pytest.approx(want.T @ want, rel=1e-10, abs=1e-10)
         gradient = want.T @ expected.residuals[k]
         assert share * told.T @ found.residuals[k] == pytest.approx(gradient, rel=1e-9, abs=1e-9)
-    assert parted.squares(points).value == pytest.approx(expected.value, rel=1e-12)
-    assert parted.modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
-    opening = partial(_traced, None)
-    poor = Blocks(
-        Here(at_most=1), parted.setup, parted.engine.blocks, opening
-    )  # two of three are opened each time
-    assert replace(parted, engine=poor).modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
+    assert chunked.squares(points).value == pytest.approx(expected.value, rel=1e-12)
+    assert chunked.modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
+    # With room for one chunk, the other two are opened again for each question.
+    engine = ChunkedReplay(
+        InProcess(at_most=1), chunked.setup, chunked.engine.chunks, partial(trace_and_replay, None)
+    )
+    assert replace(chunked, engine=engine).modelled(points) == pytest.approx(expected.modelled, rel=1e-12)
 
 
 def made_up(count: int) -> tuple[Measurements, np.ndarray, np.ndarray]:
@@ -104,10 +103,10 @@ def test_a_lost_path_and_a_link_left_out_are_as_in_one_piece():
     nuisance = Nuisance(30, (make_term(links, "offset", labels=np.arange(30) % 3, bounds=(-2.0, 2.0)),))
     counted = np.arange(30) != 11
     objective = make_objective(links, np.ones(30, bool), counted, nuisance=nuisance)
-    blocks = cut(links, 9)
-    assert sorted(np.concatenate(blocks)) == list(range(30))
-    shares = objective.shares(blocks)
-    parts = [share(loss[:, block], slope[:, block]) for share, block in zip(shares, blocks, strict=True)]
+    chunks = cut(links, 9)
+    assert sorted(np.concatenate(chunks)) == list(range(30))
+    shares = objective.shares(chunks)
+    parts = [share(loss[:, chunk], slope[:, chunk]) for share, chunk in zip(shares, chunks, strict=True)]
     products, square = objective.products(total(parts, shares, 3))
     residuals, jacobian = objective.residuals(loss), objective.jacobian(loss, slope)
     assert square[0] == pytest.approx(np.sum(residuals[0] ** 2), rel=1e-12)
@@ -118,9 +117,10 @@ def test_a_lost_path_and_a_link_left_out_are_as_in_one_piece():
 
 
 @pytest.mark.parametrize("workers", [0, 300_000])
-def test_processes_that_no_machine_can_use_are_refused(workers):
+def test_processes_that_no_machine_can_use_are_refused(tmp_path, workers):
+    setup = Setup.open(two_ray.study(tmp_path), two_ray.TwoRay)
     with (
-        pytest.raises(InputError, match=f"--workers {workers}: must be at least 1 and at most"),
-        open_crew(workers),
+        pytest.raises(InputError, match=f"--workers {workers}: must be at"),
+        engines.open_workers(workers) as opened,
     ):
-        pass
+        engines.make(setup, workers=opened)

@@ -1,0 +1,300 @@
+"""The workers of a Dask cluster, local or behind a scheduler."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence, Sized
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from socket import create_connection, gaierror
+from typing import TYPE_CHECKING, Any, Final, NoReturn, cast, final
+
+from calibray.errors import EngineError, InputError
+from calibray.support.messages import shortened
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+SCHEDULER_WAIT = 30.0
+"""Longest wait for a scheduler to answer [s]."""
+
+ALWAYS_ALLOWED: Final = 8
+"""Worker processes that may be asked for on any machine, however few cores it has."""
+
+POLL: Final = 0.5
+"""Interval between checks for dead workers [s]."""
+
+REPLACEMENT_WAIT: Final = 10.0
+"""Longest wait for the replacement of a dead worker, before other workers take its chunks [s]."""
+
+NO_WORKER_WAIT: Final = 600.0
+"""Longest wait for a worker if none is left [s]."""
+
+MOST_DEATHS: Final = 4
+"""Workers that die with a chunk before the run ends: the chunk itself is probably too large."""
+
+FETCH_WAIT: Final = 30.0
+"""Longest time for an answer to arrive before it is requested again [s]."""
+
+Answered = Callable[[int], None]
+"""Called with a chunk's number after its answer."""
+
+_ADDRESS: Final = re.compile(
+    r"(?:(?:tcp|tls|wss?)://)?(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]{1,253}):(?P<port>[0-9]{1,5})"
+)
+_LOG: Final = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class _KeptRemotely:
+    """Objects on workers: for each chunk the worker that made its object last, and Dask's reference to it."""
+
+    make: Callable[[Any], Any]
+    sources: list[Any]
+    objects: dict[int, tuple[str, Future]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+
+@final
+class DaskWorkers:
+    """The workers of a Dask cluster.
+
+    A chunk stays on one worker, its home. If that worker dies, its replacement takes the chunk, or another worker if no
+    replacement comes, and makes the chunk's objects again. Paths then come from the cache, if workers share its folder.
+
+    Args:
+        client: Dask's client, connected.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._homes: dict[int, str] = {}
+        self._deaths: dict[int, int] = {}
+        self._most_workers = 0
+
+    def executor(self) -> Executor:
+        """Dask's executor: the scheduler gives the calls of a worker that dies to other workers."""
+        return self._client.get_executor(pure=False)
+
+    def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
+        """Make and keep an object for every chunk; see `Workers.keep`."""
+        return _KeptRemotely(make, list(sources))
+
+    def ask(
+        self,
+        function: Callable[..., Any],
+        kept: Sequence[Sized],
+        *arguments: Any,
+        answered: Answered | None = None,
+    ) -> list[Any]:
+        """Call a function on the objects of every chunk; see `Workers.ask`."""
+        handles = [handle for handle in kept if isinstance(handle, _KeptRemotely)]
+        count = len(handles[0])
+        self._assign_homes(range(count), self._living(at_least=1))
+        waiting = {index: self._submit(function, handles, index, arguments) for index in range(count)}
+        answers: dict[int, Any] = {}
+        while waiting:
+            self._wait_for_any(list(waiting.values()))
+            for index in [index for index, future in waiting.items() if future.done()]:
+                if self._fetch(waiting[index], index, answers):
+                    del waiting[index]
+                    if answered is not None:
+                        answered(index)
+            for index in self._move_from_dead(waiting):
+                waiting[index] = self._submit(function, handles, index, arguments)
+        return [answers[index] for index in range(count)]
+
+    def _submit(
+        self,
+        function: Callable[..., Any],
+        handles: Sequence[_KeptRemotely],
+        index: int,
+        arguments: tuple[Any, ...],
+    ) -> Future:
+        home = self._homes[index]
+        for handle in handles:
+            if handle.objects.get(index, ("",))[0] != home:
+                future = self._client.submit(handle.make, handle.sources[index], workers=[home], pure=False)
+                handle.objects[index] = home, future
+        objects = (handle.objects[index][1] for handle in handles)
+        return self._client.submit(function, *objects, *arguments, workers=[home], pure=False)
+
+    def _wait_for_any(self, futures: list[Future]) -> None:
+        from distributed import wait
+
+        try:
+            wait(futures, timeout=POLL, return_when="FIRST_COMPLETED")
+        except TimeoutError:
+            return
+
+    def _fetch(self, future: Future, index: int, answers: dict[int, Any]) -> bool:
+        """Fetch an answer; False if it was lost with its worker."""
+        from distributed import KilledWorker
+
+        try:
+            answers[index] = future.result(timeout=FETCH_WAIT)
+        except TimeoutError:
+            return False
+        except KilledWorker:
+            # The chunk's home is gone; `_move_from_dead` moves the chunk.
+            return False
+        return True
+
+    def _move_from_dead(self, waiting: dict[int, Future]) -> list[int]:
+        """Give the chunks of dead workers a new home.
+
+        Raises:
+            EngineError: Too many workers died with one chunk, or no worker is left.
+        """
+        living = self._living()
+        lost = [index for index in waiting if self._homes[index] not in living]
+        if not lost:
+            return []
+        _LOG.warning("%d of %d chunks lost their worker; they are opened again", len(lost), len(self._homes))
+        living = self._living(at_least=self._most_workers)
+        for index in lost:
+            waiting[index].cancel()
+            del self._homes[index]
+            self._deaths[index] = self._deaths.get(index, 0) + 1
+            if self._deaths[index] >= MOST_DEATHS:
+                raise EngineError(
+                    f"chunk {index + 1}: {MOST_DEATHS} workers died with it; give workers more memory, or lower "
+                    "engine.chunk_links"
+                )
+        self._assign_homes(lost, living)
+        return lost
+
+    def _assign_homes(self, chunks: Sequence[int], living: list[str]) -> None:
+        """Assign every chunk without a home to the worker with the fewest chunks."""
+        self._most_workers = max(self._most_workers, len(living))
+        load = {worker: 0 for worker in living}
+        for home in self._homes.values():
+            if home in load:
+                load[home] += 1
+        for index in chunks:
+            if index not in self._homes:
+                self._homes[index] = min(load, key=lambda worker: load[worker])
+                load[self._homes[index]] += 1
+
+    def _living(self, at_least: int = 0) -> list[str]:
+        """Addresses of the living workers; waits a while for more if there are too few.
+
+        Raises:
+            EngineError: No worker came in `NO_WORKER_WAIT`.
+        """
+        start, warned = time.monotonic(), False
+        while True:
+            living, waited = sorted(cast(dict[str, int], self._client.nthreads())), time.monotonic() - start
+            if len(living) >= at_least or (living and waited > REPLACEMENT_WAIT):
+                return living
+            if waited > NO_WORKER_WAIT:
+                raise EngineError(f"the Dask cluster has had no worker for {NO_WORKER_WAIT:g} s; start some")
+            if not living and not warned:
+                _LOG.warning("the Dask cluster has no worker; waiting for one")
+                warned = True
+            time.sleep(POLL)
+
+
+@contextmanager
+def scheduler_client(scheduler: str) -> Iterator[Client]:
+    """Connect to a Dask scheduler.
+
+    Args:
+        scheduler: Its address, for instance "tcp://10.0.0.1:8786".
+
+    Yields:
+        The client, closed at the end.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers.
+    """
+    _require_dask("--scheduler")
+    from distributed import Client
+
+    _wait_for_scheduler(scheduler)
+    try:
+        client = Client(scheduler, timeout=SCHEDULER_WAIT)
+    # Programs other than a scheduler may answer Dask's greeting with anything.
+    except (OSError, ValueError, TypeError, RuntimeError, AssertionError) as error:
+        _refuse(scheduler, str(error))
+    with client:
+        yield client
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator[Client]:
+    """Start Dask workers on this machine, each with its share of the processor cores.
+
+    Args:
+        workers: Number of processes.
+
+    Yields:
+        Dask's client; the processes end with it.
+
+    Raises:
+        InputError: There are more processes than this machine can use, or Dask is not installed.
+    """
+    most = max(os.cpu_count() or 1, ALWAYS_ALLOWED)
+    if workers > most:
+        raise InputError(
+            f"--workers {workers}: must be at most {most}, because each is a process that keeps a core busy; use more "
+            "machines and --scheduler"
+        )
+    _require_dask("--workers")
+    from distributed import Client, LocalCluster
+
+    from calibray.engines.cluster.cores import Cores
+
+    # The study states how large chunks are; with a memory limit Dask would kill a worker with a large chunk.
+    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "memory_limit": 0}
+    with (
+        # `DaskWorkers` reports dead workers itself.
+        LocalCluster(n_workers=workers, silence_logs=logging.ERROR, **options) as cluster,
+        Client(cluster) as client,
+    ):
+        client.register_plugin(Cores(workers))
+        yield client
+
+
+def _require_dask(option: str) -> None:
+    if find_spec("distributed") is None:
+        raise InputError(f"{option} needs Dask; install it with: pip install 'calibray[dask]'")
+
+
+def _wait_for_scheduler(scheduler: str) -> None:
+    """Wait until a program answers at an address; otherwise Dask would log tracebacks.
+
+    Raises:
+        InputError: The address is malformed, or nothing answers there.
+    """
+    match = _ADDRESS.fullmatch(scheduler)
+    if match is None or not 1 <= int(match["port"]) <= 65_535:
+        raise InputError(
+            f"--scheduler {shortened(scheduler)}: not an address; give host and port, as tcp://10.0.0.1:8786"
+        )
+    host, end = match["host"].strip("[]"), time.monotonic() + SCHEDULER_WAIT
+    while True:
+        try:
+            create_connection((host, int(match["port"])), timeout=SCHEDULER_WAIT).close()
+        except (gaierror, UnicodeError) as error:
+            _refuse(scheduler, str(error))
+        except OSError as error:
+            if time.monotonic() > end:
+                _refuse(scheduler, str(error))
+            time.sleep(POLL)
+        else:
+            return
+
+
+def _refuse(scheduler: str, fault: str) -> NoReturn:
+    raise InputError(
+        f"--scheduler {shortened(scheduler)}: no Dask scheduler answers there ({shortened(fault, 200)}); start one, "
+        "or correct the address"
+    ) from None

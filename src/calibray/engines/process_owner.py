@@ -1,0 +1,85 @@
+"""The process that owns a claim or a temporary folder, so that other processes can check whether it is still alive."""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import psutil
+
+CLOCK_TOLERANCE: Final = 2.0
+"""Largest difference of two readings of one process's start time [s]: the system's clock may be corrected between them.
+
+A process number is not used again within so short a time, because the system counts through all others first.
+"""
+
+
+@dataclass(frozen=True)
+class ProcessOwner:
+    """A process, identified across machines, containers and restarts.
+
+    Attributes:
+        host: The machine.
+        namespace: The process namespace, in which a container counts its own processes; empty if unknown.
+        pid: The process number.
+        started: Start time of the process [s since 1970]; process numbers are used again, also after a reboot.
+    """
+
+    host: str
+    namespace: str
+    pid: int
+    started: float
+
+    @classmethod
+    def current(cls) -> ProcessOwner:
+        """This process."""
+        return cls(*_machine(), os.getpid(), psutil.Process().create_time())
+
+    def record(self) -> dict[str, str | int | float]:
+        """The owner as plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_record(cls, record: object) -> ProcessOwner | None:
+        """The owner from the value of `record`; None if the value is malformed."""
+        try:
+            owner = cls(**record)  # type: ignore[arg-type]
+        except TypeError:
+            return None
+        types = ((owner.host, str), (owner.namespace, str), (owner.pid, int), (owner.started, float))
+        return owner if all(isinstance(value, kind) for value, kind in types) else None
+
+    @property
+    def is_current(self) -> bool:
+        """Whether this is the current process."""
+        return self.pid == os.getpid() and (self.host, self.namespace) == _machine() and not self.is_gone
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether the process has certainly ended; processes of other machines and containers cannot be checked."""
+        if (self.host, self.namespace) != _machine():
+            return False
+        try:
+            process = psutil.Process(self.pid)
+            if process.status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+                return True
+            return abs(process.create_time() - self.started) > CLOCK_TOLERANCE
+        except (psutil.NoSuchProcess, ValueError, OverflowError):
+            return True
+        except psutil.AccessDenied:
+            return False
+
+
+@cache
+def _machine() -> tuple[str, str]:
+    """Host and process namespace of this process."""
+    try:
+        namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115
+        machine = Path("/etc/machine-id").read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        namespace = machine = ""
+    return f"{socket.gethostname()} {machine}".strip(), namespace

@@ -1,0 +1,433 @@
+"""The study and the opened study: one calibration problem, and the same with its links, scene and parameters read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from calibray.engines.section import EngineSection, RadioSettings
+from calibray.errors import InputError
+from calibray.materials import Material
+from calibray.measurements import (
+    LINK_COLUMNS,
+    Measurements,
+    SourceTable,
+    links_from_table,
+    measured_links,
+    read_table,
+)
+from calibray.parameters import Parameters
+from calibray.paths import Paths, take_links
+from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes.scene_file import content as scene_content
+from calibray.study.engine_keys import split_engine_keys
+from calibray.study.model import StudyModel
+from calibray.study.row_steps import link_columns, position_steps, row_steps
+from calibray.study.summary import summary
+from calibray.study.toml_file import read_content, refuse_unquoted_names
+from calibray.study.validation_errors import explain
+from calibray.support.progress import Progress
+from calibray.tables import display
+from calibray.tracing import cache
+from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing.positions import EnclosedAntennas
+from calibray.tracing.protocol import Tracer, TracerFactory
+from calibray.tracing.settings import TraceSettings
+from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+@final
+class Study(StudyModel):
+    """One calibration problem, as its study file states it; see ``docs/study-file.md``.
+
+    Attributes:
+        version: Version of the file format.
+        scene: The scene and the carrier.
+        objects: Materials that are created for some objects, by name: a pattern of the objects' names.
+        materials: Constants in place of the scene's, by material name.
+        links: The measured links.
+        antennas: The antennas.
+        trace: Settings of the ray tracer.
+        objective: How paths combine to a path loss.
+        parameters: The free parameters by name, in the order of a candidate's values.
+        offset: The short form of the nuisance term "offset", or None.
+        nuisance: Further nuisance terms by name; `nuisance_terms` has all.
+        noise: The errors of measured links.
+        holdout: The held-out links, or None.
+        fidelity: When to trace again.
+        method: The optimizer.
+        engine: The engine.
+    """
+
+    @classmethod
+    def load(cls, path: str | Path) -> Study:
+        """Read a study file.
+
+        Args:
+            path: The TOML file.
+
+        Returns:
+            The study.
+
+        Raises:
+            InputError: The file does not exist, is not TOML, has an unknown key or an impossible value, or names a
+                file that does not exist; one line for each error.
+        """
+        path = Path(path)
+        study = cls.from_content(read_content(path), path)
+        study.check_files()
+        return study
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Study:
+        """A study from the content of a study file; it is not checked that its files exist.
+
+        Args:
+            content: Sections by name, as TOML gives them.
+            path: The study file; other files are relative to its folder. It need not exist.
+
+        Returns:
+            The study.
+
+        Raises:
+            InputError: A key is unknown or a value impossible; one line for each error.
+        """
+        refuse_unquoted_names(content.get("parameters"), path)
+        engine, other_engines = split_engine_keys(content.get("engine", {}), str(path))
+        content = {**content, "engine": engine}
+        try:
+            # In JSON, a list passes for a tuple, but nothing else is converted: "4" is not a number.
+            text = json.dumps(content, default=str)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: a value cannot be used ({error}); correct it") from None
+        try:
+            study = cls.model_validate_json(text)
+        except ValidationError as error:
+            refusal = explain(error, cls, content, str(path), tagged=("engine",))
+            raise refusal from None
+        study._path, study._other_engines = Path(path), other_engines
+        return study
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_content, (self.content(), self._path.absolute())
+
+    def __repr__(self) -> str:
+        return display.text(*summary(self))
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return display.html(*summary(self))
+
+    def measurements(self) -> Measurements:
+        """Read the links, with the groups of the offset.
+
+        Returns:
+            All links of the study, held-out links included.
+
+        Raises:
+            InputError: The table cannot be used (see `read_measurements`), or the scene's place on the globe is
+                unknown.
+        """
+        return measured_links(read_table(self.links_path), link_columns(self), row_steps(self))
+
+    def places(self, table: SourceTable) -> Measurements:
+        """Links without measured values, for prediction, with the groups of the offset.
+
+        Args:
+            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame; or else with the
+                position columns that ``[links]`` names, in the same units. No row is left out.
+
+        Returns:
+            One link per row, with carriers if the table has the study's carrier column.
+
+        Raises:
+            InputError: A column is missing or malformed, or a position is not finite.
+        """
+        links, columns = self.links, {*table.frame}
+        group = self.offset_groups or None
+        if columns >= {*LINK_COLUMNS} or not columns & {*links.tx, *links.rx}:
+            return links_from_table(table, group, links.frequency)
+        return links_from_table(
+            table, group, links.frequency, steps=position_steps(self), tx=links.tx, rx=links.rx
+        )
+
+    def held_out(self, links: Measurements) -> NDArray[np.bool_]:
+        """Mask of the held-out links [L]: none without ``[holdout]``, or if blocks are held out in turn.
+
+        Args:
+            links: Links with the columns of the hold-out's filter.
+
+        Raises:
+            InputError: The filter is malformed, or selects all links or none.
+        """
+        if self.holdout is None or self.holdout.where is None:
+            return np.zeros(len(links), dtype=bool)
+        return links.held_out(self.holdout.where)
+
+    def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Study:
+        """The study with another method, seed or engine; a method's options are dropped with it.
+
+        Args:
+            method: Name of the method, or None to keep it.
+            seed: Seed, or None to keep it.
+            engine: Name of the engine, or None to keep it.
+
+        Returns:
+            The changed study.
+
+        Raises:
+            InputError: A value is impossible.
+        """
+        content = self.content()
+        if method is not None and method != self.method.name:
+            content["method"] = {"name": method, "seed": self.method.seed, "model": self.method.model}
+        if seed is not None:
+            content["method"]["seed"] = seed
+        if engine is not None:
+            content["engine"]["name"] = engine
+        return Study.from_content(content, self._path)
+
+    def opened(self) -> Setup:
+        """The opened study: its links, scene and parameters are read (see `Setup.open`)."""
+        return Setup.open(self)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """An opened study: its links, scene and parameters, each read once, and the tracer of its paths.
+
+    Attributes:
+        study: The study.
+        links: All its links, held-out links included.
+        scene: Its scene with the parameters' start values, because materials steer the rays that are followed.
+        parameters: The parameters that a candidate gives values to.
+        held_out: Mask of the held-out links [L].
+        factory: Opens the scene in a ray tracer.
+    """
+
+    study: Study
+    links: Measurements
+    scene: Scene
+    parameters: Parameters
+    held_out: NDArray[np.bool_]
+    factory: TracerFactory
+
+    @classmethod
+    def open(cls, study: Study, tracer: TracerFactory = SIONNA, links: Measurements | None = None) -> Setup:
+        """Read the files of a study; nothing is traced yet.
+
+        Args:
+            study: The study.
+            tracer: Opens the scene in a ray tracer.
+            links: Links in place of the study's; none of them is held out.
+
+        Returns:
+            The opened study.
+
+        Raises:
+            InputError: The links, the scene, the parameters or the hold-out cannot be used.
+        """
+        held_out = None
+        if links is None:
+            links = study.measurements()
+            held_out = study.held_out(links)
+        scene = read_scene(study.scene_source, study.scene.frequency, study.overrides, study.objects)
+        parameters = study.parameter_set(scene.materials, scene.laws)
+        parameters.check_carriers([frequency for frequency, _ in links.carriers])
+        scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
+        if held_out is None:
+            held_out = np.zeros(len(links), dtype=bool)
+        return cls(study, links, scene, parameters, held_out, tracer)
+
+    def opened(self) -> Setup:
+        """Itself, so that functions can take a study, opened or not."""
+        return self
+
+    def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
+        """The same with another method, seed or engine; no file is read again (see `Study.replace`).
+
+        Args:
+            method: Name of the method, or None to keep it.
+            seed: Seed, or None to keep it.
+            engine: Name of the engine, or None to keep it.
+
+        Returns:
+            The changed setup.
+
+        Raises:
+            InputError: A value is impossible.
+        """
+        return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
+
+    def at(self, links: Measurements) -> Setup:
+        """The same with other links, none of them held out; no file is read again.
+
+        Args:
+            links: The links.
+
+        Returns:
+            The changed setup.
+        """
+        return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
+
+    @property
+    def radio(self) -> RadioSettings:
+        """Carrier, bandwidth, combining and antennas."""
+        study = self.study
+        return RadioSettings(
+            study.scene.frequency, study.scene.bandwidth, study.objective.combining, study.antenna_pair
+        )
+
+    @property
+    def trace_settings(self) -> TraceSettings:
+        """Settings of the ray tracer."""
+        return self.study.trace
+
+    @property
+    def engine(self) -> EngineSection:
+        """The section ``[engine]``."""
+        return self.study.engine
+
+    @property
+    def source(self) -> Path:
+        """The study file."""
+        return self.study.path
+
+    @property
+    def tracer_versions(self) -> Mapping[str, str]:
+        """Versions of the ray tracer's parts by name."""
+        return self.factory.versions
+
+    @property
+    def tracer(self) -> Tracer:
+        """The ray tracer with the scene at the study's carrier, loaded on first use."""
+        if "tracer" not in self._loaded:
+            self._loaded["tracer"] = self._open_tracer(self.scene, self.study.scene.frequency)
+        return self._loaded["tracer"]
+
+    @cached_property
+    def _loaded(self) -> dict[str, Tracer]:
+        """The tracer once it is loaded, shared by all setups of one scene."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for another process: without the loaded tracer, and independent of the current folder."""
+        state = {item.name: getattr(self, item.name) for item in fields(self)}
+        return state | {"scene": replace(self.scene, path=self.scene.path.absolute())}
+
+    @property
+    def carriers(self) -> dict[float, dict[str, Material]]:
+        """Materials before calibration by carrier [Hz]; empty if all links have the study's carrier."""
+        return self._materials_by_carrier
+
+    @cached_property
+    def _materials_by_carrier(self) -> dict[float, dict[str, Material]]:
+        return {frequency: self._scene_at(frequency).materials for frequency, _ in self.links.carriers}
+
+    @cached_property
+    def enclosed(self) -> EnclosedAntennas | None:
+        """Antennas inside closed bodies of the scene; None if an external program answers."""
+        if self.study.engine.external:
+            return None
+        tracer, links = self.tracer, self.links
+        return EnclosedAntennas.of(links.row, tracer.enclosed(links.tx), tracer.enclosed(links.rx))
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """SHA-256 of every file of the scene and the antennas, by the path that the study resolves to."""
+        gains = [
+            Path(antenna.gain_file) for antenna in self.study.antenna_pair if antenna.gain_file is not None
+        ]
+        digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
+        for file in (*cache.mesh_files(self.scene), *gains):
+            digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
+        return digests
+
+    def tracer_at(self, frequency: float) -> Tracer:
+        """The ray tracer with the scene at another carrier.
+
+        Args:
+            frequency: The carrier [Hz].
+
+        Returns:
+            A new tracer.
+        """
+        return self._open_tracer(self._scene_at(frequency), frequency)
+
+    def trace(
+        self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
+    ) -> Paths:
+        """The paths of the links, from the cache if they were traced before.
+
+        Links that differ only in their carrier are traced once.
+
+        Args:
+            materials: Constants in place of the scene's, by material name.
+            progress: Called with "tracing" after every launch.
+
+        Returns:
+            The path program.
+
+        Raises:
+            InputError: The tracer cannot be used, or the scene lacks a material.
+            EngineError: The paths do not fit into memory.
+        """
+        for name in materials or {}:
+            check_material_name(name, self.scene.materials, "materials")
+        scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
+        if self.links.frequency is None:
+            return self._trace(self.links, scene, progress)
+        ends = np.hstack([self.links.tx, self.links.rx])
+        _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+        distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
+        # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
+        rank = np.argsort(np.argsort(first))
+        return take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)])
+
+    def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
+        study = self.study
+        digest = cache.trace_digest(
+            self.factory.versions,
+            scene,
+            study.scene.frequency,
+            study.trace,
+            study.antenna_pair,
+            links.tx,
+            links.rx,
+        )
+        paths = cache.load_trace(digest)
+        if paths is None:
+            plan = self.tracer.plan(links)
+            if plan.seconds > LONG_TRACE_SECONDS:
+                _LOG.warning("%s", plan.announcement(len(links)))
+            paths = self.tracer.trace(links, progress, scene.materials)
+            cache.store_trace(digest, paths)
+        return paths
+
+    def _with_tracer(self, changed: Setup) -> Setup:
+        """A changed setup with the same tracer, which depends neither on links nor on methods."""
+        changed.__dict__["_loaded"] = self._loaded
+        return changed
+
+    def _scene_at(self, frequency: float) -> Scene:
+        study, parameters = self.study, self.parameters
+        scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+        materials = parameters.materials(parameters.start, scene.materials, frequency)
+        return replace(scene, materials=materials)
+
+    def _open_tracer(self, scene: Scene, frequency: float) -> Tracer:
+        return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
