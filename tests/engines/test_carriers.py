@@ -16,8 +16,7 @@ import pytest
 
 from calibray import engines
 from calibray.calibration import calibrate
-from calibray.engines import ReplayCarriers
-from calibray.engines.fingerprint import fingerprint
+from calibray.engines import ReplayCarriers, fingerprint
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.materials import itu_law

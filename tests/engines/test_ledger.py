@@ -19,8 +19,7 @@ import restarts
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.cli.app import app
-from calibray.engines import Answer, Ledger, Recorded
-from calibray.engines.fingerprint import fingerprint
+from calibray.engines import Answer, Ledger, Recorded, fingerprint
 from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from calibray.engines.compression import compress as compress
     from calibray.engines.external.command import Command as Command
     from calibray.engines.external.exchange import Request as Request
-    from calibray.engines.fingerprint import fingerprint as fingerprint
     from calibray.engines.ledger.answers import LedgerEntry as LedgerEntry
     from calibray.engines.ledger.answers import key as key
     from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from calibray.engines.multi_carrier import ReplayCarriers as ReplayCarriers
     from calibray.engines.observable import PATH_LOSS as PATH_LOSS
     from calibray.engines.observable import Observable as Observable
+    from calibray.engines.problem_fingerprint import fingerprint as fingerprint
     from calibray.engines.protocol import Answer as Answer
     from calibray.engines.protocol import Answering as Answering
     from calibray.engines.protocol import Chunked as Chunked
@@ -69,7 +69,7 @@ _HOMES = {
     "Workers": "calibray.engines.cluster.workers",
     "check_candidates": "calibray.engines.protocol",
     "compress": "calibray.engines.compression",
-    "fingerprint": "calibray.engines.fingerprint",
+    "fingerprint": "calibray.engines.problem_fingerprint",
     "key": "calibray.engines.ledger.answers",
     "make": "calibray.engines.make_engine",
     "open_ledger": "calibray.engines.ledger.ledger",

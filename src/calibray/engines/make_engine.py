@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from calibray.engines.fingerprint import fingerprint
 from calibray.engines.kinds import KINDS
 from calibray.engines.ledger.ledger import Ledger
 from calibray.engines.ledger.recorded import Recorded
+from calibray.engines.problem_fingerprint import fingerprint
 from calibray.engines.protocol import Answering, Engine
 from calibray.engines.section import Openable
 from calibray.errors import InputError

@@ -44,7 +44,7 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
         row = connection.execute(
             "SELECT run, owner, expires FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
         ).fetchone()
-        if row is None or row[0] == run or not _is_valid(*row, now):
+        if row is None or row[0] == run or not _is_valid(row[0], row[1], row[2], now):
             connection.execute(
                 "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?)",
                 (problem, candidate, run, owner, now + EXPIRY),

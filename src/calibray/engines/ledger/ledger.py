@@ -306,12 +306,11 @@ class Ledger:
             rows = self._connection.execute(
                 f"SELECT problem, engine, parameters, candidate, {ENTRY} FROM answers JOIN problems USING (problem)"
             ).fetchall()
-            entries = [read_entry(problem, candidate, tuple(row)) for problem, _, _, candidate, *row in rows]
-            answers = [
-                RescuedAnswer(*row[:4], entry)
-                for row, entry in zip(rows, entries, strict=True)
-                if isinstance(entry, LedgerEntry)
-            ]
+            answers = []
+            for problem, engine, parameters, candidate, *columns in rows:
+                entry = read_entry(problem, candidate, tuple(columns))
+                if isinstance(entry, LedgerEntry):
+                    answers.append(RescuedAnswer(problem, engine, parameters, candidate, entry))
             rescued = self.rescue(answers)
         raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")
 
