@@ -372,8 +372,8 @@ def test_prediction_takes_the_carrier_of_each_link_or_else_the_scenes(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (28.5, r"row 3: the frequency 28\.5 must lie in 1e\+06 to 1e\+12 Hz .*28\.5 GHz is written 28\.5e9"),
-        (-1e9, r"row 3: the frequency -1e\+09 must lie"),
+        (28.5, r"row 3: the frequency 28\.5 must be in 1e\+06 to 1e\+12 Hz .*28\.5 GHz is written 28\.5e9"),
+        (-1e9, r"row 3: the frequency -1e\+09 must be"),
         (np.nan, r"column 'carrier' is missing or not finite in 1 of 24 rows \(row 3\)"),
     ],
 )
