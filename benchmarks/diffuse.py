@@ -56,10 +56,10 @@ def main() -> None:
     )
     points = parameters.from_unit(np.random.default_rng(7).random((20, len(parameters))))
 
-    trace = tracer.find(links)
+    trace = tracer.find_paths(links)
     trace.path_gains()  # compiles the kernels
     start = time.perf_counter()
-    trace = tracer.find(links)
+    trace = tracer.find_paths(links)
     gains = trace.path_gains()
     again = time.perf_counter() - start
     paths = trace.paths()

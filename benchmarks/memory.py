@@ -57,7 +57,7 @@ def campaign(receivers: int, samples: int, depth: int, compared: int) -> None:
     rx = outdoors(munich, receivers)
     links = SimpleNamespace(tx=np.repeat(MASTS, len(rx), axis=0), rx=np.tile(rx, (len(MASTS), 1)))
     start = time.perf_counter()
-    trace = munich.find(links)
+    trace = munich.find_paths(links)
     traced = time.perf_counter() - start
     paths = trace.paths()
     compiled = time.perf_counter() - start - traced

@@ -19,9 +19,9 @@ from calibray.paths.chains import Chains
 from calibray.scenes import Scene, read_scene
 from calibray.study import Study
 from calibray.support.progress import Progress
-from calibray.tracing.antennas import Radiator
-from calibray.tracing.compilation import compile_paths
-from calibray.tracing.protocol import Links, Solution, positions
+from calibray.tracing.antennas import AntennaPattern
+from calibray.tracing.positions import link_positions
+from calibray.tracing.protocol import Links, Solution, compile_paths
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import TracePlan, plan_trace
 from small_scenes import write_scene
@@ -55,12 +55,12 @@ class TwoRay:
         return replace(self, settings=settings)
 
     def plan(self, links: Links) -> TracePlan:
-        return plan_trace(positions(links)[0], replace(self.settings, samples=1), lanes=1000, buffer=0)
+        return plan_trace(link_positions(links)[0], replace(self.settings, samples=1), lanes=1000, buffer=0)
 
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        tx, rx = positions(links)
+        tx, rx = link_positions(links)
         with (self.scene.path.parent / TRACED).open("a") as file:
             file.write(f"{len(rx)}\n")
         image, count = rx * MIRROR, len(rx)
@@ -79,7 +79,7 @@ class TwoRay:
         return compile_paths(
             chains, np.tile(np.arange(count), 2), tx, rx, frequency=self.frequency,
             materials={**self.scene.materials, **(materials or {})},
-            antennas=(Radiator.of(self.tx_antenna), Radiator.of(self.rx_antenna)),
+            antennas=(AntennaPattern.of(self.tx_antenna), AntennaPattern.of(self.rx_antenna)),
         )  # fmt: skip
 
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:

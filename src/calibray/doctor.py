@@ -112,7 +112,7 @@ def examine() -> Diagnosis:
         versions=versions(),
         variant=variant,
         cuda_devices=llvm.cuda_device_count(),
-        libraries=llvm.candidates(),
+        libraries=llvm.installed_libraries(),
         checks=(*check_tracing(variant), run_check("JAX", _JAX, (), "pip install --force-reinstall jax")),
     )
 
@@ -129,12 +129,12 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
     if variant.startswith("llvm"):
-        remedy = f"{llvm.remedy()}, or name another libLLVM in {llvm.PATH_VARIABLE}"
+        remedy = f"{llvm.install_command()}, or name another libLLVM in {llvm.PATH_VARIABLE}"
         try:
             library = llvm.select()
         except InputError as error:
             return (Check("LLVM", False, "none in use", str(error)),)
-        trust = "" if library.tried else f" (versions known to work: {sorted(llvm.TRIED_MAJORS)})"
+        trust = "" if library.tested else f" (versions known to work: {sorted(llvm.TESTED_MAJORS)})"
         checks.append(Check("LLVM", True, f"{library.label} at {library.path}{trust}", remedy))
     checks.append(run_check("Dr.Jit", _KERNEL, (variant,), remedy))
     if checks[-1].passed:

@@ -132,7 +132,7 @@ def test_paths_at_another_carrier_are_those_that_sionna_traces_there(folder: Pat
     assert set(traced.kind) == {1, 2, 8}
     for frequency in (3.5e9, 28e9):
         there = tracer(frequency)
-        trace = there.find(links)
+        trace = there.find_paths(links)
         paths = traced.at(frequency, there.scene.materials)
         theirs, ours = trace.path_gains(), path_gains(paths)
         np.testing.assert_array_equal(trace.link(), paths.link)

@@ -17,7 +17,7 @@ from calibray.errors import InputError
 from calibray.materials import ITU_MATERIALS, Material, itu_material
 from calibray.scenes import export_scene, read_scene
 from calibray.support.output_files import SIGNATURES
-from calibray.tracing.sionna import FLOATS
+from calibray.tracing.sionna import SCALAR_CONSTANTS
 from small_scenes import CONCRETE, block, write_scene
 
 SCENES = Path(sionna.rt.__file__).parent / "scenes"
@@ -49,7 +49,7 @@ def test_constants_equal_sionnas(name: str, tmp_path: Path) -> None:
     ours = read_scene(f"sionna:{name}", 3.5e9).materials
     assert set(ours) == set(theirs.radio_materials)
     for key, material in ours.items():
-        for field in FLOATS:
+        for field in SCALAR_CONSTANTS:
             value = getattr(theirs.radio_materials[key], field)[0]
             assert getattr(material, field) == pytest.approx(value, rel=1e-6), (key, field)
 

@@ -102,7 +102,7 @@ def test_table_of_a_pattern_acts_like_the_pattern(
 
 def test_sionna_itself_gives_the_same_with_the_table(scene: cb.scene.Scene, tables: dict[str, str]) -> None:
     antennas = Antenna(tables["tr38901"], "cross", TILTED), Antenna(tables["dipole"], "H", (0.0, 0.2, 0.5))
-    trace = tracer(scene, *antennas).find(LINKS)
+    trace = tracer(scene, *antennas).find_paths(LINKS)
     theirs, ours = trace.path_gains(), path_gains(trace.paths())
     assert ours.shape == theirs.shape
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4 * np.abs(theirs).max())
@@ -135,7 +135,7 @@ def test_gain_is_interpolated_in_decibel_across_the_seam_and_to_the_poles() -> N
 
 def test_tracer_reads_the_table_as_the_table_reads_itself(tables: dict[str, str]) -> None:
     """In random directions and at the edges of the grid, for a grid from 0 and one from -180 degrees."""
-    from calibray.tracing.sionna.antennas import tabulated
+    from calibray.tracing.sionna.scene import tabulated_pattern
 
     rng = np.random.default_rng(4)
     azimuth = np.concatenate([rng.uniform(-180, 180, 500), [-180, 180, 0, 179.99, -179.99, 0, 0]])
@@ -144,7 +144,7 @@ def test_tracer_reads_the_table_as_the_table_reads_itself(tables: dict[str, str]
         GainTable(-180.0, rng.uniform(-20, 3, (37, 72))),
         GainTable(0.0, rng.uniform(-20, 3, (13, 24))),
     ):
-        field = tabulated(table)(mi.Float(np.radians(90 - elevation)), mi.Float(np.radians(azimuth)))
+        field = tabulated_pattern(table)(mi.Float(np.radians(90 - elevation)), mi.Float(np.radians(azimuth)))
         gain = 20 * np.log10(np.array(field.real, dtype=float))
         np.testing.assert_allclose(gain, table.gain(azimuth, elevation), atol=2e-3)
 
@@ -205,7 +205,7 @@ def replaced(index: int, line: str | None) -> list[str]:
         (replaced(36, "180,-90,2\n"), r"row 38, column 'gain_dbi': 2 differs from the gain at azimuth -180, 0"),
         (rows()[37:], r"elevation_deg runs from -80 to 90, must run from -90 to 90"),
         ([line for line in rows() if int(line.split(",")[0]) <= 90], r"azimuth_deg runs from -180 to 90 in steps"),
-        ([line for line in rows() if ",0,0" in line], r"column 'elevation_deg' holds 0 alone; give a grid"),
+        ([line for line in rows() if ",0,0" in line], r"column 'elevation_deg' holds 0 only; give a grid"),
         ([line for line in rows() if ",0,0" in line or line[:2] == "0,"], r"no row for .*principal cuts alone"),
         ([line.replace(",0\n", ",12\n") for line in rows()], r"would radiate 15\.8 times the power it takes"),
         (

@@ -69,7 +69,7 @@ def test_the_name_tells_the_major_version(name, version):
 def test_versions_from_17_on_are_accepted(version):
     library = llvm.judge(ELSEWHERE, version)
     assert library.usable
-    assert library.tried == (version[0] in {19, 22})
+    assert library.tested == (version[0] in {19, 22})
     assert library.label == ".".join(map(str, version))
 
 
@@ -77,7 +77,7 @@ def test_versions_from_17_on_are_accepted(version):
 def test_versions_that_abort_are_refused(version):
     library = llvm.judge(ELSEWHERE, version)
     assert not library.usable
-    assert not library.tried
+    assert not library.tested
     assert "too old" in library.problem
 
 
@@ -139,7 +139,7 @@ def test_known_good_comes_first_then_the_newest(machine):
         for version in [(23, 1, 0), (22, 1, 8), (19, 1, 7), (15, 0, 6)]
     )
     machine(old, older, untried, known)
-    assert llvm.candidates() == (known, older, untried, old)
+    assert llvm.installed_libraries() == (known, older, untried, old)
     assert llvm.select() == known
     assert os.environ[llvm.PATH_VARIABLE] == known.path
 
@@ -211,7 +211,7 @@ def test_a_drjit_that_already_has_an_unusable_one_is_refused(machine, monkeypatc
 def test_the_remedy_fits_the_platform(monkeypatch, platform, tools, command):
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr(shutil, "which", lambda name: name if name in tools else None)
-    assert command in llvm.remedy()
+    assert command in llvm.install_command()
 
 
 def test_without_a_cuda_driver_there_is_no_device(monkeypatch, tmp_path):

@@ -16,7 +16,7 @@ from calibray.paths import Kind, Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Trace, Tracer
-from calibray.tracing.sionna.chunks import without_empty_places
+from calibray.tracing.sionna.buffers import drop_empty_entries
 from calibray.tracing.trace_plan import starts_at_receivers
 from small_scenes import block, write_scene
 
@@ -43,10 +43,10 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Tracer:
 
 def both_ways(tracer: Tracer, monkeypatch: pytest.MonkeyPatch) -> tuple[Trace, Trace]:
     """The links traced from their receivers, and from their transmitters as if they were more."""
-    back = tracer.find(MANY_TX)
+    back = tracer.find_paths(MANY_TX)
     with monkeypatch.context() as patch:
         patch.setattr("calibray.tracing.sionna.tracer.starts_at_receivers", lambda *_: False)
-        return back, tracer.find(MANY_TX)
+        return back, tracer.find_paths(MANY_TX)
 
 
 def keys(paths: Paths, mirrored: bool = False) -> list[tuple]:
@@ -131,7 +131,7 @@ def test_places_that_are_counted_but_not_filled_are_no_direct_paths(yard):
     buffer = PathsBuffer(3, 2, False)
     buffer.set_interaction_type(mi.UInt(1), mi.UInt([0, 1, 0]), mi.Bool(True))
     buffer.valid = mi.Bool([True, False, False])
-    left = without_empty_places(buffer)
+    left = drop_empty_entries(buffer)
     assert left.buffer_size == 2
     assert np.array(left.valid).tolist() == [True, False]
-    assert without_empty_places(left) is left
+    assert drop_empty_entries(left) is left

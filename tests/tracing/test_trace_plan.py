@@ -7,7 +7,13 @@ import pytest
 
 from calibray.support import memory
 from calibray.tracing.settings import TraceSettings
-from calibray.tracing.trace_plan import LANE_BYTES, directions, find_repeats, paths_that_fit, plan_trace
+from calibray.tracing.trace_plan import (
+    LANE_BYTES,
+    find_repeats,
+    lattice_directions,
+    paths_that_fit,
+    plan_trace,
+)
 
 MASTS = np.repeat([[0.0, 0, 10], [50, 0, 10]], [7, 4], axis=0)[[0, 7, 1, 8, 2, 9, 3, 10, 4, 5, 6]]
 
@@ -72,10 +78,10 @@ def test_launches_of_one_receiver_have_seeds_of_their_own():
 
 def test_directions_cover_the_square_evenly():
     """Every strip and every column of the square holds its share of the points."""
-    whole = np.hstack([directions(first, 500, 2000) for first in range(0, 2000, 500)])
+    whole = np.hstack([lattice_directions(first, 500, 2000) for first in range(0, 2000, 500)])
     for axis in whole:
         np.testing.assert_allclose(np.histogram(axis, 20, (0, 1))[0], 100, atol=3)
-    np.testing.assert_array_equal(whole, directions(0, 2000, 2000))
+    np.testing.assert_array_equal(whole, lattice_directions(0, 2000, 2000))
 
 
 def rows(paths):
@@ -138,7 +144,7 @@ def test_long_traces_are_announced():
     long = plan_trace(MASTS, TraceSettings(samples=4_000_000, max_depth=5), 20_000_000, 1_000_000)
     assert long.announcement(11) == (
         "Tracing 11 links in 11 launches of up to 20,000,000 rays x interactions x receivers; "
-        "about 0.9 GiB of memory, besides that of the scene and the paths found, "
+        "about 0.9 GiB of memory, plus that of the scene and the paths, "
         "and 7 seconds on two cores"
     )
     # Ten thousand times the rays take ten thousand times as long.
@@ -150,6 +156,6 @@ def test_rays_added_in_rounds_take_a_launch_for_every_position():
     found = plan_trace(MASTS, TraceSettings(samples="auto", max_depth=5), 20_000_000, 1_000_000)
     assert sorted(len(launch.links) for launch in found.launches) == [4, 7]
     assert found.announcement(11) == (
-        "Tracing 11 links from 2 positions, rays added until path loss stands still; about 6 seconds on two cores, "
-        "longer where rays still find paths"
+        "Tracing 11 links from 2 positions, adding rays until path loss converges; about 6 seconds on two cores, "
+        "longer while rays still find paths"
     )

@@ -23,7 +23,7 @@ from calibray.scenes import Scene, read_scene
 from calibray.study import Setup
 from calibray.support import cache_folder as caching
 from calibray.tracing import convergence
-from calibray.tracing.antennas import Radiator
+from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
@@ -158,7 +158,7 @@ def test_antennas_radiate_as_sionnas(pattern: str, polarization: str, orientatio
     look = mi.Vector3f(*direction.T.astype(np.float32))
     functions = antenna_pattern_registry.get(pattern)(polarization=polarization).patterns
     for arriving in (False, True):
-        ours = Radiator.of(antenna).jones_vectors(direction, arriving)
+        ours = AntennaPattern.of(antenna).jones_vectors(direction, arriving)
         assert ours.shape == (len(direction), antenna.ports, 2)
         for port, function in enumerate(functions):
             parts = antenna_pattern_to_world_implicit(function, to_world, look, "in" if arriving else "out")
@@ -171,7 +171,7 @@ def test_antennas_radiate_as_sionnas(pattern: str, polarization: str, orientatio
 def test_lossless_antennas_radiate_the_power_they_take(pattern: str, mean: float) -> None:
     """Gauss-Legendre in the cosine of the zenith; the half-wave dipole's factor 1.643 is rounded."""
     cosine, weight = np.polynomial.legendre.leggauss(200)
-    gain = Radiator.of(Antenna(pattern)).amplitude(np.arccos(cosine), np.zeros(200)) ** 2
+    gain = AntennaPattern.of(Antenna(pattern)).amplitude(np.arccos(cosine), np.zeros(200)) ** 2
     assert gain @ weight / 2 == pytest.approx(mean, abs=2e-3 if pattern == "hw_dipole" else 1e-12)
 
 

@@ -21,7 +21,7 @@ from calibray.scenes import read_scene
 from calibray.support.interruption import unwrap_interruption
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from calibray.tracing.trace_plan import directions
+from calibray.tracing.trace_plan import lattice_directions
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -73,8 +73,8 @@ def test_one_receiver_at_a_time_gives_what_all_at_once_give(
 ) -> None:
     """NVlabs/sionna#1172: a receiver's paths do not depend on which others are traced with it."""
     monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", MIXED["samples"] * MIXED["max_depth"])
-    trace = canyon.find(links([-20, 2, 15], receivers))
-    assert len(trace.chunks) == len(receivers)
+    trace = canyon.find_paths(links([-20, 2, 15], receivers))
+    assert len(trace.buffers) == len(receivers)
     alone = trace.paths()
     assert alone.num_paths == together.num_paths > 500
     order = [np.lexsort((paths.spreading, paths.delay, paths.link)) for paths in (alone, together)]
@@ -112,7 +112,7 @@ def test_paths_that_memory_cannot_hold_are_an_error(
     monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
     monkeypatch.setattr("calibray.tracing.sionna.tracer.available_memory", lambda: 32_000)
     with pytest.raises(
-        EngineError, match=r"more paths than fit into memory, with 6 receivers at work; lower trace\.samples"
+        EngineError, match=r"more paths than fit into memory, with 6 receivers at once; lower trace\.samples"
     ):
         canyon.trace(links([-20, 2, 15], receivers))
 
@@ -122,7 +122,7 @@ def test_same_seed_same_paths_and_another_seed_others(
 ) -> None:
     assert_same(canyon.trace(links([-20, 2, 15], receivers)), together)
     settings = TraceSettings(**MIXED, seed=2)
-    other = Tracer(canyon.scene, FREQUENCY, settings, canyon.tx_antenna, canyon.rx_antenna)
+    other = Tracer(canyon.scene, FREQUENCY, settings, canyon.solver.tx_antenna, canyon.solver.rx_antenna)
     found = other.trace(links([-20, 2, 15], receivers))
     assert not np.array_equal(np.sort(found.delay), np.sort(together.delay))
     np.testing.assert_allclose(path_loss(found), path_loss(together), atol=1.0)
@@ -139,8 +139,8 @@ def test_progress_counts_receivers(
 
 def test_stored_paths_hold_on_to_nothing_else(canyon: Tracer, receivers: np.ndarray) -> None:
     """What Dr.Jit has still to compute keeps its inputs: all rays' candidates, for every launch."""
-    (chunk,) = canyon.find(links([-20, 2, 15], receivers)).chunks
-    buffer = chunk.buffer
+    (part,) = canyon.find_paths(links([-20, 2, 15], receivers)).buffers
+    buffer = part.buffer
     kept = [buffer.vertices_x.array, buffer.k_tx.x, buffer.shapes.array, buffer.probs.array]
     assert {array.state for array in kept} == {dr.VarState.Evaluated}
 
@@ -159,14 +159,18 @@ def split(canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
     traces = []
     for lanes in (10**9, None):
         tracer = Tracer(
-            canyon.scene, FREQUENCY, TraceSettings(**settings), canyon.tx_antenna, canyon.rx_antenna
+            canyon.scene,
+            FREQUENCY,
+            TraceSettings(**settings),
+            canyon.solver.tx_antenna,
+            canyon.solver.rx_antenna,
         )
         monkeypatch.setattr(
             "calibray.tracing.sionna.tracer.LANES",
             lanes or -(-settings["samples"] * settings["max_depth"] // 7),
         )
-        traces.append(tracer.find(links([-20, 2, 15], receivers)))
-    assert [len(trace.chunks) for trace in traces] == [1, 7 * len(receivers)]
+        traces.append(tracer.find_paths(links([-20, 2, 15], receivers)))
+    assert [len(trace.buffers) for trace in traces] == [1, 7 * len(receivers)]
     return traces
 
 
@@ -213,7 +217,7 @@ def test_rays_of_the_launches_are_those_of_one(canyon: Tracer) -> None:
     for samples in (3, 1000):
         lattice = np.array(fibonacci_lattice(samples)).reshape(2, -1)
         ends = [0, samples // 3, samples]
-        shares = np.hstack([directions(a, b - a, samples) for a, b in itertools.pairwise(ends)])
+        shares = np.hstack([lattice_directions(a, b - a, samples) for a, b in itertools.pairwise(ends)])
         np.testing.assert_allclose(shares, lattice, atol=1e-6)
 
 
@@ -246,7 +250,7 @@ def test_links_without_a_path_are_told_and_infinitely_weak(house: Tracer) -> Non
 
 
 def test_campaign_without_any_path(house: Tracer) -> None:
-    trace = house.find(links([-20, 0, 3], [[0, 0, 2], [1, 1, 2]]))
+    trace = house.find_paths(links([-20, 0, 3], [[0, 0, 2], [1, 1, 2]]))
     paths = trace.paths()
     assert paths.num_paths == paths.num_interactions == 0
     assert paths.links_without_path.tolist() == [0, 1]

@@ -1,1 +1,47 @@
-"""Tracing: finding the paths of links. `tracing.sionna` holds Sionna RT, and is imported when something is traced."""
+"""Tracing: finding the paths of links.
+
+`protocol` defines what any ray tracer must do, `default_tracer` opens Sionna RT, and `tracing.sionna` is the only room
+that imports it. Names are loaded when first used.
+"""
+
+from typing import TYPE_CHECKING
+
+from calibray.support.lazy_imports import lazy_attributes
+
+if TYPE_CHECKING:
+    from calibray.tracing.antennas import AntennaPattern as AntennaPattern
+    from calibray.tracing.convergence import Convergence as Convergence
+    from calibray.tracing.default_tracer import SIONNA as SIONNA
+    from calibray.tracing.gain_table import read_gain_table as read_gain_table
+    from calibray.tracing.positions import EnclosedAntennas as EnclosedAntennas
+    from calibray.tracing.positions import link_positions as link_positions
+    from calibray.tracing.protocol import Links as Links
+    from calibray.tracing.protocol import Solution as Solution
+    from calibray.tracing.protocol import Tracer as Tracer
+    from calibray.tracing.protocol import TracerFactory as TracerFactory
+    from calibray.tracing.protocol import compile_paths as compile_paths
+    from calibray.tracing.settings import Antenna as Antenna
+    from calibray.tracing.settings import TraceSettings as TraceSettings
+    from calibray.tracing.trace_plan import TracePlan as TracePlan
+    from calibray.tracing.trace_plan import plan_trace as plan_trace
+
+_HOMES = {
+    "Antenna": "calibray.tracing.settings",
+    "AntennaPattern": "calibray.tracing.antennas",
+    "Convergence": "calibray.tracing.convergence",
+    "EnclosedAntennas": "calibray.tracing.positions",
+    "Links": "calibray.tracing.protocol",
+    "SIONNA": "calibray.tracing.default_tracer",
+    "Solution": "calibray.tracing.protocol",
+    "TracePlan": "calibray.tracing.trace_plan",
+    "TraceSettings": "calibray.tracing.settings",
+    "Tracer": "calibray.tracing.protocol",
+    "TracerFactory": "calibray.tracing.protocol",
+    "compile_paths": "calibray.tracing.protocol",
+    "link_positions": "calibray.tracing.positions",
+    "plan_trace": "calibray.tracing.trace_plan",
+    "read_gain_table": "calibray.tracing.gain_table",
+}
+
+__all__ = sorted(_HOMES)
+__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)

@@ -1,7 +1,8 @@
-"""Antennas: the field that they radiate in a direction, and the Jones vectors of paths that leave or arrive.
+"""Antenna patterns: the field radiated in a direction, and the Jones vectors of departing and arriving paths.
 
-Patterns and polarization are Sionna RT's, in closed form and double precision. The field is polarized along one slant
-angle in every direction of the antenna's own frame (3GPP TR 38.901, eq. 7.3-4/5), its amplitude the root of the gain.
+Patterns and polarization are those of Sionna RT, in closed form and double precision. The field is polarized along one
+slant angle in every direction of the antenna's frame (3GPP TR 38.901, eq. 7.3-4/5); its amplitude is the square root of
+the gain.
 """
 
 from __future__ import annotations
@@ -19,17 +20,16 @@ from calibray.tracing.settings import Antenna
 
 SLANTS: Final = {"V": (0.0,), "H": (np.pi / 2,), "VH": (0.0, np.pi / 2), "cross": (-np.pi / 4, np.pi / 4)}
 """Slant angles of the ports by polarization [rad]."""
-BEAM: Final = np.radians(65)
-"""Beamwidth of "tr38901" in both planes [rad] (3GPP TR 38.901, Table 7.3-1)."""
-
+BEAMWIDTH: Final = np.radians(65)
+"""Half-power beamwidth of "tr38901" in both planes [rad] (3GPP TR 38.901, Table 7.3-1)."""
 
 Amplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""Root of an antenna's gain, by zenith and azimuth in (-pi, pi] in the antenna's own frame [rad]."""
+"""Square root of the gain as a function of zenith and azimuth in (-pi, pi] in the antenna's frame [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Radiator:
-    """An antenna ready to radiate, its file of gains read.
+class AntennaPattern:
+    """An antenna whose radiated field can be evaluated.
 
     Attributes:
         antenna: The antenna.
@@ -40,17 +40,11 @@ class Radiator:
     amplitude: Amplitude
 
     @classmethod
-    def of(cls, antenna: Antenna) -> Radiator:
-        """Make an antenna ready.
-
-        Args:
-            antenna: The antenna.
-
-        Returns:
-            It, ready to radiate.
+    def of(cls, antenna: Antenna) -> AntennaPattern:
+        """Make the pattern of an antenna; reads its gain table, if it has one.
 
         Raises:
-            InputError: Its file of gains cannot be used.
+            InputError: The gain table cannot be used.
         """
         if antenna.gain_file is None:
             return cls(antenna, _AMPLITUDES[antenna.pattern])
@@ -61,11 +55,11 @@ class Radiator:
         )
 
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
-        """Jones vectors of the antenna in the basis (theta, phi) of the wave.
+        """Evaluate the Jones vectors of the antenna in the basis (theta, phi) of the wave.
 
         Args:
-            direction: Directions, seen from the antenna; unit vectors [P, 3].
-            arriving: Whether the waves come from those directions; they leave for them if not.
+            direction: Directions seen from the antenna; unit vectors [P, 3].
+            arriving: Whether the waves arrive from there; False if they depart.
 
         Returns:
             The vectors by port [P, ports, 2].
@@ -76,9 +70,9 @@ class Radiator:
         slant = np.array(SLANTS[self.antenna.polarization])
         polarization = np.stack([np.cos(slant), np.sin(slant)], axis=-1)
         field = self.amplitude(zenith, azimuth)[:, None, None] * polarization
-        own = spherical_basis(local, pole_reference=False) @ to_world.T
-        wave = turned(field, rotate(direction, own, spherical_basis(direction)))
-        # Seen from the other side, the second axis points the other way.
+        antenna_basis = spherical_basis(local, pole_reference=False) @ to_world.T
+        wave = rotate_jones(field, rotate(direction, antenna_basis, spherical_basis(direction)))
+        # An arriving wave travels against `direction`, so its phi axis points the other way.
         return (wave * [1, -1] if arriving else wave).astype(complex)
 
 
@@ -95,15 +89,15 @@ def dipole(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray
 def hw_dipole(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
     """Amplitude of a half-wave dipole (Balanis, Antenna Theory, eq. 4-84); see `Amplitude`."""
     sine = np.sin(zenith)
-    # Towards the poles the limit is 0.
+    # cos(pi/2 cos z) / sin z tends to 0 at the poles.
     return np.sqrt(1.643) * np.abs(np.cos(np.pi / 2 * np.cos(zenith)) / np.where(sine > 1e-5, sine, 1.0))
 
 
 def tr38901(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Amplitude of a base station's element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
-    vertical = np.minimum(12 * ((zenith - np.pi / 2) / BEAM) ** 2, 30)
-    horizontal = np.minimum(12 * (azimuth / BEAM) ** 2, 30)
-    return 10 ** ((8 - np.minimum(vertical + horizontal, 30)) / 20)
+    """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
+    vertical_loss_db = np.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
+    horizontal_loss_db = np.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
+    return 10 ** ((8 - np.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
 
 
 _AMPLITUDES: Final[dict[str, Amplitude]] = {
@@ -115,13 +109,10 @@ _AMPLITUDES: Final[dict[str, Amplitude]] = {
 
 
 def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Rotation from an antenna's frame into the world (3GPP TR 38.901, eq. 7.1-4).
+    """Rotation [3, 3] from an antenna's frame into the scene frame (3GPP TR 38.901, eq. 7.1-4).
 
     Args:
         orientation: Rotation about z, y and x [rad].
-
-    Returns:
-        The matrix [3, 3].
     """
     (cos_z, cos_y, cos_x), (sin_z, sin_y, sin_x) = np.cos(orientation), np.sin(orientation)
     about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
@@ -130,12 +121,12 @@ def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float
     return about_z @ about_y @ about_x
 
 
-def turned(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
-    """Jones vectors in a frame that is rotated against theirs.
+def rotate_jones(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
+    """Express Jones vectors in a rotated frame.
 
     Args:
         field: The vectors [P, ports, 2].
-        rotation: (cos, sin) of the rotation [P, 2].
+        rotation: (cos, sin) of the angle from the old frame to the new one [P, 2].
 
     Returns:
         The vectors [P, ports, 2].

@@ -1,7 +1,6 @@
-"""Traces kept between runs: the same scene, links, antennas, settings and versions are traced once.
+"""Stored traces: the same scene, links, antennas, settings and versions are traced once.
 
-They lie in Calibray's cache folder (`support.cache_folder`). A damaged entry is dropped with a line in the log,
-which Python writes to stderr by default.
+Traces lie in Calibray's cache folder (`support.cache_folder`). A damaged one is removed, with a warning in the log.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from calibray.scenes import Scene
 from calibray.support.cache_folder import cache_folder
 from calibray.tracing.settings import Antenna, TraceSettings
 
-_ENTRY: Final = re.compile(r"[0-9a-f]{64}\.h5")
+_FILE_NAME: Final = re.compile(r"[0-9a-f]{64}\.h5")
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -40,13 +39,13 @@ def trace_digest(
     tx: NDArray[np.float64],
     rx: NDArray[np.float64],
 ) -> str:
-    """What a trace depends on, as a fingerprint.
+    """Fingerprint of everything that a trace depends on.
 
     Args:
         versions: The tracer's programs and their versions.
-        scene: The scene; its materials count, because they steer which rays are followed.
+        scene: The scene; its materials count, because they decide how rays continue.
         frequency: Carrier frequency [Hz].
-        settings: The tracer's switches.
+        settings: The tracer's settings.
         antennas: Transmit and receive antenna.
         tx: Transmitter of every link [L, 3], [m].
         rx: Receiver of every link [L, 3], [m].
@@ -62,7 +61,7 @@ def trace_digest(
         "settings": settings.record(),
         "antennas": [antenna.record() for antenna in antennas],
         "materials": {name: asdict(material) for name, material in scene.materials.items()},
-        "objects": [asdict(entry) for entry in scene.objects],
+        "objects": [asdict(scene_object) for scene_object in scene.objects],
     }
     digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
     digest.update(scene.xml.encode())
@@ -74,66 +73,44 @@ def trace_digest(
 
 
 def load_trace(digest: str) -> Paths | None:
-    """The trace with a fingerprint, or None if there is none; one that cannot be read is dropped.
-
-    Args:
-        digest: The fingerprint.
-
-    Returns:
-        The path program, or None.
-    """
+    """Load the trace with a fingerprint; None if there is none. A file that cannot be read is removed."""
     path = _path(digest)
     if path is None or not path.is_file():
         return None
     try:
         return Paths.load(path)
     except InputError as error:
-        _LOG.warning("Kept trace dropped, tracing again: %s", error)
+        _LOG.warning("Stored trace removed, tracing again: %s", error)
         with suppress(OSError):
             path.unlink()
         return None
 
 
 def store_trace(digest: str, paths: Paths) -> None:
-    """Keep a trace; where the folder cannot be written, it is simply not kept.
-
-    Args:
-        digest: Its fingerprint.
-        paths: The path program.
-    """
+    """Store a trace under its fingerprint; nothing happens if the cache folder cannot be written."""
     path = _path(digest)
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        paths.save(path)
-    except (OSError, InputError):
-        return
+    if path is not None:
+        with suppress(OSError, InputError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            paths.save(path)
 
 
 def stored_traces() -> list[Path]:
-    """The traces that are kept, the latest first; no other file of the folder."""
-    here = cache_folder()
-    if here is None or not here.is_dir():
+    """The files of stored traces, the latest first; no other file of the cache folder."""
+    folder = cache_folder()
+    if folder is None or not folder.is_dir():
         return []
-    traces = [path for path in here.iterdir() if _ENTRY.fullmatch(path.name) and path.is_file()]
+    traces = [path for path in folder.iterdir() if _FILE_NAME.fullmatch(path.name) and path.is_file()]
     return sorted(traces, key=lambda path: path.stat().st_mtime, reverse=True)
 
 
 def _path(digest: str) -> Path | None:
-    here = cache_folder()
-    return None if here is None else here / f"{digest}.h5"
+    folder = cache_folder()
+    return None if folder is None else folder / f"{digest}.h5"
 
 
 def mesh_files(scene: Scene) -> Iterator[Path]:
-    """The mesh files of a scene.
-
-    Args:
-        scene: The scene.
-
-    Yields:
-        Their paths, in the file's order.
-    """
+    """Yield the mesh files of a scene, in the order of the scene file."""
     for shape in ElementTree.fromstring(scene.xml).findall("shape"):
         filename = shape.find("string[@name='filename']")
         if filename is not None:

@@ -1,7 +1,7 @@
-"""Whether a trace sent out enough rays: it is repeated with twice as many and another seed.
+"""Check whether a trace sent out enough rays, by tracing again with twice as many and another seed.
 
-Rays find paths by chance: the more are sent out, the fewer paths are missed, and the less diffuse reflection, which is
-an average over rays, scatters. What a second, finer trace changes is an estimate of what the first one lacks.
+Rays find paths by chance. With more rays fewer paths are missed, and diffuse reflection, an average over rays, scatters
+less. The change from a trace to a finer one estimates what the first one lacks.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from calibray.paths import Paths
 from calibray.support.progress import Progress
 from calibray.tracing.protocol import Links, Tracer
 
+PathLoss = Callable[[Paths], NDArray[np.float64]]
+"""Path loss of every link of a path program [L], [dB]; as `calibray.path_loss`."""
+
 
 @dataclass(frozen=True)
 class Convergence:
-    """What tracing again with more samples changed.
+    """The changes between a trace and one with more rays.
 
     Attributes:
         samples: Rays per transmitter of the trace that was checked.
-        change_db: Path loss of every link with more samples, minus that before [L], [dB]: 0 where neither trace has a
-            path, -inf where the finer one alone has, +inf where the coarser one alone has.
+        change_db: Path loss of every link with more rays minus that before [L], [dB]: 0 where neither trace has a path,
+            -inf where only the finer one has, +inf where only the coarser one has.
         paths_before: Number of paths of every link [L].
-        paths_after: The same with more samples [L].
+        paths_after: The same with more rays [L].
     """
 
     samples: int
@@ -47,7 +50,7 @@ class Convergence:
 
     @property
     def largest(self) -> NDArray[np.int64]:
-        """Links by size of change, the largest first [L]."""
+        """Links ordered by the size of their change, the largest first [L]."""
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
     def quantile(self, share: float) -> float:
@@ -57,7 +60,7 @@ class Convergence:
             share: The share, from 0 to 1: 0.5 for the median, 1 for the largest change.
 
         Returns:
-            The change of one of the links, without sign [dB]; +inf if too many links have a path in one trace alone.
+            Absolute change of one of the links [dB]; +inf if too many links have a path in one trace only.
         """
         return float(np.quantile(np.abs(self.change_db), share, method="higher"))
 
@@ -66,16 +69,12 @@ class Convergence:
         return self.quantile(1.0) <= tolerance_db
 
 
-PathLoss = Callable[[Paths], NDArray[np.float64]]
-"""Path loss of every link [L], [dB], of a path program; as `calibray.path_loss`."""
-
-
 def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> Convergence:
     """Compare two traces of the same links.
 
     Args:
         before: The paths found first.
-        after: The paths found with more samples.
+        after: The paths found with more rays.
         samples: Rays per transmitter of the first trace.
         path_loss: Computes the path loss to compare.
 
@@ -91,11 +90,12 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
                 f"the traces have {before.num_links} and {after.num_links} links that differ in {name}; "
                 "compare traces of the same links"
             )
-    one, other = path_loss(before), path_loss(after)
-    neither = np.isinf(one) & np.isinf(other)
+    loss_before, loss_after = path_loss(before), path_loss(after)
+    no_path = np.isinf(loss_before) & np.isinf(loss_after)
     return Convergence(
         samples=samples,
-        change_db=np.where(neither, 0.0, other - np.where(neither, 0.0, one)),
+        # inf - inf is not a number: links without a path in both traces are set to 0 before and after.
+        change_db=np.where(no_path, 0.0, loss_after - np.where(no_path, 0.0, loss_before)),
         paths_before=np.bincount(before.link, minlength=before.num_links),
         paths_after=np.bincount(after.link, minlength=after.num_links),
     )
@@ -104,10 +104,10 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
 def check(
     tracer: Tracer, links: Links, before: Paths, path_loss: PathLoss, progress: Progress | None = None
 ) -> Convergence:
-    """Trace some links again with twice the samples and the next seed, and compare.
+    """Trace links again with twice the rays and the next seed, and compare.
 
     Args:
-        tracer: What traced them.
+        tracer: The tracer that traced them.
         links: The links.
         before: The paths that it found.
         path_loss: Computes the path loss to compare.
@@ -117,13 +117,13 @@ def check(
         The change of every link.
 
     Raises:
-        InputError: `before` holds other links, or its rays were added in rounds, of which the last one is the check.
+        InputError: `before` holds other links, or its rays were added in rounds, of which the last is the check.
         EngineError: There are more paths than the tracer can hold.
     """
     settings = tracer.settings
     if settings.samples == "auto":
         raise InputError(
-            "trace.samples = 'auto' has no trace with twice the rays: its last round is one; what it changed is "
+            "trace.samples = 'auto' needs no second trace: its last round of rays is the check; its change is "
             "settings['last_round_db'] of the paths"
         )
     finer = tracer.with_settings(replace(settings, samples=2 * settings.samples, seed=settings.seed + 1))
@@ -131,11 +131,10 @@ def check(
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
-    """What tracing again changed, of links that were traced apart.
+    """Join the changes of links that were traced in parts.
 
     Args:
-        parts: At least one record, each with the places that its links have among all; together they have every link
-            once.
+        parts: At least one record, each with the numbers of its links among all; every link is in one part.
 
     Returns:
         One record of all links.

@@ -1,4 +1,4 @@
-"""From a scene and links to paths: the default tracer, opened when it is needed, and traces kept between runs."""
+"""The default tracer, Sionna RT, which is imported only when a scene is opened; and `trace`, from scene to paths."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibray.tracing.settings import Antenna, TraceSettings, as_antenna
 
 @final
 class SionnaFactory:
-    """Sionna RT, imported when the first scene is opened."""
+    """Opens scenes in Sionna RT; a `TracerFactory`."""
 
     @property
     def versions(self) -> dict[str, str]:
@@ -33,29 +33,14 @@ class SionnaFactory:
         tx_antenna: Antenna,
         rx_antenna: Antenna,
     ) -> Tracer:
-        """Open a scene.
-
-        Args:
-            scene: The scene, with the materials to trace with.
-            frequency: Carrier frequency [Hz].
-            settings: The tracer's switches.
-            tx_antenna: Transmit antenna.
-            rx_antenna: Receive antenna.
-
-        Returns:
-            The tracer.
-
-        Raises:
-            InputError: This machine has neither a GPU nor an LLVM to trace with, Sionna cannot load the scene, the
-                frequency is not a positive number, or an antenna's file of gains cannot be used.
-        """
+        """Open a scene; see `TracerFactory`. Fails on a machine with neither a GPU nor an LLVM to trace with."""
         from calibray.tracing.sionna import Tracer as SionnaTracer
 
         return SionnaTracer(scene, frequency, settings, tx_antenna, rx_antenna)
 
 
 SIONNA: Final = SionnaFactory()
-"""The tracer that is used where none is named."""
+"""The tracer that is used unless another one is given."""
 
 
 def trace(
@@ -73,16 +58,16 @@ def trace(
 
     Args:
         scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read.
-        links: The links; their values and carriers are not looked at (for another carrier, `Paths.at`).
+        links: The links; only their positions count. For another carrier, see `Paths.at`.
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
-        materials: Constants in place of the scene's, by material name.
+        materials: Constants that replace the scene's, by material name.
         progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
         **settings: The attributes of `TraceSettings`.
 
     Returns:
-        The path program; `links_without_path` tells which links it cannot say anything about.
+        The path program; `links_without_path` lists the links that no path reaches.
 
     Raises:
         InputError: The scene, an antenna, a setting or a position cannot be used.
@@ -91,17 +76,16 @@ def trace(
     tracer = SIONNA(
         scene if isinstance(scene, Scene) else read_scene(scene, frequency, materials),
         frequency,
-        _settings(settings),
+        _trace_settings(settings),
         as_antenna(tx_antenna),
         as_antenna(rx_antenna),
     )
     return tracer.trace(links, progress)
 
 
-def _settings(settings: Mapping[str, Any]) -> TraceSettings:
-    unknown = set(settings) - set(TraceSettings().record())
+def _trace_settings(settings: Mapping[str, Any]) -> TraceSettings:
+    names = TraceSettings().record()
+    unknown = set(settings) - set(names)
     if unknown:
-        raise InputError(
-            f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(TraceSettings().record())}"
-        )
+        raise InputError(f"trace: unknown setting {sorted(unknown)[0]!r}; known: {', '.join(names)}")
     return TraceSettings(**settings)

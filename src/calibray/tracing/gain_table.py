@@ -1,8 +1,8 @@
 """Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file.
 
-Between grid points the gain is interpolated bilinearly in decibel, and across the seam of the azimuth. Decibel, because
-main lobes are close to a parabola there (3GPP TR 38.901, Table 7.3-1, is one), so that the error is least where the
-antenna radiates; what is lost is the depth of nulls narrower than the grid.
+Between grid points the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
+decibels main lobes are nearly parabolas (3GPP TR 38.901, Table 7.3-1, is one), so the error is least where the antenna
+radiates most. Nulls narrower than the grid lose depth.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
 LARGEST_STEP_DEG: Final = 15.0
 LARGEST_EFFICIENCY: Final = 1.5
-"""Radiated over accepted power beyond which the gains are taken for another quantity."""
+"""Ratio of radiated to accepted power above which the values cannot be absolute gains."""
 SEAM_TOLERANCE_DB: Final = 0.1
-"""How far the gains at the first azimuth and a full turn later may lie apart."""
-_UNEVEN: Final = 0.01
-"""How far a step may differ from the others, as a share of it."""
+"""Largest difference of the gains at the first azimuth and at the same direction a full turn later."""
+_STEP_TOLERANCE: Final = 0.01
+"""Largest relative difference of a step from the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class GainTable:
     Attributes:
         first_azimuth_deg: Azimuth of the first column [deg], from the antenna's x axis towards its y axis.
         gain_dbi: Gain [elevations, azimuths], [dBi]. Elevations run from -90 to 90 degrees in equal steps, ends
-            included; azimuths in equal steps round a full turn, whose end is not repeated.
+            included; azimuths in equal steps around a full turn, whose end is not repeated.
 
     Example:
         >>> GainTable(-180.0, np.zeros((181, 360))).efficiency
@@ -54,16 +54,16 @@ class GainTable:
 
     @property
     def efficiency(self) -> float:
-        """Radiated over accepted power [1]: the mean of the gain over the sphere; 1 for a lossless antenna."""
+        """Ratio of radiated to accepted power [1]: the mean of the gain over the sphere; 1 for a lossless antenna."""
         step = np.radians(self.steps_deg[0])
-        angle = np.radians(np.linspace(-90, 90, len(self.gain_dbi)))
+        elevation = np.radians(np.linspace(-90, 90, len(self.gain_dbi)))
         # Integrals of cos(elevation) times the hat functions of linear interpolation, so that gain 0 dBi gives 1.
-        weight = 2 * np.cos(angle) * (1 - np.cos(step)) / step
+        weight = 2 * np.cos(elevation) * (1 - np.cos(step)) / step
         weight[[0, -1]] = 1 - np.sin(step) / step
         return round(float(weight @ (10 ** (self.gain_dbi / 10)).mean(axis=1)) / 2, 12)
 
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
-        """Gain in some directions.
+        """Interpolate the gain.
 
         Args:
             azimuth_deg: Azimuth [...], [deg].
@@ -72,26 +72,26 @@ class GainTable:
         Returns:
             Gain [...], [dBi].
         """
-        rise, turn = self.steps_deg
-        row = (np.asarray(elevation_deg, dtype=float) + 90) / rise
-        column = (
-            (np.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / turn
-        ) % self.gain_dbi.shape[1]
-        i = np.clip(row.astype(int), 0, len(self.gain_dbi) - 2)
-        j = column.astype(int) % self.gain_dbi.shape[1]
-        k = (j + 1) % self.gain_dbi.shape[1]
+        elevation_step, azimuth_step = self.steps_deg
+        rows, columns = self.gain_dbi.shape
+        row = (np.asarray(elevation_deg, dtype=float) + 90) / elevation_step
+        column = ((np.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
+        i = np.clip(row.astype(int), 0, rows - 2)
+        j = column.astype(int) % columns
+        next_j = (j + 1) % columns
         u, v = row - i, column - j
-        low, high = ((1 - v) * self.gain_dbi[at, j] + v * self.gain_dbi[at, k] for at in (i, i + 1))
+        low = (1 - v) * self.gain_dbi[i, j] + v * self.gain_dbi[i, next_j]
+        high = (1 - v) * self.gain_dbi[i + 1, j] + v * self.gain_dbi[i + 1, next_j]
         return (1 - u) * low + u * high
 
     def digest(self) -> str:
-        """A fingerprint of the gains, the same however the file is laid out."""
+        """Fingerprint of the gains, independent of the layout of the file."""
         content = np.array([self.first_azimuth_deg, *self.gain_dbi.shape, *self.gain_dbi.ravel()])
         return hashlib.sha256(content.astype("<f8").tobytes()).hexdigest()
 
 
 def is_gain_file(pattern: str) -> bool:
-    """Whether the name of a pattern is that of a file of gains: one that ends in ".csv"."""
+    """Whether the name of a pattern is a file of gains: it ends in ".csv"."""
     return pattern.lower().endswith(".csv")
 
 
@@ -100,64 +100,66 @@ def read_gain_table(path: str | Path) -> GainTable:
 
     Args:
         path: CSV file with the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order.
-            Azimuths go round a full turn (-180 to 180 or 0 to 360, the end repeated or not), elevations from -90 to
-            90, both in equal steps of at most 15 degrees, and every pair of them has its row. Principal cuts alone
-            do not do.
+            Azimuths cover a full turn (-180 to 180 or 0 to 360, with or without the end), elevations -90 to 90, both in
+            equal steps of at most 15 degrees; every pair of them has its row. Principal cuts alone are not enough.
 
     Returns:
         The table.
 
     Raises:
-        InputError: The file or a column is missing or malformed, a number lies outside its range, a direction is
-            missing or stands twice, the steps are unequal or the sphere not covered, the gains disagree at the
-            azimuths that are the same direction, or the antenna would radiate more than 1.5 times its power.
+        InputError: The file or a column is missing or malformed, a number is out of range, a direction is missing or
+            given twice, the steps are unequal, the sphere is not covered, the gains of one direction at both ends of
+            the azimuth axis differ, or the antenna would radiate more than 1.5 times its power.
     """
     table = read_table(path)
     azimuth, elevation, gain = (_in_range(table, name) for name in COLUMNS)
-    rows, low, high = _axis(table, "elevation_deg", elevation)
+    row, low, high = _axis(table, "elevation_deg", elevation)
     if (low, high) != (-90.0, 90.0):
         raise InputError(
-            f"{path}: elevation_deg runs from {low:g} to {high:g}, must run from -90 to 90; add the directions "
-            "that are missing (principal cuts alone do not do)"
+            f"{path}: elevation_deg runs from {low:g} to {high:g}, must run from -90 to 90; add the missing "
+            "directions (principal cuts alone are not enough)"
         )
-    columns, first, last = _axis(table, "azimuth_deg", azimuth)
-    count = columns.max() + 1
+    column, first, last = _axis(table, "azimuth_deg", azimuth)
+    count = column.max() + 1
     closed = abs(last - first - 360) < 1e-6
     step = (last - first) / (count - 1)
-    if not closed and abs(last - first + step - 360) > _UNEVEN * step:
+    if not closed and abs(last - first + step - 360) > _STEP_TOLERANCE * step:
         raise InputError(
             f"{path}: azimuth_deg runs from {first:g} to {last:g} in steps of {step:g}, must cover a full turn, as "
-            "-180 to 180 or 0 to 360; add the directions that are missing (principal cuts alone do not do)"
+            "-180 to 180 or 0 to 360; add the missing directions (principal cuts alone are not enough)"
         )
-    gains = np.full((rows.max() + 1, count), np.nan)
-    gains[rows, columns] = gain
-    _refuse_gaps(table, rows, columns, gains)
+    gains = np.full((row.max() + 1, count), np.nan)
+    gains[row, column] = gain
+    _refuse_repeats(table, row * count + column)
+    _refuse_gaps(table, row, column, gains)
     if closed:
-        apart = np.abs(gains[:, 0] - gains[:, -1])
-        if apart.max() > SEAM_TOLERANCE_DB:
-            worst = np.flatnonzero((rows == apart.argmax()) & (columns == count - 1))[0]
+        difference = np.abs(gains[:, 0] - gains[:, -1])
+        if difference.max() > SEAM_TOLERANCE_DB:
+            worst = difference.argmax()
+            line = int(np.flatnonzero((row == worst) & (column == count - 1))[0])
             raise InputError(
-                f"{table.cell(int(worst), 'gain_dbi')}: {gain[worst]:g} differs from the gain at azimuth "
-                f"{first:g}, {gains[apart.argmax(), 0]:g}, which is the same direction; correct one"
+                f"{table.cell(line, 'gain_dbi')}: {gain[line]:g} differs from the gain at azimuth "
+                f"{first:g}, {gains[worst, 0]:g}, which is the same direction; correct one"
             )
         gains = gains[:, :-1]
-    found = GainTable(first, gains)
-    if found.efficiency > LARGEST_EFFICIENCY:
+    gain_table = GainTable(first, gains)
+    if gain_table.efficiency > LARGEST_EFFICIENCY:
         raise InputError(
-            f"{path}: an antenna with these gains would radiate {found.efficiency:.3g} times the power it takes, "
+            f"{path}: an antenna with these gains would radiate {gain_table.efficiency:.3g} times the power it takes, "
             f"must be at most {LARGEST_EFFICIENCY:g}; give absolute gains [dBi], not levels relative to another"
         )
-    return found
+    return gain_table
 
 
 def _in_range(table: SourceTable, name: str) -> NDArray[np.float64]:
     values = table.numbers(name)
     low, high = RANGES[name]
-    if (wrong := (values < low) | (values > high)).any():
-        first = int(np.flatnonzero(wrong)[0])
-        remedy = "write a null as a low gain, such as -60" if values[first] < low else "check the unit"
+    wrong = np.flatnonzero((values < low) | (values > high))
+    if len(wrong):
+        value = values[wrong[0]]
+        remedy = "write a null as a low gain, such as -60" if value < low else "check the unit"
         raise InputError(
-            f"{table.cell(first, name)}: {values[first]:g} must be {low:g} to {high:g} ({wrong.sum()} of "
+            f"{table.cell(int(wrong[0]), name)}: {value:g} must be {low:g} to {high:g} ({len(wrong)} of "
             f"{len(table)} rows); {remedy if name == 'gain_dbi' else 'give degrees'}"
         )
     return values
@@ -166,51 +168,51 @@ def _in_range(table: SourceTable, name: str) -> NDArray[np.float64]:
 def _axis(
     table: SourceTable, name: str, values: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], float, float]:
-    """Place of every row on an axis of equal steps [rows], and its ends [deg]."""
-    found = np.unique(values)
-    if len(found) < 2:
+    """Index of every row on an axis of equal steps [rows], and the ends of the axis [deg]."""
+    axis = np.unique(values)
+    if len(axis) < 2:
         raise InputError(
-            f"{table.source}: column {name!r} holds {found[0]:g} alone; give a grid over all directions "
-            "(principal cuts alone do not do)"
+            f"{table.source}: column {name!r} holds {axis[0]:g} only; give a grid over all directions "
+            "(principal cuts alone are not enough)"
         )
-    steps = np.diff(found)
+    steps = np.diff(axis)
     step = float(np.median(steps))
-    odd = np.flatnonzero(np.abs(steps - step) > _UNEVEN * step)
-    if len(odd):
-        at = int(np.flatnonzero(values == found[odd[0] + 1])[0])
+    uneven = np.flatnonzero(np.abs(steps - step) > _STEP_TOLERANCE * step)
+    if len(uneven):
+        before, after = axis[uneven[0]], axis[uneven[0] + 1]
+        line = int(np.flatnonzero(values == after)[0])
         raise InputError(
-            f"{table.cell(at, name)}: {found[odd[0] + 1]:g} follows {found[odd[0]]:g} where the other steps are "
+            f"{table.cell(line, name)}: {after:g} follows {before:g} where the other steps are "
             f"{step:g}; give equal steps"
         )
-    if step > LARGEST_STEP_DEG * (1 + _UNEVEN):
+    if step > LARGEST_STEP_DEG * (1 + _STEP_TOLERANCE):
         raise InputError(
-            f"{table.source}: {name} goes in steps of {step:g}, must be at most {LARGEST_STEP_DEG:g}; give a finer grid"
+            f"{table.source}: {name} has steps of {step:g}, must be at most {LARGEST_STEP_DEG:g}; give a finer grid"
         )
-    return np.round((values - found[0]) / step).astype(np.int64), float(found[0]), float(found[-1])
+    return np.round((values - axis[0]) / step).astype(np.int64), float(axis[0]), float(axis[-1])
+
+
+def _refuse_repeats(table: SourceTable, cell: NDArray[np.int64]) -> None:
+    """Refuse two rows for one cell of the grid [rows]."""
+    order = np.argsort(cell, kind="stable")
+    repeats = np.flatnonzero(np.diff(cell[order]) == 0)
+    if len(repeats):
+        first, second = order[repeats[0]], order[repeats[0] + 1]
+        raise InputError(
+            f"{table.source}, row {table.row[second]}: the same direction as row {table.row[first]} "
+            f"({len(repeats)} in all); remove one"
+        )
 
 
 def _refuse_gaps(
-    table: SourceTable, rows: NDArray[np.int64], columns: NDArray[np.int64], gains: NDArray[np.float64]
+    table: SourceTable, row: NDArray[np.int64], column: NDArray[np.int64], gains: NDArray[np.float64]
 ) -> None:
-    """Refuse directions that stand twice or not at all."""
-    place = rows * gains.shape[1] + columns
-    order = np.argsort(place, kind="stable")
-    twice = np.flatnonzero(np.diff(place[order]) == 0)
-    if len(twice):
-        first, second = order[twice[0]], order[twice[0] + 1]
-        raise InputError(
-            f"{table.source}, row {table.row[second]}: the same direction as row {table.row[first]} "
-            f"({len(twice)} in all); remove one"
-        )
+    """Refuse cells of the grid without a row."""
     missing = np.argwhere(np.isnan(gains))
     if len(missing):
-        row, column = missing[0]
-        axes = (table.numbers(name) for name in ("azimuth_deg", "elevation_deg"))
-        azimuth, elevation = (
-            axis[np.flatnonzero(index == at)[0]]
-            for axis, index, at in zip(axes, (columns, rows), (column, row), strict=True)
-        )
+        elevation = table.numbers("elevation_deg")[row == missing[0, 0]][0]
+        azimuth = table.numbers("azimuth_deg")[column == missing[0, 1]][0]
         raise InputError(
             f"{table.source}: no row for azimuth_deg = {azimuth:g}, elevation_deg = {elevation:g} "
-            f"({len(missing)} of {gains.size} directions); add it (principal cuts alone do not do)"
+            f"({len(missing)} of {gains.size} directions); add it (principal cuts alone are not enough)"
         )

@@ -1,10 +1,10 @@
-"""The runtime below the ray tracer: which libLLVM, or which GPU, Dr.Jit will run on.
+"""Choose the compiler library below the ray tracer: which libLLVM, or which GPU, Dr.Jit runs on.
 
-On a machine without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and a version
-that it cannot work with ends the whole process. So the choice is made here, before Dr.Jit is imported: every
-candidate is opened in a process of its own, and `DRJIT_LIBLLVM_PATH` is set to the best one.
+Without CUDA, Dr.Jit compiles its kernels with the newest libLLVM that it finds, and an incompatible version aborts the
+whole process. The choice is therefore made here, before Dr.Jit is imported: every library is opened in a separate
+process, and `DRJIT_LIBLLVM_PATH` is set to the best one.
 
-`python -m calibray.tracing.llvm` prints what the ray tracer will run on, or says what to install and exits with 2.
+`python -m calibray.tracing.llvm` prints what the ray tracer will run on, or what to install, and then exits with 2.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from pathlib import Path
 from calibray.errors import InputError
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""The environment variable that tells Dr.Jit its libLLVM."""
+"""Environment variable with the path of Dr.Jit's libLLVM."""
 
 OLDEST_MAJOR = 17
 """Oldest accepted major version.
 
-Dr.Jit 1.5 refuses 14 and older, and aborts on x86 with 15 and 16 ("Cannot select: fminimum"): LLVM compiles
+Dr.Jit 1.5 refuses 14 and older and aborts on x86 with 15 and 16 ("Cannot select: fminimum"): LLVM has compiled
 `llvm.minimum` for x86 since 17 (reviews.llvm.org D145634 and D148691).
 """
 
-TRIED_MAJORS = frozenset({19, 22})
-"""Major versions on which Sionna RT 2.2 was seen to work; others are accepted with a note."""
+TESTED_MAJORS = frozenset({19, 22})
+"""Major versions that Sionna RT 2.2 was tested with; others are accepted with a note."""
 
 PROBE_TIMEOUT = 30.0
-"""Longest time [s] that opening one library may take."""
+"""Time limit for opening one library [s]."""
 
 _FOLDERS = (
     "/usr/lib/*-linux-gnu",
@@ -48,11 +48,11 @@ _FOLDERS = (
     "/home/linuxbrew/.linuxbrew/opt/llvm*/lib",
 )
 
-# libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.dylib, but neither libLLVM-C.dylib nor
+# Matches libLLVM-15.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1 and libLLVM.dylib, but not libLLVM-C.dylib or
 # libLLVMSupport.so, which are parts of LLVM.
 _NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.(?:so(?:\.(\d+)[\d.]*)?|dylib)")
 
-# LLVMGetVersion came with LLVM 16; for a library without it nothing is printed.
+# LLVMGetVersion exists since LLVM 16; without it nothing is printed.
 _VERSION_PROBE = """
 import ctypes, sys
 library = ctypes.CDLL(sys.argv[1])
@@ -62,7 +62,7 @@ if hasattr(library, "LLVMGetVersion"):
     print(*(number.value for number in numbers))
 """
 
-# Mitsuba traces rays on a GPU with OptiX, so a CUDA driver without it is of no use.
+# Mitsuba traces rays on a GPU with OptiX, so a CUDA driver alone is not enough.
 _CUDA_PROBE = """
 import ctypes, os
 driver = ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
@@ -79,7 +79,7 @@ class Llvm:
 
     Attributes:
         path: The file, or a bare name that the dynamic loader resolves.
-        version: Major, minor and patch number, or the major alone, or nothing, as far as it is known.
+        version: Major, minor and patch number; the major number alone, or nothing, where less is known.
         problem: Why Dr.Jit cannot use it; None if it can.
     """
 
@@ -93,9 +93,9 @@ class Llvm:
         return self.problem is None
 
     @property
-    def tried(self) -> bool:
-        """Whether this major version was seen to work, and is not just taken to."""
-        return self.usable and self.version[0] in TRIED_MAJORS
+    def tested(self) -> bool:
+        """Whether it is usable and its major version was tested."""
+        return self.usable and self.version[0] in TESTED_MAJORS
 
     @property
     def label(self) -> str:
@@ -104,13 +104,7 @@ class Llvm:
 
 
 def version_in_name(path: str) -> tuple[int, ...]:
-    """Read the major version from a file name.
-
-    Args:
-        path: Path or name of a library.
-
-    Returns:
-        The major version alone, or nothing where the name holds none.
+    """Read the major version from a library's file name; empty if the name has none.
 
     Examples:
         >>> version_in_name("/usr/lib/x86_64-linux-gnu/libLLVM-14.0.6.so.1")
@@ -126,14 +120,14 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether a library that opens is one that Dr.Jit can use.
+    """Decide whether Dr.Jit can use a library that opens.
 
     Args:
         path: Path or name of the library.
-        reported: The version that the library itself gives through `LLVMGetVersion`; empty if it gives none.
+        reported: The version that the library reports through `LLVMGetVersion`; empty if it reports none.
 
     Returns:
-        The library with its version and, where it is not usable, the reason.
+        The library with its version and, if it is not usable, the reason.
     """
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
@@ -144,14 +138,7 @@ def judge(path: str, reported: tuple[int, ...]) -> Llvm:
 
 
 def inspect(path: str) -> Llvm:
-    """Open a library in a process of its own, which a broken one may kill, and asks for its version.
-
-    Args:
-        path: Path of the library, or a bare name for the dynamic loader.
-
-    Returns:
-        What was found; a library that is missing, broken or too old comes with its `problem`.
-    """
+    """Open a library, given by path or bare name, in a separate process, which a broken library may abort."""
     output, problem = _probe(_VERSION_PROBE, path)
     if problem is not None:
         return Llvm(path, version_in_name(path), f"it cannot be opened ({problem})")
@@ -159,92 +146,80 @@ def inspect(path: str) -> Llvm:
 
 
 def library_paths() -> tuple[str, ...]:
-    """Find the libLLVM files of this machine, each once.
-
-    Returns:
-        Paths from the dynamic loader's cache, the usual folders of Linux and Homebrew, and conda's.
-    """
+    """Find each libLLVM file once: in the loader's cache, the usual folders of Linux and Homebrew, and conda's."""
     folders = [*_FOLDERS, f"{sys.base_prefix}/lib"]
     listed = [path for folder in folders for path in sorted(Path("/").glob(f"{folder[1:]}/libLLVM*"))]
-    found: dict[Path, str] = {}
+    by_file: dict[Path, str] = {}
     for path in [*_loader_cache(), *listed]:
         if _NAME.fullmatch(path.name) and path.is_file():
-            found.setdefault(path.resolve(), str(path))
-    return tuple(found.values())
+            by_file.setdefault(path.resolve(), str(path))
+    return tuple(by_file.values())
 
 
-def candidates() -> tuple[Llvm, ...]:
-    """Every libLLVM found on this machine, whatever `DRJIT_LIBLLVM_PATH` says.
-
-    Returns:
-        Usable before unusable, versions seen to work before others, newer before older.
-    """
+def installed_libraries() -> tuple[Llvm, ...]:
+    """Inspect every libLLVM on this machine: usable, tested and newer versions come first."""
     libraries = map(inspect, library_paths())
-    return tuple(sorted(libraries, key=lambda each: (each.usable, each.tried, each.version), reverse=True))
+    return tuple(
+        sorted(libraries, key=lambda library: (library.usable, library.tested, library.version), reverse=True)
+    )
 
 
 def select() -> Llvm:
-    """Point Dr.Jit to the libLLVM that it shall use; to be called before Dr.Jit is imported.
+    """Set Dr.Jit's libLLVM; to be called before Dr.Jit is imported.
 
-    A library named by `DRJIT_LIBLLVM_PATH` is used or refused, never passed over. Without one, the best
-    candidate is taken and `DRJIT_LIBLLVM_PATH` is set to it, for this process and those that it starts.
+    A library named by `DRJIT_LIBLLVM_PATH` is used or refused, never ignored. Without one, the best installed library
+    is chosen and `DRJIT_LIBLLVM_PATH` set to it, for this process and its children.
 
     Returns:
         The library in use.
 
     Raises:
-        InputError: If no library is usable, if `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, if
-            Dr.Jit was imported earlier without a usable one, or if libatomic is missing.
+        InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit was
+            imported before without a usable one, or libatomic is missing.
     """
     require_libatomic()
     requested = os.environ.get(PATH_VARIABLE)
     if requested:
         library = inspect(requested)
         if not library.usable:
-            best = next((each.path for each in candidates() if each.usable), None)
-            way_out = f"use {best}" if best else f"have one searched for, after installing it: {remedy()}"
-            raise InputError(f"{PATH_VARIABLE}={requested}: {library.problem}. Unset it to {way_out}")
-    else:
-        found = candidates()
-        if not found or not found[0].usable:
-            seen = "; ".join(f"{each.path}: {each.problem}" for each in found) or "none found"
-            raise InputError(
-                f"Without a CUDA GPU the ray tracer needs libLLVM {OLDEST_MAJOR} or newer ({seen}). "
-                f"To install it: {remedy()}"
+            best = next((other.path for other in installed_libraries() if other.usable), None)
+            remedy = (
+                f"use {best}" if best else f"let Calibray search, after installing one: {install_command()}"
             )
-        library = found[0]
+            raise InputError(f"{PATH_VARIABLE}={requested}: {library.problem}. Unset it to {remedy}")
+    else:
+        libraries = installed_libraries()
+        if not libraries or not libraries[0].usable:
+            problems = "; ".join(f"{other.path}: {other.problem}" for other in libraries) or "none found"
+            raise InputError(
+                f"Without a CUDA GPU the ray tracer needs libLLVM {OLDEST_MAJOR} or newer ({problems}). "
+                f"To install it: {install_command()}"
+            )
+        library = libraries[0]
     _refuse_loaded()
     os.environ[PATH_VARIABLE] = library.path
     return library
 
 
 def cuda_device_count() -> int:
-    """Number of GPUs that Mitsuba can trace on, which takes a CUDA driver and OptiX.
-
-    Returns:
-        The count; 0 where the driver or OptiX is missing, or `CUDA_VISIBLE_DEVICES` hides every device.
-    """
+    """Number of GPUs with a CUDA driver and OptiX; 0 if `CUDA_VISIBLE_DEVICES` hides all of them."""
     output, problem = _probe(_CUDA_PROBE)
     return int(output) if problem is None and output else 0
 
 
 def mitsuba_variant() -> str:
-    """The Mitsuba variant to trace with: on a CUDA GPU where there is one, as Sionna RT chooses, else LLVM.
-
-    Returns:
-        `"cuda_ad_mono_polarized"` or `"llvm_ad_mono_polarized"`.
-    """
+    """The Mitsuba variant to trace with: CUDA if there is a GPU, as Sionna RT chooses, else LLVM."""
     return "cuda_ad_mono_polarized" if cuda_device_count() else "llvm_ad_mono_polarized"
 
 
 def prepare() -> str:
-    """Make Dr.Jit safe to import: picks the variant and, if that compiles with LLVM, the library.
+    """Make Dr.Jit safe to import: choose the variant and, if it compiles with LLVM, the library.
 
     Returns:
         The Mitsuba variant to set before `sionna.rt` is imported.
 
     Raises:
-        InputError: As `select` does on a machine without a usable GPU, and if libatomic is missing on any.
+        InputError: libatomic is missing, or there is no usable GPU and `select` finds no usable library.
     """
     require_libatomic()
     variant = mitsuba_variant()
@@ -254,24 +229,22 @@ def prepare() -> str:
 
 
 def require_libatomic() -> None:
-    """Refuse a Linux without libatomic, which Dr.Jit links to and a bare Debian does not bring.
+    """Refuse a Linux without libatomic; Dr.Jit links to it, and a minimal Debian lacks it.
 
     Raises:
-        InputError: If the library cannot be opened.
+        InputError: The library cannot be opened.
     """
     if sys.platform == "linux":
         try:
             ctypes.CDLL("libatomic.so.1")
         except OSError as error:
-            raise InputError(f"Dr.Jit needs libatomic ({error}). To install it: {remedy()}") from error
+            raise InputError(
+                f"Dr.Jit needs libatomic ({error}). To install it: {install_command()}"
+            ) from error
 
 
-def remedy() -> str:
-    """The command that installs what the ray tracer needs beside Python packages on this machine.
-
-    Returns:
-        One line to paste into a shell, or advice where the package manager is not known.
-    """
+def install_command() -> str:
+    """One line for a shell that installs the system libraries, or advice if the package manager is not known."""
     sudo = "" if getattr(os, "geteuid", int)() == 0 else "sudo "
     if sys.platform == "darwin":
         return "brew install llvm"
@@ -279,11 +252,11 @@ def remedy() -> str:
         return f"{sudo}apt-get update && {sudo}apt-get install libllvm19 libatomic1"
     if shutil.which("dnf"):
         return f"{sudo}dnf install llvm-libs libatomic"
-    return f"install LLVM {max(TRIED_MAJORS)} and set {PATH_VARIABLE} to its libLLVM"
+    return f"install LLVM {max(TESTED_MAJORS)} and set {PATH_VARIABLE} to its libLLVM"
 
 
 def _refuse_loaded() -> None:
-    """Refuse a Dr.Jit that was imported already with an unusable library, which cannot be exchanged."""
+    """Refuse a Dr.Jit that was imported with an unusable library, because it cannot be exchanged."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
         return
@@ -291,14 +264,14 @@ def _refuse_loaded() -> None:
     if loaded[0] < OLDEST_MAJOR:
         state = "without libLLVM" if loaded[0] < 0 else f"with LLVM {loaded[0]}"
         raise InputError(
-            f"Dr.Jit was imported {state}, and needs {OLDEST_MAJOR} or newer. Call calibray.tracing.llvm.prepare() "
+            f"Dr.Jit was imported {state} and needs {OLDEST_MAJOR} or newer. Call calibray.tracing.llvm.prepare() "
             f"before importing sionna.rt, mitsuba or drjit, or set {PATH_VARIABLE}. To install one: "
-            f"{remedy()}"
+            f"{install_command()}"
         )
 
 
 def _loader_cache() -> list[Path]:
-    """Paths in the cache of the dynamic loader that may be a libLLVM; none where there is no such cache."""
+    """Files in the dynamic loader's cache that may be a libLLVM; empty if there is no such cache."""
     # Some distributions keep ldconfig off the PATH of ordinary users.
     ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/sbin:/usr/sbin")
     if ldconfig is None:
@@ -308,7 +281,7 @@ def _loader_cache() -> list[Path]:
 
 
 def _probe(code: str, *arguments: str) -> tuple[str, str | None]:
-    """Run Python code in a bare interpreter; return its output and what went wrong, None if nothing did."""
+    """Run Python code in an interpreter without site packages; returns its output and its error, if any."""
     command = [sys.executable, "-I", "-S", "-c", code, *arguments]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT, check=False)

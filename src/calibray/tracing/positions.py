@@ -1,21 +1,57 @@
-"""Enclosed antennas: links whose ends stand inside closed bodies of the scene, most often by a wrong position."""
+"""Positions of the antennas: checked before a trace, and compared with the buildings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.errors import InputError
+from calibray.tracing.protocol import Links
+
+LEAST_DISTANCE: Final = 1e-3
+"""Distance below which the ends of a link coincide [m]."""
+
+
+def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions of transmitters and receivers, checked.
+
+    Args:
+        links: The links.
+
+    Returns:
+        Transmitter and receiver of every link [L, 3] each, [m].
+
+    Raises:
+        InputError: There is no link, a position is not finite, or the ends of a link coincide.
+    """
+    tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
+    if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
+        raise InputError(
+            f"links: tx has the shape {tx.shape}, rx {rx.shape}; both must be [links, 3], with at least one link"
+        )
+    for name, position in (("tx", tx), ("rx", rx)):
+        not_finite = np.flatnonzero(~np.isfinite(position).all(axis=1))
+        if len(not_finite):
+            link = not_finite[0]
+            raise InputError(f"link {link}: {name} position {position[link]} is not finite; give metres")
+    coincident = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < LEAST_DISTANCE)
+    if len(coincident):
+        link = coincident[0]
+        raise InputError(f"link {link}: transmitter and receiver coincide at {tx[link]}; check the columns")
+    return tx, rx
+
 
 @dataclass(frozen=True)
 class EnclosedAntennas:
-    """Antennas that stand inside closed bodies of the scene.
+    """Antennas inside closed bodies of the scene, most often because of a wrong position.
 
     Attributes:
-        tx: Lines in the source file of the links whose transmitter is enclosed.
-        rx: The same for receivers.
-        indoors: Whether most are, as they are in a building's inside; then none is suspect.
+        tx: Rows of the source file whose transmitter is enclosed.
+        rx: Rows of the source file whose receiver is enclosed.
+        indoors: Whether most links are enclosed, as in an indoor scene; then none of them is suspect.
     """
 
     tx: tuple[int, ...] = ()
@@ -24,15 +60,15 @@ class EnclosedAntennas:
 
     @classmethod
     def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> EnclosedAntennas:
-        """Sort out which antennas are enclosed.
+        """Collect the enclosed antennas.
 
         Args:
-            row: Line of every link in the source file [L].
+            row: Row of every link in the source file [L].
             tx: Whether its transmitter is enclosed [L].
             rx: Whether its receiver is enclosed [L].
 
         Returns:
-            The lines of the links concerned.
+            The rows concerned.
         """
         indoors = bool(np.mean(tx | rx) > 0.5)
         return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)

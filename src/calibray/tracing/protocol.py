@@ -1,8 +1,7 @@
-"""What a ray tracer is to this package: something that finds the paths of links in a scene.
+"""The interface to ray tracers: what Calibray calls, and how a tracer hands over its paths.
 
-A tracer needs no more than geometry. It hands over its paths as `calibray.paths.chains.Chains`, with the material of
-every interaction, and `calibray.tracing.compilation.compile_paths` turns them, with the antennas, into the path program
-that everything else works on.
+A tracer only has to know the geometry. It gives its paths as `calibray.paths.chains.Chains`, with the material of every
+interaction. `compile_paths` combines them with the antennas into the path program that all further computations use.
 """
 
 from __future__ import annotations
@@ -14,17 +13,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.paths import Paths
+from calibray.paths import Paths, concatenate
+from calibray.paths.chains import Chains, compile_chains, zenith_azimuth
 from calibray.scenes import Scene
 from calibray.support.progress import Progress
+from calibray.tracing.antennas import AntennaPattern, rotate_jones
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import TracePlan
 
 
 class Links(Protocol):
-    """Anything with transmitter and receiver positions [L, 3], [m]; `Measurements` above all."""
+    """An object with the positions of transmitters and receivers [L, 3], [m], as `Measurements`."""
 
     @property
     def tx(self) -> NDArray[np.float64]: ...  # noqa: D102
@@ -34,7 +34,7 @@ class Links(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Path gains of links as a tracer's own field stage gives them.
+    """Path gains of links as the tracer's own field computation gives them.
 
     Attributes:
         gain: Complex gain of every path, without the phase of its delay [P, R, T].
@@ -50,7 +50,7 @@ class Solution:
 class Tracer(Protocol):
     """A scene opened in a ray tracer, with antennas and settings.
 
-    Nothing that is called changes what a later call answers.
+    No call changes the result of a later one.
     """
 
     @property
@@ -65,22 +65,15 @@ class Tracer(Protocol):
 
     @property
     def settings(self) -> TraceSettings:
-        """The switches."""
+        """The tracer's settings."""
         ...
 
     def with_settings(self, settings: TraceSettings) -> Tracer:
-        """The tracer with other switches; the scene stays as it is loaded.
-
-        Args:
-            settings: The switches.
-
-        Returns:
-            Another tracer.
-        """
+        """Copy the tracer with other settings; the loaded scene is shared."""
         ...
 
     def plan(self, links: Links) -> TracePlan:
-        """How the links will be traced.
+        """Plan the launches of a trace.
 
         Args:
             links: The links.
@@ -89,7 +82,7 @@ class Tracer(Protocol):
             The launches, with an estimate of the memory that they take.
 
         Raises:
-            InputError: There is no link, a position is not finite, or a link's ends coincide.
+            InputError: There is no link, a position is not finite, or the ends of a link coincide.
         """
         ...
 
@@ -101,26 +94,26 @@ class Tracer(Protocol):
         Args:
             links: The links.
             progress: Called with ("tracing", receivers traced, receivers in all).
-            materials: Constants in place of the scene's, by name.
+            materials: Constants that replace the scene's, by name.
 
         Returns:
-            The path program, its materials those traced with.
+            The path program, with the materials that it was traced with.
 
         Raises:
-            InputError: There is no link, a position is not finite, a link's ends coincide, or the scene lacks a
+            InputError: There is no link, a position is not finite, the ends of a link coincide, or the scene lacks a
                 material.
             EngineError: There are more paths than fit into memory.
         """
         ...
 
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
-        """Find the paths of every link and compute their gains with the tracer's own field stage.
+        """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without one replays the paths: `calibray.path_gains`.
+        A tracer without one can replay the paths: `calibray.path_gains`.
 
         Args:
             links: The links.
-            materials: Constants in place of the scene's, by name.
+            materials: Constants that replace the scene's, by name.
 
         Returns:
             The gains.
@@ -132,23 +125,16 @@ class Tracer(Protocol):
         ...
 
     def enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points lie inside closed bodies of the scene, such as buildings.
-
-        Args:
-            points: Positions [n, 3], [m].
-
-        Returns:
-            True where enclosed [n].
-        """
+        """Whether points [n, 3], [m], lie inside closed bodies of the scene, such as buildings [n]."""
         ...
 
 
 class TracerFactory(Protocol):
-    """What opens a scene in a ray tracer: a class that is a `Tracer`, or anything that is called like one."""
+    """Opens a scene in a ray tracer: a class that implements `Tracer`, or a callable with the same arguments."""
 
     @property
     def versions(self) -> Mapping[str, str]:
-        """What the paths found depend on beside the arguments: the tracer's programs and their versions."""
+        """Versions of the tracer's programs by name; a stored trace is reused only with the same ones."""
         ...
 
     def __call__(
@@ -165,7 +151,7 @@ class TracerFactory(Protocol):
         Args:
             scene: The scene, with the materials to trace with.
             frequency: Carrier frequency [Hz].
-            settings: The switches.
+            settings: The tracer's settings.
             tx_antenna: Transmit antenna.
             rx_antenna: Receive antenna.
 
@@ -173,35 +159,63 @@ class TracerFactory(Protocol):
             The tracer.
 
         Raises:
-            InputError: The tracer cannot load the scene, or does not know a switch or an antenna.
+            InputError: The tracer cannot load the scene, or does not support a setting or an antenna.
         """
         ...
 
 
-def positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the ends of links stand, checked.
+def compile_paths(
+    chains: Chains,
+    link: NDArray[np.integer],
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    *,
+    frequency: float,
+    materials: Mapping[str, Material],
+    antennas: tuple[AntennaPattern, AntennaPattern],
+    settings: Mapping[str, object] | None = None,
+) -> Paths:
+    """Compile the paths that a tracer found into a path program.
 
     Args:
-        links: The links.
+        chains: The paths.
+        link: Link of every path, in any order [P].
+        tx: Transmitter of every link [L, 3], [m].
+        rx: Receiver of every link [L, 3], [m].
+        frequency: Carrier frequency [Hz].
+        materials: The materials by name, in the order of the material numbers of `chains`.
+        antennas: Transmit and receive antenna.
+        settings: How the paths were found; stored with them.
 
     Returns:
-        Transmitter and receiver of every link [L, 3] each, [m].
-
-    Raises:
-        InputError: There is no link, a position is not finite, or a link's ends coincide.
+        The program, its paths ordered by link, and within a link as given.
     """
-    tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
-    if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
-        raise InputError(
-            f"links: tx has the shape {tx.shape}, rx {rx.shape}; both must be [links, 3], with at least one link"
-        )
-    for name, position in (("tx", tx), ("rx", rx)):
-        bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
-        if len(bad):
-            raise InputError(f"link {bad[0]}: {name} position {position[bad[0]]} is not finite; give metres")
-    same = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < 1e-3)
-    if len(same):
-        raise InputError(
-            f"link {same[0]}: transmitter and receiver coincide at {tx[same[0]]}; check the columns"
-        )
-    return tx, rx
+    geometry = compile_chains(chains)
+    departure, arrival = geometry.departure_direction, geometry.arrival_direction
+    tx_pattern, rx_pattern = antennas
+    paths = Paths(
+        frequency=frequency,
+        materials=dict(materials),
+        tx_position=tx,
+        rx_position=rx,
+        link=np.asarray(link).astype(np.int32),
+        delay=geometry.delay,
+        spreading=geometry.spreading,
+        departure=zenith_azimuth(departure),
+        # The wave travels along `arrival`; the receiver sees it come from the opposite direction.
+        arrival=zenith_azimuth(-arrival),
+        tx_field=rotate_jones(tx_pattern.jones_vectors(departure), geometry.departure_rotation),
+        rx_field=rotate_jones(
+            rx_pattern.jones_vectors(-arrival, arriving=True), geometry.arrival_rotation * [1, -1]
+        ),
+        first=geometry.first,
+        kind=geometry.kind,
+        material=geometry.material,
+        cos_incidence=geometry.cos_incidence,
+        rotation=geometry.rotation,
+        diffuse=geometry.diffuse,
+        diffraction=geometry.diffraction,
+        settings=dict(settings or {}),
+        vertex=chains.vertex[chains.kind != 0].astype(np.float32),
+    )
+    return paths if (np.diff(paths.link) >= 0).all() else concatenate([paths])

@@ -1,4 +1,4 @@
-"""How a scene is traced: the tracer's switches and the antennas at both ends."""
+"""How a scene is traced: the tracer's settings and the antennas at both ends."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ PATTERNS: Final = ("iso", "dipole", "hw_dipole", "tr38901")
 POLARIZATIONS: Final = ("V", "H", "VH", "cross")
 
 AUTO: Final = "auto"
-"""The number of rays is the tracer's to find."""
-ROUND: Final = 250_000
-"""Rays of one launch where rays are added in rounds."""
+"""Value of `samples` with which the tracer chooses the number of rays."""
+RAYS_PER_ROUND: Final = 250_000
+"""Rays of one launch if rays are added in rounds."""
 
 RANGES: Final = {"max_depth": (0, 100), "samples": (1, 10**12), "seed": (0, 2**32 - 1)}
-"""The numbers a trace may be given: no machine follows more, and Sionna RT's seeds have 32 bits."""
+"""Allowed ranges of the numbers: no machine traces more, and Sionna RT's seeds have 32 bits."""
 
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """Switches of the tracer, with Sionna RT's meaning.
+    """Settings of the tracer, with Sionna RT's meaning.
 
     Attributes:
         max_depth: Largest number of interactions of a path, 0 to 100.
@@ -36,12 +36,12 @@ class TraceSettings:
         edge_diffraction: Let free edges diffract as well.
         diffraction_lit_region: Keep diffraction where the edge's source or image is in sight.
         diffuse_reflection: Follow diffuse reflections.
-        samples: Rays sent out per transmitter, 1 to 10^12; or "auto": rays are added in rounds until path loss stands
-            still, without diffuse reflection.
+        samples: Rays per transmitter, 1 to 10^12; or "auto": rays are added in rounds until path loss converges,
+            without diffuse reflection.
         seed: Seed of the tracer's random numbers, 0 to 2^32 - 1.
 
     Raises:
-        InputError: A number lies outside its bound, or a switch is neither true nor false.
+        InputError: A number is out of range, or a switch is neither true nor false.
     """
 
     max_depth: int = 3
@@ -72,19 +72,19 @@ class TraceSettings:
 
         if self.diffuse_reflection and self.adaptive:
             raise InputError(
-                "trace.samples = 'auto' looks for paths until there are no more, but diffuse reflection is an average "
+                "trace.samples = 'auto' adds rays until no new path is found, but diffuse reflection is an average "
                 "over rays; give a number, or diffuse_reflection = false"
             )
 
     @property
     def adaptive(self) -> bool:
-        """Whether rays are added until path loss stands still."""
+        """Whether rays are added until path loss converges."""
         return self.samples == AUTO
 
     @property
     def rays(self) -> int:
-        """Rays per transmitter; those of one round where rays are added in rounds."""
-        return ROUND if self.samples == "auto" else self.samples
+        """Rays per transmitter; those of one launch if rays are added in rounds."""
+        return RAYS_PER_ROUND if self.samples == "auto" else self.samples
 
     def record(self) -> dict[str, int | bool | str]:
         """The settings by name, for files and digests."""
@@ -93,12 +93,12 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class Antenna:
-    """An antenna as Sionna RT names them, or one whose gain was measured.
+    """An antenna of Sionna RT, or one with a measured gain.
 
     Attributes:
         pattern: "iso", "dipole", "hw_dipole" or "tr38901", or a CSV file of gains (see `read_gain_table`).
-        polarization: "V", "H", or dual "VH" or "cross". The field is polarized so in every direction of the
-            antenna's own frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain that the pattern says.
+        polarization: "V", "H", or dual "VH" or "cross". The field has this polarization in every direction of the
+            antenna's frame (3GPP TR 38.901, eq. 7.3-4/5), with the gain of the pattern.
         orientation: Rotation about z, y and x [rad]: yaw, pitch, roll.
 
     Raises:
@@ -138,15 +138,11 @@ class Antenna:
 
     @property
     def gain_file(self) -> str | None:
-        """The CSV file that gives the gain, or None."""
+        """The CSV file of gains, or None."""
         return self.pattern if is_gain_file(self.pattern) else None
 
     def record(self) -> dict[str, object]:
-        """The antenna by attribute, for digests: a file of gains counts by what it holds, not by its name.
-
-        Raises:
-            InputError: The file cannot be used.
-        """
+        """The antenna by attribute, for digests; a gain table counts by its content, not by its file name."""
         record: dict[str, object] = asdict(self)
         if self.gain_file is not None:
             record["pattern"] = read_gain_table(self.gain_file).digest()
@@ -154,10 +150,10 @@ class Antenna:
 
 
 def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
-    """An antenna from an antenna, a mapping of its attributes, or None for the default.
+    """Make an antenna from an antenna, a mapping of its attributes, or None for the default.
 
     Args:
-        value: What the user gave.
+        value: The antenna as the user gave it.
 
     Returns:
         The antenna.

@@ -1,11 +1,11 @@
-"""Finding paths with Sionna RT; the only package that imports it."""
+"""Path tracing with Sionna RT; the only room that imports it."""
 
 from calibray.tracing import llvm
 
-# Before Dr.Jit loads an LLVM that would abort the process.
+# Before the imports below load Dr.Jit, which would abort the process with an unsuitable LLVM.
 llvm.prepare()
 
-from calibray.tracing.sionna.stored import Trace  # noqa: E402
-from calibray.tracing.sionna.tracer import FLOATS, Tracer  # noqa: E402
+from calibray.tracing.sionna.solver import SCALAR_CONSTANTS  # noqa: E402
+from calibray.tracing.sionna.tracer import Trace, Tracer  # noqa: E402
 
-__all__ = ["FLOATS", "Trace", "Tracer"]
+__all__ = ["SCALAR_CONSTANTS", "Trace", "Tracer"]

@@ -17,7 +17,7 @@ from calibray.scenes import read_scene
 from calibray.tracing import convergence
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from calibray.tracing.unfolding import Surfaces, unfold
+from calibray.tracing.sionna.image_method import Edges, Surfaces, unfold
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
@@ -83,7 +83,7 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
         "Not converged: 8 rays a position were sent out; the later half of them changed a link by 0.70 dB "
         "(fidelity.tolerance_db = 0.5)."
     )
-    with pytest.raises(InputError, match="its last round is one"):
+    with pytest.raises(InputError, match="its last round of rays is the check"):
         convergence.check(yard, LINKS, rounds, path_loss)
 
 
@@ -95,10 +95,15 @@ def test_rays_are_sent_out_once_for_all_links_of_a_position(
     )
     settings = replace(AUTO, seed=7)
     alone = yard.with_settings(settings).trace(second)
-    yard.known_chains.clear()
+    yard.sequence_cache.clear()
     tracer, sent = yard.with_settings(settings), []
-    search = tracer.candidates
-    monkeypatch.setattr(tracer, "candidates", lambda *given: sent.append(given[3]) or search(*given))
+    find_candidates = tracer.solver.find_candidates
+
+    def count(*arguments):
+        sent.append(arguments[-1].count)
+        return find_candidates(*arguments)
+
+    monkeypatch.setattr(tracer.solver, "find_candidates", count)
     tracer.trace(first)
     rays = sum(sent)
     assert rays >= 1_000_000
@@ -110,7 +115,7 @@ def test_rays_are_sent_out_once_for_all_links_of_a_position(
     name, wall = next(iter(yard.scene.materials.items()))
     tracer.trace(second, materials={name: replace(wall, relative_permittivity=30.0)})
     assert sum(sent) >= 2 * rays
-    assert len(tracer.known_chains) == 2
+    assert len(tracer.sequence_cache) == 2
 
 
 def test_links_turned_around_have_the_same_loss(yard: Tracer, rounds: Paths) -> None:
@@ -143,13 +148,13 @@ def test_a_path_in_a_corner_of_mirrors_unfolds_to_a_line() -> None:
     wall = [[5.0, -9, 0], [5, 9, 0], [5, 0, 9]]
     surfaces = Surfaces(np.array([ground, wall, wall[::-1]]))
     assert surfaces.plane[1] == surfaces.plane[2] != surfaces.plane[0]
-    none = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1)
+    none = Edges(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
     kind, triangle = np.array([[Kind.SPECULAR, Kind.REFRACTION, Kind.SPECULAR]]), np.array([[0, 0, 1]])
     found = unfold(np.array([1.0, 2, 3]), kind, triangle, surfaces, none)
     np.testing.assert_allclose(found.aim[0], [[1, 2, -3], [1, 2, -3], [9, 2, -3]])
     np.testing.assert_allclose(found.image, [[9, 2, -3]])
     np.testing.assert_allclose(found.low[0, 2], [4.9, -9.1, -0.1])
-    edge = np.array([[0.0, 0, 4]]), np.array([[0.0, 0.6, 0.8]]), np.array([2.0])
+    edge = Edges(np.array([[0.0, 0, 4]]), np.array([[0.0, 0.6, 0.8]]), np.array([2.0]))
     found = unfold(np.array([1.0, 2, 3]), np.array([[Kind.DIFFRACTION, Kind.SPECULAR]]), triangle[:, :2] + [[0, 1]],
                    surfaces, edge)  # fmt: skip
     np.testing.assert_allclose(found.aim[0], [[0, 0, 4], [10, 0, 4]])

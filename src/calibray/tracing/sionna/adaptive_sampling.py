@@ -1,0 +1,298 @@
+"""Rays are added in rounds until path loss converges (`trace.samples = "auto"`).
+
+Each round sends out as many rays as all rounds before it, in other directions. The interaction sequences that they
+find belong to the source; new ones are tried for every receiver by the method of images (`image_method`). Two rounds in
+a row that change the path loss of no link by more than `CONVERGED_DB` end the search. The last round is the same check
+as a second trace with twice the rays (`calibray.tracing.convergence`).
+"""
+
+# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+from calibray.errors import EngineError
+from calibray.materials import Material
+from calibray.support.progress import Progress
+from calibray.tracing.settings import RAYS_PER_ROUND, TraceSettings
+from calibray.tracing.sionna.arrays import aligned, to_points
+from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse
+from calibray.tracing.sionna.image_method import (
+    Meshes,
+    Unobstructed,
+    possible_pairs,
+    sequence_keys,
+    unfold_sequences,
+)
+from calibray.tracing.sionna.solver import Rays, Solver
+from calibray.tracing.trace_plan import Launch, TracePlan, lattice_directions, launch_seed
+
+CONVERGED_DB: Final = 0.05
+"""Change of a link's path loss with twice the rays that counts as converged [dB]."""
+QUIET_ROUNDS: Final = 2
+"""Consecutive rounds without a larger change that end the search."""
+MAX_LAUNCHES: Final = 256
+"""Launches of a source after which the search ends in any case: 64 million rays."""
+CACHED_SOURCES: Final = 4
+"""Sources whose sequences are kept for the next links."""
+SEQUENCE_BUFFER: Final = 100_000
+"""Sequences that the buffer of a launch holds at first."""
+GEOMETRY_BATCH: Final = 500_000
+"""Sequences x receivers whose geometry is computed together; bounds the memory."""
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+class SequenceCache:
+    """Interaction sequences of the sources traced last.
+
+    Sequences serve all receivers, so rays are sent out once for all chunks of links that are traced on one worker.
+    """
+
+    def __init__(self) -> None:
+        self._sequences: dict[tuple[bytes, TraceSettings, tuple], SourceSequences] = {}
+
+    def __len__(self) -> int:
+        return len(self._sequences)
+
+    def clear(self) -> None:
+        """Forget all sequences."""
+        self._sequences.clear()
+
+    def of_source(
+        self, solver: Solver, source: NDArray[np.float64], materials: Mapping[str, Material]
+    ) -> SourceSequences:
+        """The sequences of a source [3], [m], found with the same materials, which decide how rays continue."""
+        key = source.tobytes(), solver.settings, tuple(materials.items())
+        if key not in self._sequences:
+            while len(self._sequences) >= CACHED_SOURCES:
+                del self._sequences[next(iter(self._sequences))]
+            self._sequences[key] = SourceSequences(solver, source)
+        return self._sequences[key]
+
+
+class SourceSequences:
+    """The interaction sequences that rays from one source find, launch by launch.
+
+    Args:
+        solver: The solver.
+        source: The position [3], [m].
+    """
+
+    def __init__(self, solver: Solver, source: NDArray[np.float64]) -> None:
+        self.meshes = Meshes(solver.mitsuba_scene)
+        self._solver, self._source = solver, source
+        self._keys = np.zeros((0, 2 * solver.settings.max_depth + 2), dtype=np.int64)
+        self._new_by_launch: list[PathsBuffer | None] = []
+
+    def new_in_launch(self, number: int, max_paths: int) -> PathsBuffer | None:
+        """The sequences that launch `number` finds and no earlier one did, None if there are none; run if need be."""
+        while len(self._new_by_launch) <= number:
+            sequences = self._launch(len(self._new_by_launch), max_paths)
+            self._keys, new = _merge(self._keys, sequence_keys(sequences, self.meshes))
+            self._new_by_launch.append(
+                sequences.gather(mi.UInt(aligned(new, np.uint32))) if len(new) else None
+            )
+        return self._new_by_launch[number]
+
+    def _launch(self, number: int, max_paths: int) -> PathsBuffer:
+        """Send out the rays of one launch."""
+        seed = self._solver.settings.seed
+        # Each launch after the first shifts the lattice at random, modulo the unit square.
+        shift = np.random.default_rng([seed, number]).random((2, 1)) * (number > 0)
+        rays = Rays(
+            count=RAYS_PER_ROUND,
+            seed=launch_seed(seed, number),
+            directions=(lattice_directions(0, RAYS_PER_ROUND, RAYS_PER_ROUND) + shift) % 1.0,
+            direct=False,
+            buffer_size=SEQUENCE_BUFFER,
+            max_paths=max_paths,
+        )
+        # Sionna needs a target; in an unobstructed scene any will do.
+        any_target = to_points(np.zeros((1, 3)))
+        scene = Unobstructed(self._solver.mitsuba_scene)
+        return self._solver.find_candidates(scene, to_points(self._source[None]), any_target, rays)
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveSearch:
+    """A search for the paths of links with rays added in rounds.
+
+    Attributes:
+        solver: The solver, its materials set.
+        cache: Sequences found before.
+        materials: The constants traced with.
+        backwards: Whether the receivers send.
+        max_paths: Paths that fit into memory.
+    """
+
+    solver: Solver
+    cache: SequenceCache
+    materials: Mapping[str, Material]
+    backwards: bool
+    max_paths: int
+
+    def run(
+        self, plan: TracePlan, targets: NDArray[np.float64], progress: Progress | None
+    ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
+        """Find the paths.
+
+        Args:
+            plan: A launch for every source.
+            targets: The end of every link that does not send rays [L, 3], [m].
+            progress: Called with ("tracing", receivers traced, receivers in all) before the first source and after
+                each.
+
+        Returns:
+            The paths; the largest number of rays of a source and the largest change of a link in the last round.
+
+        Raises:
+            EngineError: There are more paths than fit into memory.
+        """
+        done = 0
+        if progress is not None:
+            progress("tracing", 0, len(targets))
+        traced: list[TracedBuffer] = []
+        searches: list[_SourceSearch] = []
+        for launch in plan.launches:
+            left = self.max_paths - sum(len(part.link) for part in traced)
+            sequences = self.cache.of_source(self.solver, launch.source, self.materials)
+            source_search = _SourceSearch(self, sequences, launch, targets[launch.links], left)
+            source_search.run()
+            searches.append(source_search)
+            traced += source_search.traced
+            done += len(launch.links)
+            if progress is not None:
+                progress("tracing", done, len(targets))
+        return tuple(traced), {
+            "rays": max(source_search.rays for source_search in searches),
+            "last_round_db": max(source_search.change_db for source_search in searches),
+        }
+
+
+class _SourceSearch:
+    """The search for the paths between one source and its targets [R, 3], [m]."""
+
+    def __init__(
+        self,
+        search: AdaptiveSearch,
+        sequences: SourceSequences,
+        launch: Launch,
+        targets: NDArray[np.float64],
+        max_paths: int,
+    ) -> None:
+        self._solver, self._backwards = search.solver, search.backwards
+        self._sequences, self._launch, self._targets = sequences, launch, targets
+        self._max_paths = max_paths
+        self.traced: list[TracedBuffer] = []
+        self.rays = 0
+        self.change_db = 0.0
+
+    def run(self) -> None:
+        """Find the paths, round by round."""
+        power = self._keep([self._direct_paths()])
+        if self._solver.settings.max_depth == 0:
+            return
+        launches, quiet = 0, 0
+        while quiet < QUIET_ROUNDS and launches < MAX_LAUNCHES:
+            parts: list[TracedBuffer] = []
+            # As many launches as in all rounds before.
+            for _ in range(max(launches, 1)):
+                sequences = self._sequences.new_in_launch(launches, self._max_paths)
+                launches += 1
+                if sequences is not None:
+                    parts += self._paths_of(sequences)
+            gained = self._keep(parts)
+            # A link that had no path before gives inf, one that gained none gives 0.
+            with np.errstate(divide="ignore", invalid="ignore"):
+                change_db = np.where(gained > 0, 10 * np.log10((power + gained) / power), 0.0)
+            self.rays, self.change_db = launches * RAYS_PER_ROUND, float(change_db.max())
+            power += gained
+            quiet = quiet + 1 if self.change_db <= CONVERGED_DB else 0
+        if quiet < QUIET_ROUNDS and self.change_db > CONVERGED_DB:
+            _LOG.warning(
+                "%s rays from %s still changed path loss by up to %.2f dB: paths may be missing",
+                f"{self.rays:,}", self._launch.source.tolist(), self.change_db,
+            )  # fmt: skip
+
+    def _direct_paths(self) -> TracedBuffer:
+        """Find the paths without an interaction."""
+        source, target = to_points(self._launch.source[None]), to_points(self._targets)
+        rays = Rays(
+            count=0,
+            seed=0,
+            directions=None,
+            direct=self._solver.settings.line_of_sight,
+            buffer_size=len(self._targets) + 2,
+            max_paths=self._max_paths,
+        )
+        candidates = self._solver.find_candidates(self._solver.mitsuba_scene, source, target, rays)
+        return self._trace_candidates(candidates)
+
+    def _paths_of(self, sequences: PathsBuffer) -> list[TracedBuffer]:
+        """Find the paths that run along interaction sequences to any receiver."""
+        unfolded = unfold_sequences(sequences, self._launch.source, self._sequences.meshes)
+        pairs = list(possible_pairs(unfolded, self._targets))
+        sequence, target = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        traced = []
+        for start in range(0, len(sequence), GEOMETRY_BATCH):
+            batch = slice(start, start + GEOMETRY_BATCH)
+            candidates = sequences.gather(mi.UInt(aligned(sequence[batch], np.uint32)))
+            candidates._tgt_indices = mi.UInt(aligned(target[batch], np.uint32))
+            candidates.schedule()
+            dr.eval()
+            traced.append(self._trace_candidates(candidates))
+        return traced
+
+    def _trace_candidates(self, candidates: PathsBuffer) -> TracedBuffer:
+        """Compute the paths of candidates, in the direction of the wave."""
+        source, target = to_points(self._launch.source[None]), to_points(self._targets)
+        if self._backwards:
+            candidates, source, target = reverse(candidates, target), target, source
+        self._solver.compute_geometry(candidates, source, target)
+        end: Any = candidates.source_indices if self._backwards else candidates.target_indices
+        return TracedBuffer(candidates, source, target, self._launch.links[np.array(end, dtype=np.int64)])
+
+    def _keep(self, parts: list[TracedBuffer]) -> NDArray[np.float64]:
+        """Keep the paths that are new and return the power that every link gained [R]."""
+        is_first = not self.traced
+        # The first buffer holds the direct paths and is kept even if empty: it defines the ends of the links.
+        new = [part for part in parts if len(part.link) or is_first]
+        if new and not is_first:
+            # Rounding may split a plane in two, so that its sequence is tried twice.
+            earlier = self.traced[1:]
+            new = drop_repeats([*earlier, *new])[len(earlier) :]
+        self.traced += new
+        if sum(len(part.link) for part in self.traced) > self._max_paths:
+            raise EngineError(
+                f"more paths than fit into memory, with {len(self._targets)} receivers at once; lower "
+                "trace.max_depth, or trace fewer links at once"
+            )
+        gained = np.zeros(len(self._targets))
+        order = np.argsort(self._launch.links)
+        for part in new:
+            gain = self._solver.compute_fields(part)
+            # Summed over receive ports, averaged over transmit ports.
+            power = (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
+            target = order[np.searchsorted(self._launch.links[order], part.link)]
+            gained += np.bincount(target, power, len(self._targets))
+        return gained
+
+
+def _merge(
+    known: NDArray[np.int64], candidates: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Merge the keys of sequences; returns all keys [n, k] and the candidates that are new [m]."""
+    merged, first = np.unique(np.vstack([known, candidates]), axis=0, return_index=True)
+    return merged, np.sort(first[first >= len(known)] - len(known))

@@ -1,0 +1,139 @@
+"""Sionna's path buffers: cleaned of empty entries and duplicates, and reversed."""
+
+# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+from calibray.paths import Kind
+from calibray.tracing.sionna.arrays import aligned, normals_at, per_interaction, vertices_of
+from calibray.tracing.trace_plan import find_repeats
+
+
+@dataclass(frozen=True)
+class TracedBuffer:
+    """Paths in one of Sionna's buffers.
+
+    Attributes:
+        buffer: The P paths.
+        source: Transmitters that they start at.
+        target: Receivers that they end at.
+        link: Link of every path [P].
+    """
+
+    buffer: PathsBuffer
+    source: mi.Point3f
+    target: mi.Point3f
+    link: NDArray[np.integer]
+
+
+def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
+    """Remove the entries that Sionna RT 2.2 counts but does not fill; refraction produces some.
+
+    An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
+    into another direct path between these two.
+
+    Args:
+        buffer: Candidate paths; direct paths among them are marked valid.
+
+    Returns:
+        The buffer itself if no entry is empty, else a copy without the empty ones.
+    """
+    if not buffer.buffer_size:
+        return buffer
+    filled = buffer.valid | (buffer.get_interaction_type(mi.UInt(1), mi.Bool(True)) != 0)
+    index = mi.UInt(dr.compress(filled))
+    return buffer if dr.width(index) == buffer.buffer_size else buffer.gather(index)
+
+
+def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
+    """Remove paths that several launches to the same receivers found; random samples of diffuse reflection stay.
+
+    Args:
+        traced: The paths of each launch, in order; changed.
+
+    Returns:
+        The same buffers without the paths that an earlier one holds.
+    """
+    if len(traced) == 1:
+        return traced
+    counts = [len(part.link) for part in traced]
+    kind = np.concatenate([per_interaction(part.buffer, "interaction_types") for part in traced])
+    is_repeat = find_repeats(
+        launch=np.repeat(np.arange(len(traced)), counts),
+        link=np.concatenate([part.link for part in traced]),
+        kind=kind,
+        shape=np.concatenate([per_interaction(part.buffer, "shapes") for part in traced]),
+        vertex=np.concatenate([vertices_of(part.buffer) for part in traced]),
+        is_sample=(kind == Kind.DIFFUSE).any(axis=1),
+    )
+    unique = []
+    for part, repeat in zip(traced, np.split(is_repeat, np.cumsum(counts)[:-1]), strict=True):
+        if repeat.any():
+            part.buffer.valid &= mi.Bool(aligned(~repeat, np.bool_))
+            part.buffer.discard_invalid()
+            part.buffer.schedule()
+            dr.eval()
+        unique.append(replace(part, link=part.link[~repeat]))
+    return unique
+
+
+def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
+    """Reverse candidate paths, so that those found from the receivers start at the transmitters.
+
+    Mirror images, straight lines through walls and the shortest path over an edge are the same in both directions, so
+    candidates of one direction are candidates of the other. They are reversed before their geometry is computed, which
+    makes the paths equal digit by digit whichever end they were found from. Three things depend on the direction: the
+    order of the interactions, the two ends, and the faces of an edge, where Sionna calls the one that the source
+    illuminates the 0-face.
+
+    Args:
+        buffer: Candidates without diffuse reflection, their geometry not computed yet.
+        sources: Where the reversed candidates start.
+
+    Returns:
+        The candidates in the same order, sources and targets exchanged.
+    """
+    if not buffer.buffer_size:
+        return buffer
+    reversed_buffer = buffer.reverse()
+    # Sionna does not type the wedges; they are None unless diffraction was asked for.
+    wedges: Any = reversed_buffer.diffracting_wedges
+    if wedges is not None:
+        start = np.array(sources, dtype=float).T[np.array(reversed_buffer.source_indices, dtype=np.int64)]
+        kind = per_interaction(reversed_buffer, "interaction_types")
+        wedges.swap_faces(mi.Bool(aligned(_zero_face_is_dark(reversed_buffer, kind, start), np.bool_)))
+        at_edge = kind == Kind.DIFFRACTION
+        depth = np.where(at_edge.any(axis=1), at_edge.argmax(axis=1) + 1, 0)
+        edge_depth = mi.UInt(aligned(depth, np.uint32))
+        reversed_buffer.set_primitive(edge_depth, wedges.prim0, edge_depth > 0)
+    reversed_buffer.schedule()
+    dr.eval()
+    return reversed_buffer
+
+
+def _zero_face_is_dark(
+    buffer: PathsBuffer, kind: NDArray[np.int64], source: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether the 0-face of each candidate's edge faces away from the incident wave [P]."""
+    # The wave comes from the image of the source in the planes before the edge, whichever point of the edge it meets.
+    image, vertex = source.copy(), vertices_of(buffer)
+    before_edge = np.ones(len(kind), dtype=bool)
+    for step in range(kind.shape[1]):
+        before_edge &= kind[:, step] != Kind.DIFFRACTION
+        mirrors = before_edge & (kind[:, step] == Kind.SPECULAR)
+        normal = normals_at(buffer, step, mirrors) * mirrors[:, None]
+        # Mirror image: s - 2 ((s - v) . n) n, with v a point of the plane and n its normal.
+        image -= 2 * np.sum((image - vertex[:, step]) * normal, axis=1)[:, None] * normal
+    wedges: Any = buffer.diffracting_wedges
+    edge_origin, zero_normal = (np.array(part, dtype=float).T for part in (wedges.o, wedges.n0))
+    return np.sum((edge_origin - image) * zero_normal, axis=1) > 0

@@ -1,0 +1,307 @@
+"""Sionna RT's solver, stage by stage: candidate paths by rays, exact geometry by the method of images, fields.
+
+The first two stages do not depend on the materials' constants beyond the choice of the ray's next interaction, so their
+result is kept and compiled into a path program. The field stage serves as the reference that replay is tested against.
+"""
+
+# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Final
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import sionna.rt as rt
+from numpy.typing import NDArray
+from sionna.rt.path_solvers import sb_deterministic
+from sionna.rt.path_solvers.field_calculator import FieldCalculator
+from sionna.rt.path_solvers.image_method import ImageMethod
+from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+from calibray.errors import EngineError, InputError
+from calibray.materials import Material
+from calibray.paths import Paths
+from calibray.paths.chains import Chains
+from calibray.scenes import Scene, check_material_name
+from calibray.tracing.antennas import AntennaPattern
+from calibray.tracing.protocol import compile_paths
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna.arrays import (
+    aligned,
+    normals_at,
+    per_interaction,
+    to_numpy_complex,
+    to_points,
+    vertices_of,
+)
+from calibray.tracing.sionna.buffers import TracedBuffer, drop_empty_entries
+from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
+
+# Sionna drops candidates whose hashes collide in its table. With its million entries it lost 16 of 6,030 (100 receivers
+# in Munich, 25 at once), with this many none. A prime, because the lowest bits of FNV hashes vary least.
+SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = 16_777_213
+
+SCALAR_CONSTANTS: Final = (
+    "relative_permittivity",
+    "conductivity",
+    "thickness",
+    "scattering_coefficient",
+    "xpd_coefficient",
+)
+"""Constants that Sionna's radio materials hold as single-precision numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays to send out, and how much room there is for the candidate paths that they find.
+
+    Attributes:
+        count: Number of rays; with 0 only direct paths are looked for.
+        seed: Seed of the random numbers.
+        directions: Directions as points of the unit square [2, count]; Sionna's own lattice if None.
+        direct: Whether direct paths are looked for as well.
+        buffer_size: Candidates that the buffer holds at first; a full one is replaced by a larger one.
+        max_paths: Candidates that fit into memory.
+    """
+
+    count: int
+    seed: int
+    directions: NDArray[np.float64] | None
+    direct: bool
+    buffer_size: int
+    max_paths: int
+
+
+class Solver:
+    """The stages of Sionna RT's solver on one loaded scene.
+
+    Args:
+        scene: The scene.
+        frequency: Carrier frequency [Hz].
+        settings: The tracer's settings.
+        tx_antenna: Transmit antenna.
+        rx_antenna: Receive antenna.
+
+    Raises:
+        InputError: Sionna cannot load the scene, the frequency is not a positive number, or an antenna's gain table
+            cannot be used.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        frequency: float,
+        settings: TraceSettings,
+        tx_antenna: Antenna,
+        rx_antenna: Antenna,
+    ) -> None:
+        if not (np.isfinite(frequency) and frequency > 0):
+            raise InputError(f"frequency = {frequency!r}: must be a finite number of Hz greater than 0")
+        self.scene, self.frequency, self.settings = scene, float(frequency), settings
+        self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
+        self._patterns = AntennaPattern.of(tx_antenna), AntennaPattern.of(rx_antenna)
+        self._tx_functions, self._rx_functions = antenna_patterns(tx_antenna), antenna_patterns(rx_antenna)
+        self._scene = load_scene(scene)
+        self._scene.frequency = self.frequency
+        # The names of Sionna's materials end in the number of the material (`Scene.xml`).
+        self._material_of_shape = {
+            key: int(shape.bsdf().name.split("-")[-1]) for key, shape in shape_ids(self.mitsuba_scene).items()
+        }
+        self._generate_candidates = SBDeterministicCandidateGenerator()
+        self._apply_image_method = ImageMethod()
+        self._calculate_fields = FieldCalculator()
+
+    @property
+    def mitsuba_scene(self) -> Any:
+        """The scene that Mitsuba holds; neither Sionna nor Mitsuba types it."""
+        return self._scene.mi_scene
+
+    def with_settings(self, settings: TraceSettings) -> Solver:
+        """Copy the solver with other settings; the loaded scene is shared."""
+        other = copy(self)
+        other.settings = settings
+        return other
+
+    def set_materials(self, materials: Mapping[str, Material]) -> dict[str, Material]:
+        """Set the constants of Sionna's materials: the scene's, except those given by name; returns all of them."""
+        for name in materials:
+            check_material_name(name, self.scene.materials, "materials")
+        constants = {**self.scene.materials, **materials}
+        for index, material in enumerate(constants.values()):
+            target = self._scene.radio_materials[f"calibray-{index}"]
+            # Opaque: Dr.Jit would compile a literal into its kernels.
+            for constant in SCALAR_CONSTANTS:
+                setattr(target, constant, dr.opaque(mi.Float, getattr(material, constant)))
+            target.scattering_pattern = scattering_pattern(material)
+        return constants
+
+    def find_candidates(
+        self, mitsuba_scene: Any, source: mi.Point3f, targets: mi.Point3f, rays: Rays
+    ) -> PathsBuffer:
+        """Send out rays and collect candidate paths.
+
+        Args:
+            mitsuba_scene: Mitsuba's scene, or an object with its ray queries.
+            source: Where the rays start.
+            targets: Where paths end.
+            rays: The rays.
+
+        Returns:
+            The candidates.
+
+        Raises:
+            EngineError: There are more than fit into memory.
+        """
+        settings, size = self.settings, rays.buffer_size
+        num_targets = dr.width(targets)
+        # At most one candidate per ray, interaction and target, and the direct paths.
+        most = (rays.count * settings.max_depth + 1) * num_targets + 2
+        while True:
+            with _ray_directions(rays.directions):
+                buffer = self._generate_candidates(
+                    mi_scene=mitsuba_scene,
+                    src_positions=source,
+                    tgt_positions=targets,
+                    samples_per_src=max(rays.count, 1),
+                    max_num_paths_per_src=size,
+                    max_depth=settings.max_depth if rays.count else 0,
+                    los=rays.direct,
+                    specular_reflection=settings.specular_reflection,
+                    diffuse_reflection=settings.diffuse_reflection,
+                    refraction=settings.refraction,
+                    diffraction=settings.diffraction,
+                    edge_diffraction=settings.edge_diffraction,
+                    seed=rays.seed,
+                )
+            buffer.schedule()
+            dr.eval()
+            num_candidates = int(np.array(buffer.paths_counter).item())
+            if num_candidates > rays.max_paths:
+                raise EngineError(
+                    f"more paths than fit into memory, with {num_targets} receivers at once; "
+                    "lower trace.samples or trace.max_depth, or trace fewer links at once"
+                )
+            if num_candidates < size - 1:
+                break
+            size = min(4 * size, most)
+        buffer.shrink()
+        buffer.detach_geometry()
+        return drop_empty_entries(buffer)
+
+    def compute_geometry(self, buffer: PathsBuffer, source: mi.Point3f, target: mi.Point3f) -> None:
+        """Compute the exact geometry of candidates by the method of images, in place; drop those that are no paths."""
+        if not buffer.buffer_size:
+            return
+        self._apply_image_method(
+            scene=self.mitsuba_scene,
+            paths=buffer,
+            src_positions=source,
+            tgt_positions=target,
+            diffraction=self.settings.diffraction,
+            diffraction_lit_region=self.settings.diffraction_lit_region,
+        )
+        buffer.discard_invalid()
+        buffer.schedule()
+        # Evaluated at once: pending results would keep all candidates and the whole buffer in memory.
+        dr.eval()
+
+    def compute_fields(self, traced: TracedBuffer) -> NDArray[np.complex128]:
+        """Compute path gains [P, R, T] with Sionna's field stage and the constants that were set last."""
+        if not len(traced.link):
+            return np.zeros((0, self.rx_antenna.ports, self.tx_antenna.ports), dtype=complex)
+        buffer = traced.buffer
+        valid = mi.Bool(buffer.valid)
+        num_tx, num_rx = dr.width(traced.source), dr.width(traced.target)
+        fields: Any = self._calculate_fields(
+            wavelength=self._scene.wavelength,
+            paths=buffer,
+            samples_per_src=self.settings.rays,
+            diffraction=self.settings.diffraction,
+            src_positions=traced.source,
+            tgt_positions=traced.target,
+            src_orientations=to_points(np.tile(self.tx_antenna.orientation, (num_tx, 1))),
+            tgt_orientations=to_points(np.tile(self.rx_antenna.orientation, (num_rx, 1))),
+            src_antenna_patterns=self._tx_functions,
+            tgt_antenna_patterns=self._rx_functions,
+        )
+        # Evaluated at once: reading each array would run the whole stage again.
+        dr.eval(fields.a, fields.tau)
+        # The field stage clears the flag of some paths; restored, so that it can run again.
+        buffer.valid = valid
+        return np.array([[to_numpy_complex(gain) for gain in row] for row in fields.a]).transpose(2, 0, 1)
+
+    def compile(
+        self,
+        traced: TracedBuffer,
+        tx: NDArray[np.float64],
+        rx: NDArray[np.float64],
+        materials: Mapping[str, Material],
+    ) -> Paths:
+        """Compile the paths of one buffer; `tx` and `rx` are the ends of every link [L, 3], [m]."""
+        return compile_paths(
+            self._chains(traced, tx, rx),
+            traced.link,
+            tx,
+            rx,
+            frequency=self.frequency,
+            materials=materials,
+            antennas=self._patterns,
+            settings={**self.settings.record(), "scene": self.scene.source, "sionna_rt": rt.__version__},
+        )
+
+    def _chains(self, traced: TracedBuffer, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Chains:
+        buffer, count = traced.buffer, len(traced.link)
+        depth = buffer.depth_dim_size
+        shape, of_path = np.unique(np.array(buffer.shapes, dtype=np.int64), return_inverse=True)
+        material = np.array([self._material_of_shape.get(key, 0) for key in shape.tolist()], dtype=np.int64)
+        normal = np.zeros((count, depth, 3))
+        edge, normal_n, edge_lengths = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
+        kind = per_interaction(buffer, "interaction_types")
+        if count and kind.any():
+            for step in range(depth):
+                normal[:, step] = normals_at(buffer, step, kind[:, step] != 0)
+            if self.settings.diffraction:
+                source = dr.gather(mi.Point3f, traced.source, buffer.source_indices)
+                target = dr.gather(mi.Point3f, traced.target, buffer.target_indices)
+                # Sionna's own lengths, so that replay follows its known error in them (docs/fidelity.md).
+                after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
+                wedges: Any = buffer.diffracting_wedges
+                edge, normal_n = (np.array(part, dtype=float).T for part in (wedges.e_hat, wedges.nn))
+                edge_lengths = np.stack([np.array(before, dtype=float), np.array(after, dtype=float)], axis=1)
+        return Chains(
+            source=tx[traced.link],
+            target=rx[traced.link],
+            vertex=vertices_of(buffer),
+            normal=normal,
+            kind=kind,
+            material=material[of_path].reshape(count, depth),
+            probability=np.array(buffer.probs, dtype=float).reshape(count, depth),
+            samples=self.settings.rays,
+            edge=edge,
+            normal_n=normal_n,
+            edge_lengths=edge_lengths,
+        )
+
+
+@contextmanager
+def _ray_directions(directions: NDArray[np.float64] | None) -> Iterator[None]:
+    """Make Sionna send its rays into directions, points of the unit square [2, rays]; its own lattice if None."""
+    # Sionna has no argument for them, so the function that makes its lattice is replaced.
+    sionna_lattice = sb_deterministic.fibonacci_lattice
+    if directions is not None:
+        sb_deterministic.fibonacci_lattice = lambda _: mi.Point2f(
+            *(aligned(axis, np.float32) for axis in directions)
+        )
+    try:
+        yield
+    finally:
+        sb_deterministic.fibonacci_lattice = sionna_lattice
