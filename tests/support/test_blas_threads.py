@@ -1,33 +1,35 @@
-"""One thread for the linear algebra, and as many as before afterwards."""
+"""One thread for the linear algebra inside the context, and as many as before afterwards."""
 
 import pytest
+import scipy.linalg  # noqa: F401  (its BLAS library must be loaded to be limited)
 from threadpoolctl import threadpool_info
 
 from calibray.support import blas_threads
 
 
-def _numbers():
-    return [each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"]
+def blas_thread_counts():
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 
 
-def test_threads_are_as_before_afterwards():
-    before = _numbers()
+def test_threads_are_limited_in_the_context_only():
+    before = blas_thread_counts()
+    assert before
     with blas_threads.single_blas_thread():
-        assert set(_numbers()) == {1}
+        assert set(blas_thread_counts()) == {1}
         with blas_threads.single_blas_thread(wanted=False):
-            assert set(_numbers()) == {1}
-    assert _numbers() == before
+            assert set(blas_thread_counts()) == {1}
+    assert blas_thread_counts() == before
 
 
-def test_nothing_is_changed_where_it_is_not_wanted():
-    before = _numbers()
+def test_nothing_changes_unless_wanted():
+    before = blas_thread_counts()
     with blas_threads.single_blas_thread(wanted=False):
-        assert _numbers() == before
+        assert blas_thread_counts() == before
 
 
-def test_libraries_are_looked_up_once(monkeypatch):
+def test_libraries_are_searched_once(monkeypatch):
     with blas_threads.single_blas_thread():
         pass
-    monkeypatch.setattr(blas_threads, "ThreadpoolController", lambda: pytest.fail("looked up again"))
+    monkeypatch.setattr(blas_threads, "ThreadpoolController", lambda: pytest.fail("searched again"))
     with blas_threads.single_blas_thread():
-        assert set(_numbers()) == {1}
+        assert set(blas_thread_counts()) == {1}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.support import memory
 from calibray.tracing.settings import TraceSettings
 from calibray.tracing.trace_plan import (
     LANE_BYTES,
@@ -120,22 +119,6 @@ def test_direct_paths_are_found_once():
 def test_paths_that_fit_grow_with_memory_and_shrink_with_depth():
     assert paths_that_fit(10**9, 2) > paths_that_fit(10**9, 5) > paths_that_fit(10**8, 5) > 0
     assert paths_that_fit(0, 3) == 0
-
-
-def test_memory_is_the_least_that_system_and_container_have_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "SYSTEM", tmp_path / "meminfo")
-    monkeypatch.setattr(memory, "GROUP", tmp_path)
-    whole = memory.available_memory()
-    assert whole > 2**20  # half of what is built in, as nothing tells more
-    (tmp_path / "meminfo").write_text("MemTotal:  9 kB\nMemFree: 1 kB\nMemAvailable:   5000 kB\n")
-    assert memory.available_memory() == 5000 * 1024
-    (tmp_path / "memory.max").write_text("max\n")
-    (tmp_path / "memory.stat").write_text("anon 1000\nfile 400\n")
-    assert memory.available_memory() == 5000 * 1024
-    (tmp_path / "memory.max").write_text("3000\n")
-    assert memory.available_memory() == 2000
-    (tmp_path / "memory.max").write_text("500\n")
-    assert memory.available_memory() == 0
 
 
 def test_long_traces_are_announced():

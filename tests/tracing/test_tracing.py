@@ -18,7 +18,6 @@ from calibray.errors import EngineError, InputError
 from calibray.fields import path_gains, path_loss
 from calibray.paths import Paths
 from calibray.scenes import read_scene
-from calibray.support.interruption import unwrap_interruption
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from calibray.tracing.trace_plan import lattice_directions
@@ -343,16 +342,3 @@ def test_nothing_is_written(house: Tracer, tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InputError):
         cb.trace("absent.xml", links([0, 0, 9], [[1, 0, 1]]), frequency=FREQUENCY)
     assert not list(tmp_path.iterdir())
-
-
-def test_an_interruption_in_the_midst_of_a_kernel_is_one():
-    def kernel(error):
-        try:
-            raise error
-        except BaseException as cause:
-            raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from cause
-
-    with pytest.raises(KeyboardInterrupt), unwrap_interruption():
-        kernel(KeyboardInterrupt())
-    with pytest.raises(RuntimeError, match="while_loop"), unwrap_interruption():
-        kernel(ValueError("another"))

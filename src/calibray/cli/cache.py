@@ -23,7 +23,7 @@ def cache(
     folder, programs = caching.cache_folder(), compiled_programs()
     kept = {
         "traces": traces.stored_traces(),
-        "compiled programs": [] if programs is None else programs.kept(),
+        "compiled programs": [] if programs is None else programs.entries(),
     }
     size = {name: sum(path.stat().st_size for path in paths) / 1e6 for name, paths in kept.items()}
     if clear:

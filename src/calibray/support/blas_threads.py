@@ -1,4 +1,4 @@
-"""Threads of the linear algebra: matrices of a calibration are small, and threads cost more there than they give."""
+"""Threads of the linear algebra: the matrices of a calibration are so small that threads slow it down."""
 
 from __future__ import annotations
 
@@ -9,21 +9,14 @@ from threadpoolctl import ThreadpoolController
 
 
 def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
-    """One thread for the linear algebra, as long as the context lasts.
-
-    Args:
-        wanted: Whether; nothing is changed if not.
-
-    Returns:
-        The context.
-    """
+    """Context in which the linear algebra uses one thread; nothing changes unless it is wanted."""
     return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The libraries that are loaded: looked up once, for that reads all that the process has mapped."""
-    # Loads those that are used later, if they are not yet.
+    """The loaded libraries; cached, because the search reads all memory maps of the process."""
+    # Import SciPy's library as well, so that it is among them.
     import scipy.linalg  # noqa: F401
 
     return ThreadpoolController()

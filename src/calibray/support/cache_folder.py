@@ -1,6 +1,6 @@
-"""Calibray's cache folder: what can be had again, kept between runs.
+"""Calibray's cache folder: data kept between runs that can be computed again.
 
-The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` switches it off.
+The folder is `CALIBRAY_CACHE`, else `calibray` in the user's cache folder; an empty `CALIBRAY_CACHE` disables caching.
 """
 
 from __future__ import annotations
@@ -14,44 +14,43 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from platformdirs import user_cache_path
+
 CACHE_VARIABLE: Final = "CALIBRAY_CACHE"
-MOST: Final = 512 * 2**20
-"""Size that compiled programs may take [bytes]."""
-_SEAL: Final = 32
-"""Bytes of the SHA-256 that an entry begins with."""
+COMPILED_BYTES: Final = 512 * 2**20
+"""Size limit of compiled programs [bytes]."""
+_DIGEST_BYTES: Final = 32
+"""Bytes of the SHA-256 at the start of each entry."""
 
 
 def cache_folder() -> Path | None:
-    """Where things are kept, whether it is there yet or not; None where they are not."""
-    named = os.environ.get(CACHE_VARIABLE)
-    if named == "":
-        return None
-    if named is None:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        return Path(home) / "calibray"
-    return Path(named)
+    """The cache folder, which need not exist; None if caching is disabled."""
+    folder = os.environ.get(CACHE_VARIABLE)
+    if folder is None:
+        return user_cache_path("calibray", appauthor=False)
+    return Path(folder) if folder else None
 
 
 @dataclass(frozen=True)
 class Store:
-    """Sealed entries in a folder that nobody else can write, for what must be trusted, such as machine code.
+    """Checksummed entries in a folder that nobody else can write, for data that must be trusted, such as machine code.
 
-    An entry is whole or it is none: it is moved into its place when it is complete, and one that was damaged is
-    removed when it is asked for. What cannot be read or written is simply not kept.
+    An entry is complete or absent: it is moved into place once it is written, and a damaged one is removed when it is
+    read. Entries that cannot be read or written are skipped without an error.
 
     Attributes:
         path: The folder, which need not exist.
-        suffix: What the entries' names end with.
-        most: Size at which the entries that were not asked for the longest are removed [bytes].
+        suffix: The end of the entries' file names.
+        limit: Size limit; the entries read least recently are removed above it [bytes].
     """
 
     path: Path
     suffix: str
-    most: int
+    limit: int
 
     @property
     def trusted(self) -> bool:
-        """Whether the folder, made if need be, is the user's own and nobody else can write into it."""
+        """Whether the folder, created if need be, belongs to the user and nobody else can write to it."""
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             status = self.path.lstat()
@@ -59,63 +58,51 @@ class Store:
             return False
         if not stat.S_ISDIR(status.st_mode):
             return False
-        if not hasattr(os, "geteuid"):  # Windows, where a user's folders are the user's
+        if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders
             return True
         return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
     def get(self, name: str) -> bytes | None:
-        """An entry.
-
-        Args:
-            name: Its name.
-
-        Returns:
-            What was kept, or None where nothing was or it was damaged.
-        """
+        """Read an entry; None if it is absent or damaged."""
         path = self._path(name)
-        try:
-            sealed = path.read_bytes()
-            if hashlib.sha256(sealed[_SEAL:]).digest() == sealed[:_SEAL]:
+        with suppress(OSError):
+            content = path.read_bytes()
+            digest, value = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+            if hashlib.sha256(value).digest() == digest:
                 path.touch()
-                return sealed[_SEAL:]
+                return value
             path.unlink()
-        except OSError:
-            pass
         return None
 
     def put(self, name: str, value: bytes) -> None:
-        """Keep an entry.
-
-        Args:
-            name: Its name.
-            value: What to keep.
-        """
+        """Write an entry."""
         path = self._path(name)
         partial = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
         try:
             partial.write_bytes(hashlib.sha256(value).digest() + value)
             partial.replace(path)
-            self._make_room()
+            self._remove_oldest()
         except OSError:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
 
-    def kept(self) -> list[Path]:
-        """The entries, the one asked for last first; no other file of the folder."""
+    def entries(self) -> list[Path]:
+        """The files of the entries, the one read last first; no other file of the folder."""
         ages = []
         with suppress(OSError):
             for path in self.path.glob(f"*{self.suffix}"):
                 with suppress(OSError):  # another process may remove it meanwhile
-                    if stat.S_ISREG((status := path.lstat()).st_mode):
+                    status = path.lstat()
+                    if stat.S_ISREG(status.st_mode):
                         ages.append((status.st_mtime, path))
         return [path for _, path in sorted(ages, reverse=True)]
 
-    def _make_room(self) -> None:
+    def _remove_oldest(self) -> None:
         total = 0
-        for path in self.kept():
+        for path in self.entries():
             with suppress(OSError):
                 total += path.stat().st_size
-                if total > self.most:
+                if total > self.limit:
                     path.unlink()
 
     def _path(self, name: str) -> Path:
@@ -123,6 +110,6 @@ class Store:
 
 
 def compiled_programs() -> Store | None:
-    """Where compiled programs are kept; None where nothing is."""
-    here = cache_folder()
-    return None if here is None else Store(here / "compiled", ".xla", MOST)
+    """The store of compiled programs; None if caching is disabled."""
+    folder = cache_folder()
+    return None if folder is None else Store(folder / "compiled", ".xla", COMPILED_BYTES)

@@ -1,4 +1,4 @@
-"""Optional libraries: imported when they are needed, and missed with the command that installs them."""
+"""Optional libraries: imported when they are needed; the error for a missing one names the command that installs it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from calibray.errors import InputError
 
 
 def library(name: str, extra: str) -> ModuleType:
-    """Import a library that only some users need.
+    """Import an optional library.
 
     Args:
         name: The module.
-        extra: Calibray's extra that brings it.
+        extra: Calibray's extra that installs it.
 
     Returns:
         The module.
 
     Raises:
-        InputError: It is not installed; the message names the command that installs it.
+        InputError: It is not installed.
 
     Example:
         >>> library("zipfile", "scenes").is_zipfile("no such file")

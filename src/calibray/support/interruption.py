@@ -1,4 +1,4 @@
-"""Ctrl-C in the midst of compiled code, which libraries take for a failure of their own, or drop."""
+"""Ctrl-C during compiled code, where libraries turn it into an error of their own or drop it."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from types import FrameType
 from typing import Final
 
 GRACE: Final = 1.0
-"""Time that an interruption may take to reach whoever keeps what was computed [s]."""
+"""Time that an interruption may take to reach the code that saves results, before it is raised again [s]."""
 
 
 @contextmanager
 def unwrap_interruption() -> Iterator[None]:
-    """Let an interruption through as what it is.
+    """Raise KeyboardInterrupt in place of the error that a library made of it.
 
     Yields:
-        Nothing; what runs meanwhile may call Dr.Jit or import compiled modules.
+        Nothing; the block may call Dr.Jit or import compiled modules.
 
     Raises:
-        KeyboardInterrupt: An error was raised because of one.
-        RuntimeError: An error was raised for another reason.
-        SystemError: The same, of an import.
-        ImportError: The same, of a library's own import.
+        KeyboardInterrupt: It caused the error of a library.
+        RuntimeError: Raised in the block, with another cause.
+        SystemError: The same.
+        ImportError: The same.
     """
     try:
         yield
-    # Dr.Jit raises the first in a loop, the interpreter the second in an import, and Mitsuba the third in its own.
+    # Dr.Jit raises RuntimeError in a loop, the interpreter SystemError in an import, Mitsuba ImportError in its own.
     except (RuntimeError, SystemError, ImportError) as error:
         cause: BaseException | None = error
         while cause is not None:
@@ -41,21 +41,23 @@ def unwrap_interruption() -> Iterator[None]:
 
 @contextmanager
 def ensure_interruption() -> Iterator[None]:
-    """See to it that Ctrl-C ends what runs meanwhile, whatever a library makes of it.
+    """Make sure that Ctrl-C ends the block, whatever a library does with it.
 
-    Compiled code drops interruptions that fall into its callbacks, and raises errors of its own in their place: `check`
-    raises again those that were dropped, and whatever fails after Ctrl-C was pressed is an interruption.
+    Compiled code may drop an interruption that occurs in its callbacks, or raise another error. Inside this context
+    `raise_pending_interruption` raises a dropped one again, and any error after Ctrl-C counts as an interruption.
 
     Yields:
-        Nothing. Outside the main thread, or where interruptions are ignored or seen to otherwise, they are left alone.
+        Nothing. Outside the main thread, or if another handler for Ctrl-C is set, the block runs unchanged.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that came of it, if one did.
-        Exception: What was raised without it.
+        KeyboardInterrupt: Ctrl-C was pressed; its cause is the error that followed, if any.
+        Exception: Raised in the block without Ctrl-C.
     """
-    mine = threading.current_thread() is threading.main_thread()
-    mine = mine and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if mine:
+    handled = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if handled:
         _pressed.clear()
         signal.signal(signal.SIGINT, _press)
     try:
@@ -65,22 +67,22 @@ def ensure_interruption() -> Iterator[None]:
             raise KeyboardInterrupt from error
         raise
     finally:
-        if mine:
+        if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             _pressed.clear()
 
 
 def raise_pending_interruption() -> None:
-    """Go on, unless Ctrl-C was pressed a while ago and nobody has heeded it.
+    """Raise a KeyboardInterrupt that was dropped within `ensure_interruption`, after a time of grace.
 
     Raises:
-        KeyboardInterrupt: It was, within `ensure_interruption`.
+        KeyboardInterrupt: Ctrl-C was pressed longer than `GRACE` ago and the block still runs.
     """
     if _pressed and time.monotonic() - _pressed[-1] > GRACE:
         raise KeyboardInterrupt
 
 
-# When, within `ensure_interruption`; there is one keyboard, and one handler of its signal, a process.
+# Times of Ctrl-C within `ensure_interruption`. Global, because a process has one handler for the signal.
 _pressed: list[float] = []
 
 
@@ -91,22 +93,22 @@ def _press(_: int, __: FrameType | None) -> None:
 
 @contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Let Ctrl-C wait until something is made that a library would leave half-made, and say nothing.
+    """Delay Ctrl-C to the end of a short block that must not be left half done.
 
     Yields:
-        Nothing; what runs meanwhile is short.
+        Nothing.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed meanwhile.
+        KeyboardInterrupt: Ctrl-C was pressed in the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
         if pressed:
             signal.raise_signal(signal.SIGINT)

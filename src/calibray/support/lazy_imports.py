@@ -1,4 +1,4 @@
-"""Names of a package that are loaded when first used, so that importing it costs nothing."""
+"""Names of a package that are imported when first used, so that importing the package is fast."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 def lazy_attributes(
     package: str, homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """The `__getattr__` and `__dir__` of a package (PEP 562).
+    """Make the `__getattr__` and `__dir__` of a package (PEP 562).
 
     Args:
         package: The package's name.
-        homes: The module of each name; that of a module itself where the two agree.
+        homes: The module that defines each name; for a submodule, its own name in full.
 
     Returns:
         The two functions.
@@ -26,7 +26,7 @@ def lazy_attributes(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(homes[name])
         value = module if homes[name] == f"{package}.{name}" else getattr(module, name)
-        # From here on Python finds it by itself.
+        # Set as an attribute, so that Python does not call this function again.
         setattr(sys.modules[package], name, value)
         return value
 

@@ -1,43 +1,31 @@
-"""How much memory this process may still take."""
+"""Memory that this process may still use."""
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from pathlib import Path
 
-GROUP = Path("/sys/fs/cgroup")
-"""Where a container's limit is."""
-SYSTEM = Path("/proc/meminfo")
-"""Where Linux tells what is left."""
-UNKNOWN = 2**34
-"""What is taken to be built in where nothing tells [bytes]."""
+import psutil
+
+CONTROL_GROUP = Path("/sys/fs/cgroup")
+"""Control group (version 2) of a container, with its memory limit."""
 
 
 def available_memory() -> int:
-    """Memory that can be taken before the system, or the container, ends processes.
+    """Memory that can be allocated before the system ends the process or refuses more [bytes].
 
-    Returns:
-        The least of what the system and the container have left, [bytes]; where the system does not tell (it does on
-        Linux), half of what is built in.
+    The least of what the system, the container and the limit of the address space (`ulimit -v`) leave.
     """
-    left = [_physical() // 2]
-    with suppress(OSError, ValueError, KeyError):
-        left = [_entries(SYSTEM)["MemAvailable:"] * 1024]
-    # There is no number where there is no limit; caches give way.
-    with suppress(OSError, ValueError, KeyError):
-        left.append(int((GROUP / "memory.max").read_text()) - _entries(GROUP / "memory.stat")["anon"])
-    return max(min(left), 0)
+    free = [psutil.virtual_memory().available]
+    # psutil does not know limits. The file of the container holds "max" if there is none; file caches can be freed.
+    with suppress(OSError, ValueError, StopIteration):
+        limit = int((CONTROL_GROUP / "memory.max").read_text())
+        lines = (CONTROL_GROUP / "memory.stat").read_text().splitlines()
+        free.append(limit - next(int(line.split()[1]) for line in lines if line.startswith("anon ")))
+    with suppress(ImportError):  # Windows has no such limit
+        import resource
 
-
-def _entries(file: Path) -> dict[str, int]:
-    lines = (line.split() for line in file.read_text().splitlines())
-    return {words[0]: int(words[1]) for words in lines}
-
-
-def _physical() -> int:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    # Not every system tells.
-    except (AttributeError, ValueError, OSError):
-        return UNKNOWN
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            free.append(limit - psutil.Process().memory_info().vms)
+    return max(min(free), 0)

@@ -1,4 +1,4 @@
-"""The words of messages: what was perhaps meant by an unknown name, and values short enough to be read."""
+"""Parts of messages: suggestions for unknown names, values short enough to read, durations."""
 
 from __future__ import annotations
 
@@ -7,25 +7,23 @@ from difflib import get_close_matches
 from itertools import islice
 from typing import Final
 
-LONGEST: Final = 80
-"""The number of characters beyond which a value is shortened in a message."""
-
-LISTED: Final = 20
-"""The number of names beyond which a message does not list them all."""
-
-COMPARED: Final = 2_000
-"""The number of names beyond which a misspelled one is not compared with the rest."""
+MAX_LENGTH: Final = 80
+"""Characters above which a value is shortened in a message."""
+MAX_LISTED: Final = 20
+"""Names above which a message does not list them all."""
+MAX_COMPARED: Final = 2_000
+"""Names that a misspelled one is compared with at most."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The remedy for an unknown name, as a phrase to end a message with.
 
     Args:
-        name: The name that was given.
-        known: The names there are.
+        name: The name as given.
+        known: The valid names.
 
     Returns:
-        ``did you mean 'x'?`` when one name is close, else the names, the first twenty where there are more.
+        ``did you mean 'x'?`` if a valid name is close, else the names, at most the first twenty.
 
     Example:
         >>> did_you_mean("concret", ["brick", "concrete"])
@@ -34,24 +32,17 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         'there are: brick, concrete'
     """
     names = [str(known_name) for known_name in known]
-    compared = [each for each in islice(names, COMPARED) if len(each) <= LONGEST]
-    if len(str(name)) <= LONGEST and (close := get_close_matches(str(name), compared, n=1)):
+    compared = [known_name for known_name in islice(names, MAX_COMPARED) if len(known_name) <= MAX_LENGTH]
+    if len(str(name)) <= MAX_LENGTH and (close := get_close_matches(str(name), compared, n=1)):
         return f"did you mean {close[0]!r}?"
     if not names:
         return "there are none"
-    more = f", ... ({len(names)} in all)" if len(names) > LISTED else ""
-    return f"there are: {', '.join(shortened(each) for each in names[:LISTED])}{more}"
+    more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
+    return f"there are: {', '.join(shortened(known_name) for known_name in names[:MAX_LISTED])}{more}"
 
 
-def shortened(text: str, longest: int = LONGEST) -> str:
-    """A text for a message, its middle left out where it is long.
-
-    Args:
-        text: The text.
-        longest: The number of characters it may have.
-
-    Returns:
-        The text, or its beginning and its end.
+def shortened(text: str, longest: int = MAX_LENGTH) -> str:
+    """Shorten a text for a message: its start and its end, if it has more than `longest` characters.
 
     Example:
         >>> shortened("abcdefghijkl", longest=9)
@@ -64,13 +55,7 @@ def shortened(text: str, longest: int = LONGEST) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """What a library says of a damaged file, which can break it anywhere.
-
-    Args:
-        error: What it raised.
-
-    Returns:
-        The first line of its message, or its type where it has none.
+    """The first line of an error's message, or its type if it has none.
 
     Example:
         >>> first_line(KeyError())
@@ -80,13 +65,7 @@ def first_line(error: Exception) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A length of time in words, as coarse as an estimate.
-
-    Args:
-        seconds: The time [s].
-
-    Returns:
-        Seconds, minutes, hours or days.
+    """Write a time [s] in seconds, minutes, hours or days, with the precision of an estimate.
 
     Example:
         >>> duration(26_700.0)

@@ -1,14 +1,13 @@
 """Output files: refused before the work if they could not be written, and never half-written.
 
-An output never takes the place of an input, of a link or a device, nor of a file that Calibray did not write or that
-was changed since. What it writes it signs: the digest and the name of each file stand in `.calibray` beside it.
+An output never replaces an input, a link or a device, nor a file that Calibray did not write or that was changed since.
+Calibray signs the files that it writes: `.calibray` in the same folder lists the digest and the name of each.
 """
 
 from __future__ import annotations
 
 import glob
 import hashlib
-import json
 import os
 import stat
 import time
@@ -25,35 +24,25 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TABLES: Final = (".csv", ".parquet")
-PARTIAL: Final = ".part"  # what the name of an unfinished file ends with
-SIGNATURES: Final = ".calibray"  # one line a file written, its SHA-256 and its name; only ever appended to
-FIRST_RESULT: Final = (
-    "result.json",
-    "links.csv",
-    "history.csv",
-    "scene.xml",
-)  # of the first version, not signed
-PATH_SEAL: Final = b"calibray/paths sha256 "  # what a path file begins with
-STALE: Final = 60.0  # age of an unfinished file whose process is gone [s]
+PARTIAL: Final = ".part"  # end of the name of an unfinished file
+SIGNATURES: Final = ".calibray"  # a line per file written, its SHA-256 and its name; only appended to
+PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
+STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its process has ended
 
 
 def exists(file: str | Path) -> bool:
-    """Whether there is a file of a name; none has a name that no file can have.
-
-    Args:
-        file: The file.
-
-    Returns:
-        True for a file, also through a link; False for a folder, a device or nothing.
-    """
+    """Whether a file exists, also through a link. Folders, devices and invalid names give False."""
     try:
         return Path(file).is_file()
     except (OSError, ValueError):
         return False
 
 
+# Checks before the work; nothing is created yet.
+
+
 def check_folder(folder: str | Path) -> Path:
-    """Refuse a folder that no file can be written into; nothing is made yet.
+    """Refuse a folder that no file can be written into.
 
     Args:
         folder: The folder, which need not exist.
@@ -62,9 +51,9 @@ def check_folder(folder: str | Path) -> Path:
         Its path.
 
     Raises:
-        InputError: It, or what it would be made in, is a file or cannot be written.
+        InputError: The folder, or the one that it would be created in, is a file or cannot be written.
     """
-    target = _named(folder, "output folder")
+    target = _valid_name(folder, "output folder")
     nearest = next(path for path in (target, *target.absolute().parents) if path.exists())
     if not nearest.is_dir():
         raise InputError(f"output folder {target}: {nearest} is a file; name another folder")
@@ -73,25 +62,10 @@ def check_folder(folder: str | Path) -> Path:
     return target
 
 
-def _named(path: str | Path, role: str) -> Path:
-    """The path of an output, whose name some file could have."""
-    target = Path(path)
-    place = f"{role} {shortened(str(target), 300)}"
-    try:
-        target.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except OSError as error:
-        raise InputError(f"{place}: cannot be looked up ({error.strerror}); name another") from None
-    except ValueError as error:
-        raise InputError(f"{place}: cannot be a name ({error}); name another") from None
-    return target
-
-
 def check_outputs(
     folder: str | Path, names: Sequence[str], inputs: Iterable[Path] = (), overwrite: bool = False
 ) -> Path:
-    """Refuse a folder that files cannot be written into, or that holds files in their place; nothing is made yet.
+    """Refuse a folder that files cannot be written into, or with files that must not be replaced.
 
     Args:
         folder: The folder, which need not exist.
@@ -103,7 +77,7 @@ def check_outputs(
         The folder's path.
 
     Raises:
-        InputError: What `check_folder` refuses, or a file there must not be replaced.
+        InputError: As for `check_folder` and `check_replaceable`.
     """
     target, sources = check_folder(folder), list(inputs)
     for name in names:
@@ -111,109 +85,8 @@ def check_outputs(
     return target
 
 
-def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
-    """Refuse to replace what must not be replaced; what does not exist may be written.
-
-    Args:
-        file: The output.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace a file that Calibray did not write.
-
-    Raises:
-        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that was
-            changed since, unless `overwrite`.
-    """
-    try:
-        status = file.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    except OSError as error:
-        raise InputError(
-            f"output file {file}: cannot be looked up ({error.strerror}); name another"
-        ) from None
-    if stat.S_ISLNK(status.st_mode):
-        raise InputError(f"output file {file}: is a link; name the file that it leads to, or another")
-    if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"output file {file}: is a folder, a device or a FIFO; name a file")
-    for source in inputs:
-        if source.exists() and file.samefile(source):
-            raise InputError(f"output file {file}: is an input of the study; name another")
-    if status.st_size and not overwrite and not is_own(file):
-        raise InputError(
-            f"output file {file}: was not written by Calibray, or was changed since; name another, move it away, or "
-            "give --overwrite"
-        )
-
-
-def is_own(file: Path) -> bool:
-    """Whether Calibray wrote a file as it is.
-
-    Args:
-        file: The file.
-
-    Returns:
-        Whether it is signed; or a path file, which says so itself; or a file of a result of the first version, which
-        signed nothing.
-    """
-    lines = _signatures(file.parent)
-    if _signature(file, file.name) in lines or _is_path_file(file):
-        return True
-    if not lines:
-        return file.name in FIRST_RESULT and _is_result(file.parent / FIRST_RESULT[0])
-    return False
-
-
-def check_unchanged(file: Path) -> None:
-    """Refuse a file that Calibray signed and that is another now; one that nobody signed may be what it is.
-
-    Args:
-        file: The file, which can be read.
-
-    Raises:
-        InputError: The file changed since it was written.
-    """
-    signed = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
-    if signed and _signature(file, file.name) not in signed:
-        raise InputError(
-            f"{file}: changed since Calibray wrote it, and may say what was never found; run the study again, or "
-            "give --anyway (anyway=True)"
-        )
-
-
-def _signatures(folder: Path) -> list[str]:
-    try:
-        return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return []
-
-
-def _sign(folder: Path, signature: str) -> None:
-    if signature not in _signatures(folder):
-        with (folder / SIGNATURES).open("a", encoding="utf-8") as stream:
-            stream.write(f"{signature}\n")
-
-
-def _is_path_file(file: Path) -> bool:
-    """Whether a file carries the seal of path files (see `calibray.paths.checksum`); nothing of it is interpreted."""
-    with file.open("rb") as stream:
-        return stream.read(len(PATH_SEAL)) == PATH_SEAL
-
-
-def _is_result(file: Path) -> bool:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(content, dict) and {"version", "study", "rmse_db", "rt_calls"} <= set(content)
-
-
-def _signature(file: Path, name: str) -> str:
-    with file.open("rb") as stream:
-        return f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name}"
-
-
 def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a file that cannot be written; nothing is made yet.
+    """Refuse a file that cannot be written.
 
     Args:
         file: The file, which need not exist; its folder must.
@@ -224,9 +97,9 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
         Its path.
 
     Raises:
-        InputError: It is a folder, its folder does not exist or cannot be written, or what `check_replaceable` refuses.
+        InputError: It is a folder, its folder does not exist or cannot be written, or as for `check_replaceable`.
     """
-    target = _named(file, "output file")
+    target = _valid_name(file, "output file")
     if target.is_dir():
         raise InputError(f"output file {target}: is a folder; name a file in it")
     if not target.parent.is_dir():
@@ -240,18 +113,10 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
 
 
 def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a table that cannot be written; nothing is made yet.
-
-    Args:
-        file: The file; its ending says how it will be written.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace a file that Calibray did not write.
-
-    Returns:
-        Its path.
+    """Refuse a table that cannot be written: as `check_file`, and the name must end in .csv or .parquet.
 
     Raises:
-        InputError: The ending is another, or what `check_file` refuses.
+        InputError: The ending is another one, or as for `check_file`.
     """
     target = check_file(file, inputs, overwrite)
     if target.suffix.lower() not in TABLES:
@@ -259,34 +124,126 @@ def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool =
     return target
 
 
+def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
+    """Refuse to replace a file that must be kept; a file that does not exist may be written.
+
+    Args:
+        file: The output.
+        inputs: Files that the work reads; none of them is ever replaced.
+        overwrite: Replace a file that Calibray did not write.
+
+    Raises:
+        InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that was
+            changed since, unless `overwrite`.
+    """
+    status = _status(file, "output file")
+    if status is None:
+        return
+    if stat.S_ISLNK(status.st_mode):
+        raise InputError(f"output file {file}: is a link; name the file that it leads to, or another")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"output file {file}: is a folder, a device or a FIFO; name a file")
+    for source in inputs:
+        if source.exists() and file.samefile(source):
+            raise InputError(f"output file {file}: is an input of the study; name another")
+    if status.st_size and not overwrite and not is_unchanged_output(file):
+        raise InputError(
+            f"output file {file}: was not written by Calibray, or was changed since; name another, move it away, or "
+            "give --overwrite"
+        )
+
+
+def check_unchanged(file: Path) -> None:
+    """Refuse a file that Calibray signed and that was changed since; an unsigned file may have any content.
+
+    Args:
+        file: The file, which can be read.
+
+    Raises:
+        InputError: The file changed since it was written.
+    """
+    signatures = [line for line in _signatures(file.parent) if line.partition("  ")[2] == file.name]
+    if signatures and _signature(file, file.name) not in signatures:
+        raise InputError(
+            f"{file}: changed since Calibray wrote it, so its numbers may be wrong; run the study again, or "
+            "give --allow-changed-inputs (allow_changed_inputs=True)"
+        )
+
+
+def is_unchanged_output(file: Path) -> bool:
+    """Whether Calibray wrote a file in its present form: it is signed, or it is a path file, which has its own seal."""
+    if _signature(file, file.name) in _signatures(file.parent):
+        return True
+    with file.open("rb") as stream:
+        return stream.read(len(PATH_SEAL)) == PATH_SEAL
+
+
+def _valid_name(path: str | Path, role: str) -> Path:
+    """The path of an output; refused if no file can have the name."""
+    target = Path(path)
+    _status(target, role)
+    return target
+
+
+def _status(path: Path, role: str) -> os.stat_result | None:
+    """The status of an output; None if it does not exist."""
+    name = f"{role} {shortened(str(path), 300)}"
+    try:
+        return path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise InputError(f"{name}: cannot be looked up ({error.strerror}); name another") from None
+    except ValueError as error:
+        raise InputError(f"{name}: cannot be a name ({error}); name another") from None
+
+
+def _signatures(folder: Path) -> list[str]:
+    try:
+        return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+
+
+def _signature(file: Path, name: str) -> str:
+    with file.open("rb") as stream:
+        return f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name}"
+
+
+# Writing
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A place beside a file to write the new one into; it is signed and takes the file's place once it is complete.
+    """Write a file under a temporary name; it is signed and moved into place once it is complete.
 
     Args:
         path: The file.
 
     Yields:
-        Where to write; removed again if the writing fails.
+        The temporary file in the same folder, removed if writing fails.
     """
-    _sweep(path)
+    _remove_unfinished(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}{PARTIAL}")
     try:
         yield partial
-        # Signed first: a run that is killed in between must not find a file that it does not take for its own.
-        _sign(path.parent, _signature(partial, path.name))
+        # Signed first: after a kill between the two steps, the next run must still recognise the file as its own.
+        signature = _signature(partial, path.name)
+        if signature not in _signatures(path.parent):
+            with (path.parent / SIGNATURES).open("a", encoding="utf-8") as stream:
+                stream.write(f"{signature}\n")
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _sweep(path: Path) -> None:
-    """Remove unfinished files of runs that were killed while they wrote this one."""
+def _remove_unfinished(path: Path) -> None:
+    """Remove the unfinished files of processes that were killed while they wrote this file."""
     for partial in path.parent.glob(f"{glob.escape(path.name)}.*-*{PARTIAL}"):
-        number = partial.name.removeprefix(f"{path.name}.").split("-")[0]
+        process = partial.name.removeprefix(f"{path.name}.").split("-")[0]
         try:
-            if number.isdigit() and time.time() - partial.lstat().st_mtime > STALE:
-                os.kill(int(number), 0)
+            if process.isdigit() and time.time() - partial.lstat().st_mtime > STALE_SECONDS:
+                os.kill(int(process), 0)  # raises ProcessLookupError if it has ended
         except ProcessLookupError:
             partial.unlink(missing_ok=True)
         except (OSError, OverflowError):
@@ -294,46 +251,32 @@ def _sweep(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file beside its place and move it there.
-
-    Args:
-        path: The file.
-        text: Its content.
-    """
+    """Write a text file and move it into place once it is complete."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a CSV or Parquet file beside its place and move it there.
-
-    Args:
-        path: The file; its ending says how it is written.
-        table: The rows; their index is left out.
-
-    Raises:
-        InputError: What `check_table` refuses, or it is Parquet and pyarrow is not installed.
-    """
+    """Write a CSV or Parquet file, without the index, and move it into place; errors as for `growing_table`."""
     with growing_table(path) as append:
         append(table)
 
 
 @contextmanager
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
-    """Write a CSV or Parquet file in pieces beside its place, and move it there once it is complete.
+    """Write a CSV or Parquet file in parts and move it into place once it is complete.
 
     Args:
-        path: The file; its ending says how it is written.
+        path: The file; its ending decides the format.
 
     Yields:
-        What appends rows, with the columns of those before; their index is left out. Columns have the types of the
-        first rows.
+        A function that appends rows without their index; all calls must give the columns and types of the first one.
 
     Raises:
-        InputError: What `check_table` refuses, it is Parquet and pyarrow is not installed, or a column cannot have the
-            type that it had before.
+        InputError: As for `check_table`, or Parquet without pyarrow, or a column changes its type.
     """
-    target = check_table(path, overwrite=True)  # whether it may be replaced was asked before the work
+    # Whether the file may be replaced was checked before the work.
+    target = check_table(path, overwrite=True)
     write = _csv if target.suffix.lower() == ".csv" else _parquet
     with replacing(target) as partial, write(partial, target) as append:
         yield append

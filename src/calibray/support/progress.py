@@ -1,26 +1,19 @@
-"""Progress: how long work tells how far it is."""
+"""Reporting the progress of long work."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with the stage ("tracing", "calibrating", ...), how much is done, and out of how much; None if unknown."""
+"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount; None if unknown."""
 
 
 def with_stage(progress: Progress | None, stage: str) -> Progress | None:
-    """Tell progress under another stage's name.
-
-    Args:
-        progress: Whom to tell; None for nobody.
-        stage: The name in place of that of the work itself, as "checking" for a trace that checks another.
-
-    Returns:
-        What the work calls.
+    """Report progress under another stage, as "checking" for a trace that checks another one.
 
     Example:
-        >>> told = with_stage(lambda *parts: print(*parts), "checking")
-        >>> told("tracing", 3, 40)
+        >>> progress = with_stage(lambda *parts: print(*parts), "checking")
+        >>> progress("tracing", 3, 40)
         checking 3 40
     """
     if progress is None:
@@ -29,19 +22,19 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
 
 
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Tell progress of one of several pieces of work as that of all.
+    """Report the progress of one of several parts as that of the whole work.
 
     Args:
-        progress: Whom to tell; None for nobody.
-        before: How much was done before this piece.
-        total: How much there is in all.
+        progress: Receives the reports; None for nobody.
+        before: Amount done before this part.
+        total: Amount of the whole work.
 
     Returns:
-        What the work calls.
+        The callback of the part.
 
     Example:
-        >>> told = with_total(lambda *parts: print(*parts), 100, 250)
-        >>> told("tracing", 3, 40)
+        >>> progress = with_total(lambda *parts: print(*parts), 100, 250)
+        >>> progress("tracing", 3, 40)
         tracing 103 250
     """
     if progress is None:

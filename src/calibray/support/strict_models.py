@@ -1,4 +1,4 @@
-"""Closed models of what comes from files: what has no meaning is refused, not ignored."""
+"""Strict models of file contents: unknown keys and wrong types are refused, not ignored."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 CLOSED: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-"""No unknown keys, no conversions, no number that is not finite."""
+"""No unknown keys, no type conversions, only finite numbers."""
 
 Text = Annotated[str, Field(min_length=1)]
 
 
 class Section(BaseModel):
-    """A table of a file: closed, and never changed."""
+    """A table of a file: strict and immutable."""
 
     model_config = CLOSED | ConfigDict(frozen=True)

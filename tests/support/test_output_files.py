@@ -1,8 +1,7 @@
-"""Outputs never take the place of what is not Calibray's own."""
+"""Outputs replace only files that Calibray wrote and nobody changed."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import time
@@ -14,12 +13,11 @@ import pytest
 from calibray.errors import InputError
 from calibray.paths import seal
 from calibray.support.output_files import (
-    FIRST_RESULT,
     SIGNATURES,
     check_file,
     check_outputs,
     check_table,
-    is_own,
+    is_unchanged_output,
     replacing,
     write_table,
     write_text,
@@ -28,7 +26,7 @@ from calibray.support.output_files import (
 TABLE = pd.DataFrame({"a": [1.0, 2.0]})
 
 
-def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path):
+def test_an_output_may_be_replaced_unless_it_was_changed(tmp_path):
     for name, write in {
         "a.txt": lambda file: write_text(file, "one"),
         "a.csv": lambda file: write_table(file, TABLE),
@@ -37,9 +35,9 @@ def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path)
         for _ in range(2):
             assert check_file(file) == file
             write(file)
-            assert is_own(file)
+            assert is_unchanged_output(file)
         file.write_text(file.read_text() + "by hand")
-        assert not is_own(file)
+        assert not is_unchanged_output(file)
         with pytest.raises(
             InputError, match=r"was not written by Calibray, or was changed since.*--overwrite"
         ):
@@ -49,22 +47,22 @@ def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path)
         assert check_file(file) == file
 
 
-def test_path_files_say_themselves_whose_they_are(tmp_path):
+def test_path_files_are_recognised_without_a_signature(tmp_path):
     file = tmp_path / "paths.h5"
     with h5py.File(file, "w") as content:
         content.attrs["schema"] = "calibray/paths"
-    assert not is_own(file)
+    assert not is_unchanged_output(file)
     seal(file)
     (tmp_path / SIGNATURES).unlink()
-    assert is_own(file)
+    assert is_unchanged_output(file)
 
 
-def test_a_file_of_the_same_content_and_another_name_is_not_own(tmp_path):
+def test_a_copy_under_another_name_is_not_an_output(tmp_path):
     write_text(tmp_path / "a.txt", "one")
     (tmp_path / "b.txt").write_text("one")
-    assert not is_own(tmp_path / "b.txt")
+    assert not is_unchanged_output(tmp_path / "b.txt")
     (tmp_path / "c.txt").touch()
-    assert check_file(tmp_path / "c.txt")  # nothing is in it
+    assert check_file(tmp_path / "c.txt")  # an empty file may be replaced
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -93,20 +91,7 @@ def test_inputs_links_and_devices_are_never_replaced(tmp_path, overwrite):
     assert check_outputs(tmp_path, ["other.json"], [source], overwrite) == tmp_path
 
 
-def test_a_result_of_the_first_version_may_be_written_again(tmp_path):
-    for name in FIRST_RESULT:
-        (tmp_path / name).write_text("anything")
-    with pytest.raises(InputError, match=r"result.json: was not written by Calibray"):
-        check_outputs(tmp_path, FIRST_RESULT)
-    content = {"version": 1, "study": {}, "rmse_db": 1.0, "rt_calls": 2}
-    (tmp_path / "result.json").write_text(json.dumps(content))
-    assert check_outputs(tmp_path, FIRST_RESULT) == tmp_path
-    (tmp_path / "other.csv").write_text("mine")
-    with pytest.raises(InputError, match=r"other.csv: was not written by Calibray"):
-        check_outputs(tmp_path, ["other.csv"])
-
-
-def test_a_run_that_is_killed_between_signing_and_moving_still_knows_its_own(tmp_path):
+def test_the_old_file_is_recognised_after_a_kill_between_signing_and_moving(tmp_path):
     file = tmp_path / "a.txt"
     write_text(file, "one")
 
@@ -117,26 +102,26 @@ def test_a_run_that_is_killed_between_signing_and_moving_still_knows_its_own(tmp
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert is_own(file)
+    assert is_unchanged_output(file)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
     for torn in ("", "ab", "\ufffd"):
         with (tmp_path / SIGNATURES).open("a") as signatures:
             signatures.write(f"{torn}\n")
-    assert is_own(file)
+    assert is_unchanged_output(file)
 
 
-def test_unfinished_files_of_processes_that_are_gone_are_removed(tmp_path):
-    gone = subprocess.Popen(["true"])
-    gone.wait()
+def test_unfinished_files_of_ended_processes_are_removed(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
     names = {
-        "old": f"a.txt.{gone.pid}-12345678.part",
+        "old": f"a.txt.{ended.pid}-12345678.part",
         "alive": f"a.txt.{os.getpid()}-12345678.part",
         "users": "a.txt.my-own.part",
     }
     for name in names.values():
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (time.time() - 1000,) * 2)
-    (tmp_path / f"a.txt.{gone.pid}-new.part").touch()
+    (tmp_path / f"a.txt.{ended.pid}-new.part").touch()
     write_text(tmp_path / "a.txt", "one")
-    left = {path.name for path in tmp_path.iterdir()} - {"a.txt", SIGNATURES}
-    assert left == {names["alive"], names["users"], f"a.txt.{gone.pid}-new.part"}
+    remaining = {path.name for path in tmp_path.iterdir()} - {"a.txt", SIGNATURES}
+    assert remaining == {names["alive"], names["users"], f"a.txt.{ended.pid}-new.part"}
