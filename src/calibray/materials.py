@@ -1,8 +1,8 @@
-"""Radio materials: the constants of a surface, and the ITU-R P.2040 laws that give them by name.
+"""Radio materials: the constants of a surface, and the laws of ITU-R P.2040 that give them by name.
 
-Of the revisions of ITU-R P.2040, -1 differs from the later ones below 100 GHz (concrete 5.31 became 5.24,
-glass 6.27 became 6.31); -2 and -3 print the same Table 3; -4 keeps those rows and adds rows above 100 GHz and
-new materials. Sionna RT 2.2 follows -4, so below 100 GHz the default "P.2040-3" gives its numbers.
+Revision P.2040-1 differs from the later ones below 100 GHz (concrete 5.31 became 5.24, glass 6.27 became 6.31). -2 and
+-3 print the same Table 3. -4 keeps those rows and adds rows above 100 GHz and new materials. Sionna RT 2.2 follows -4,
+so the default "P.2040-3" gives the same numbers below 100 GHz.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Bound:
     open_below: bool = False
 
     def __contains__(self, value: float) -> bool:
-        above = value > self.lower if self.open_below else value >= self.lower
-        return isfinite(value) and above and value <= self.upper
+        above_lower = value > self.lower if self.open_below else value >= self.lower
+        return isfinite(value) and above_lower and value <= self.upper
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -72,7 +72,7 @@ BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "lambda_": Bound(0.0, 1.0, "1"),
     }
 )
-"""The physical bounds of each field: those that Sionna RT enforces, and a slab that is not empty."""
+"""Physical bounds of each field: those that Sionna RT enforces, and a thickness greater than 0."""
 
 SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -81,7 +81,7 @@ SCATTERING_PATTERNS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "backscattering": ("alpha_r", "alpha_i", "lambda_"),
     }
 )
-"""The scattering patterns, each with the fields that shape it."""
+"""Scattering patterns, each with the fields that shape it."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,13 @@ class Material:
         relative_permittivity: Real part of the relative permittivity [1], at least 1.
         conductivity: Conductivity [S/m], at least 0.
         thickness: Thickness of the slab [m], greater than 0.
-        scattering_coefficient: Scattering coefficient S [1], the share of the reflected amplitude that leaves
+        scattering_coefficient: Scattering coefficient S [1], the share of the reflected amplitude that is scattered
             diffusely, in [0, 1].
         xpd_coefficient: Cross-polarization discrimination coefficient K_x [1] of diffuse fields, in [0, 1].
         scattering_pattern: "lambertian", "directive" or "backscattering" (Degli-Esposti et al., IEEE Trans.
             Antennas and Propagation 55(1), 2007).
-        alpha_r: Exponent [1] of the lobe around the specular direction, at least 1; whole for Sionna RT.
-        alpha_i: Exponent [1] of the lobe back towards the source, at least 1; whole for Sionna RT.
+        alpha_r: Exponent [1] of the lobe around the specular direction, at least 1; Sionna RT rounds it.
+        alpha_i: Exponent [1] of the lobe back towards the source, at least 1; Sionna RT rounds it.
         lambda_: Share [1] of the diffuse energy in the lobe around the specular direction, in [0, 1].
 
     Raises:
@@ -128,7 +128,7 @@ class Material:
 
 
 def _within_bounds(name: str, value: Any) -> float:
-    """The value of a field as a float, or an `InputError` that names the field, the value and the bound."""
+    """Convert the value of a field to float; an `InputError` names the field, the value and the bound."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -139,13 +139,7 @@ def _within_bounds(name: str, value: Any) -> float:
 
 
 def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
-    """The constants of materials as a matrix.
-
-    Args:
-        materials: Materials by name; their order is the order of the rows.
-
-    Returns:
-        The constants [materials, fields], columns in the order of `FIELDS`, in the fields' units.
+    """Constants of materials [materials, fields], columns in the order of `FIELDS`, in the fields' units.
 
     Example:
         >>> constants_matrix({"walls": Material(5.24, 0.14, 0.3)})[0, :3].tolist()
@@ -156,7 +150,7 @@ def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
 
 
 def complex_relative_permittivity(material: Material, frequency: float) -> complex:
-    """Complex relative permittivity of a material, for the time convention e^{+jwt}.
+    """Complex relative permittivity of a material for the time convention e^{+jwt} (ITU-R P.2040-1, eq. 9b).
 
     Args:
         material: The material.
@@ -172,17 +166,17 @@ def complex_relative_permittivity(material: Material, frequency: float) -> compl
         >>> complex_relative_permittivity(Material(4.0, 0.0, 0.1), frequency=1e9)
         (4+0j)
     """
-    # SciPy takes long to load; who only names materials does without.
+    # SciPy takes long to load and most callers need no permittivity.
     from scipy.constants import epsilon_0
 
     _check_frequency(frequency)
-    # ITU-R P.2040-1 eq. 9b
+    # eta = eps_r - j sigma / (2 pi f eps_0), ITU-R P.2040-1 eq. 9b
     loss = material.conductivity / (2 * pi * frequency * epsilon_0)
     return complex(material.relative_permittivity, -loss) if loss else complex(material.relative_permittivity)
 
 
 class ItuLaw(NamedTuple):
-    """One row of ITU-R P.2040 Table 3: eps_r = a f^b, sigma = c f^d [S/m], with f in GHz.
+    """One row of ITU-R P.2040 Table 3: eps_r = a f^b and sigma = c f^d [S/m], with f in GHz.
 
     Attributes:
         lower: Lower end of the frequency range [GHz], included.
@@ -209,7 +203,7 @@ def _table(rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
 
 
 def _extended(base: _Table, rows: Mapping[str, tuple[tuple[float, ...], ...]]) -> _Table:
-    """A table with rows added after those of `base`, so that where ranges overlap `base` rules."""
+    """A table with rows added after those of `base`, whose rows win where ranges overlap."""
     return _table({name: (*base.get(name, ()), *rows.get(name, ())) for name in {**base, **rows}})
 
 
@@ -277,7 +271,7 @@ _P2040_4: Final = _extended(
 ITU_MATERIALS: Final[Mapping[str, _Table]] = MappingProxyType(
     {"P.2040-1": _P2040_1, "P.2040-2": _P2040_2, "P.2040-3": _P2040_2, "P.2040-4": _P2040_4}
 )
-"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap the first rules, as in Sionna RT."""
+"""ITU-R P.2040 Table 3 by revision and material; where ranges overlap the first row wins, as in Sionna RT."""
 
 DEFAULT_REVISION: Final = "P.2040-3"
 
@@ -289,10 +283,10 @@ def itu_material(
     revision: str = DEFAULT_REVISION,
     **scattering: Any,
 ) -> Material:
-    """A material of ITU-R P.2040 Table 3 at one frequency.
+    """Make a material of ITU-R P.2040 Table 3 at one frequency.
 
     Args:
-        name: Name as Sionna RT writes it, for instance "concrete" or "very_dry_ground".
+        name: Name as in Sionna RT, for instance "concrete" or "very_dry_ground".
         frequency: Frequency [Hz], within the range of the material's law, ends included.
         thickness: Thickness of the slab [m]; P.2040 gives none, 0.1 m is Sionna RT's default.
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
@@ -312,18 +306,18 @@ def itu_material(
     law = itu_law(name, frequency, revision)
     frequency_ghz = frequency / 1e9
     return Material(
-        relative_permittivity=law.a * frequency_ghz**law.b,  # ITU-R P.2040-1 eq. 58
-        conductivity=law.c * frequency_ghz**law.d,  # ITU-R P.2040-1 eq. 59
+        relative_permittivity=law.a * frequency_ghz**law.b,  # eps_r = a f^b, ITU-R P.2040-1 eq. 58
+        conductivity=law.c * frequency_ghz**law.d,  # sigma = c f^d, ITU-R P.2040-1 eq. 59
         thickness=thickness,
         **scattering,
     )
 
 
 def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> ItuLaw:
-    """The law of a material of ITU-R P.2040 Table 3 that covers a frequency.
+    """Find the row of ITU-R P.2040 Table 3 for a material and a frequency.
 
     Args:
-        name: Name as Sionna RT writes it.
+        name: Name as in Sionna RT.
         frequency: Frequency [Hz].
         revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
 
@@ -342,8 +336,8 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
     _check_frequency(frequency)
     table = ITU_MATERIALS[revision]
     if name not in table:
-        elsewhere = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
-        remedy = f"it is in {', '.join(elsewhere)}" if elsewhere else did_you_mean(name, table)
+        others = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
+        remedy = f"it is in {', '.join(others)}" if others else did_you_mean(name, table)
         raise InputError(f"{name!r} is no material of ITU-R {revision}: {remedy}")
     for law in table[name]:
         if law.lower <= frequency / 1e9 <= law.upper:

@@ -8,7 +8,7 @@ import pytest
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, itu_law, itu_material
 from calibray.parameters import Parameter, Parameters, make_parameter
-from calibray.parameters.laws import CONSTANT, LAWS, power
+from calibray.parameters.laws import CONSTANT_OF_FIELD, LAWS, power_law
 
 BASE = {"walls": Material(5.0, 0.1, 0.3), "soil": Material(3.0, 0.01, 0.5)}
 CONCRETE = itu_law("concrete", 4e9)
@@ -21,8 +21,8 @@ def parameters(*names: str) -> Parameters:
 
 
 def test_every_constant_and_coefficient_acts_on_a_constant():
-    assert set(CONSTANT.values()) == set(FIELDS)
-    assert {name: CONSTANT[name] for law in LAWS.values() for name in law} == {
+    assert set(CONSTANT_OF_FIELD.values()) == set(FIELDS)
+    assert {name: CONSTANT_OF_FIELD[name] for law in LAWS.values() for name in law} == {
         "itu_a": "relative_permittivity", "itu_b": "relative_permittivity",
         "itu_c": "conductivity", "itu_d": "conductivity",
     }  # fmt: skip
@@ -77,7 +77,7 @@ def test_without_a_frequency_the_law_is_taken_at_the_carrier_of_the_parameters()
         law.constants_and_slopes([3.0, 0.2])[0], law.constants_and_slopes([3.0, 0.2], 4e9)[0]
     )
     assert law.constants_and_slopes([3.0, 0.2], 1e9)[0][0] == 3.0
-    assert power(np.array(3.0), np.array(0.2), 1e9).by_exponent == 0.0
+    assert power_law(np.array(3.0), np.array(0.2), 1e9).by_exponent == 0.0
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
         ),
         (
             lambda: parameters("walls.itu_a", "walls.thickness").matrix_indices(list(BASE)),
-            r"parameters walls\.itu_a, walls\.thickness: a law stands in no constants matrix; take them at a carrier",
+            r"parameters walls\.itu_a, walls\.thickness: coefficients of laws have no cell in a constants matrix",
         ),
         (
             lambda: parameters("walls.itu_a").check_carriers([4e9, 10e9]),

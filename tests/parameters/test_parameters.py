@@ -124,7 +124,7 @@ def test_impossible_parameters_are_refused(arguments, message):
 def test_impossible_sets_and_candidates_are_refused():
     with pytest.raises(InputError, match="none given"):
         Parameters(())
-    with pytest.raises(InputError, match=r"'walls\.thickness' stands twice"):
+    with pytest.raises(InputError, match=r"'walls\.thickness' is given twice"):
         Parameters((*PARAMETERS.items, Parameter("walls.thickness", 0.1, 0.2, 0.1)))
     for method in (PARAMETERS.to_unit, PARAMETERS.from_unit):
         with pytest.raises(InputError, match=r"shape \(3,\), must end in 4"):

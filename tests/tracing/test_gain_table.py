@@ -210,7 +210,7 @@ def replaced(index: int, line: str | None) -> list[str]:
         ([line.replace(",0\n", ",12\n") for line in rows()], r"would radiate 15\.8 times the power it takes"),
         (
             [f"{a:g},{e:g},0\n" for a, e in product(range(-180, 181, 30), range(-90, 91, 30))],
-            r"elevation_deg goes in steps of 30, must be at most 15; give a finer grid",
+            r"elevation_deg has steps of 30, must be at most 15; give a finer grid",
         ),
         ([], r"holds no rows"),
     ],

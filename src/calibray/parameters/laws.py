@@ -1,7 +1,7 @@
-"""How a material's constants follow the frequency: eps_r = a f^b and sigma = c f^d [S/m], f in GHz (ITU-R P.2040).
+"""How a material's constants depend on frequency: eps_r = a f^b and sigma = c f^d [S/m], f in GHz (ITU-R P.2040).
 
-A material that ITU-R gives by name has the coefficients of Table 3; any other one keeps its constants at every
-frequency, which is the same law with the exponents 0.
+A material that ITU-R lists has the coefficients of Table 3. Any other keeps its constants at all frequencies: the same
+law with the exponents 0.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from calibray.materials import BOUNDS, FIELDS, Bound, ItuLaw, Material
 LAWS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {"relative_permittivity": ("itu_a", "itu_b"), "conductivity": ("itu_c", "itu_d")}
 )
-"""The constants that follow the frequency, each with the coefficient and the exponent of its law, as parameters."""
+"""Constants that may depend on frequency, each with the parameters of its law: coefficient and exponent."""
 
-CONSTANT: Final[Mapping[str, str]] = MappingProxyType(
+CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
     {
         **{field: field for field in FIELDS},
         **{coefficient: constant for constant, law in LAWS.items() for coefficient in law},
     }
 )
-"""What a parameter may be, each with the constant of the material that it acts on."""
+"""Fields that a parameter may set, each with the constant of the material that it changes."""
 
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
@@ -40,16 +40,16 @@ PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "itu_d": Bound(-10.0, 10.0, "1"),
     }
 )
-"""The physical bounds of each parameter; those of a law's coefficients leave its value to `check_law`."""
+"""Physical bounds of each field; the value of a law is checked by `check_law`."""
 
 
-class Power(NamedTuple):
-    """A power law s f^e with its derivatives.
+class PowerLaw(NamedTuple):
+    """Values of a power law s f^e and its derivatives [...].
 
     Attributes:
         value: The value.
-        by_scale: Its derivative by s.
-        by_exponent: Its derivative by e.
+        by_scale: Its derivative with respect to s.
+        by_exponent: Its derivative with respect to e.
     """
 
     value: NDArray[np.float64]
@@ -57,25 +57,16 @@ class Power(NamedTuple):
     by_exponent: NDArray[np.float64]
 
 
-def power(scale: NDArray[np.float64], exponent: NDArray[np.float64], frequency: float) -> Power:
-    """The law s f^e at one frequency.
-
-    Args:
-        scale: s [...], in the constant's unit.
-        exponent: e [...].
-        frequency: Frequency [Hz].
-
-    Returns:
-        The law [...].
-    """
+def power_law(scale: NDArray[np.float64], exponent: NDArray[np.float64], frequency: float) -> PowerLaw:
+    """Evaluate s f^e at one frequency [Hz] for scales s [...], in the constant's unit, and exponents e [...]."""
     frequency_ghz = frequency / 1e9
-    rise = frequency_ghz**exponent
-    value = scale * rise
-    return Power(value, rise, value * log(frequency_ghz))
+    power = frequency_ghz**exponent
+    value = scale * power  # ITU-R P.2040-1 eq. 58 and 59
+    return PowerLaw(value, by_scale=power, by_exponent=value * log(frequency_ghz))
 
 
 def frequency_independent_law(material: Material) -> ItuLaw:
-    """The law of a material whose constants are the same at every frequency."""
+    """The law of a material whose constants are the same at all frequencies."""
     return ItuLaw(0, inf, material.relative_permittivity, 0.0, material.conductivity, 0.0)
 
 
@@ -86,25 +77,25 @@ def check_law(
     exponents: Iterable[float],
     frequencies: Iterable[float],
 ) -> None:
-    """Refuse bounds of coefficients between which a constant leaves physics at some carrier.
+    """Refuse bounds of a law within which a constant takes an impossible value at some carrier.
 
-    A power law is monotonous in both coefficients, so that the corners of their bounds tell.
+    A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds.
 
     Args:
         material: The material's name.
         constant: "relative_permittivity" or "conductivity".
-        scales: Bounds of the coefficient s, or its one value.
-        exponents: Bounds of the exponent e, or its one value.
+        scales: Bounds of the coefficient s, or its fixed value.
+        exponents: Bounds of the exponent e, or its fixed value.
         frequencies: The carriers [Hz].
 
     Raises:
         InputError: s f^e lies outside the constant's bound.
     """
-    names = LAWS[constant]
+    scale_name, exponent_name = LAWS[constant]
     for frequency, scale, exponent in product(frequencies, scales, exponents):
-        value = float(power(np.array(scale), np.array(exponent), frequency).value)
+        value = float(power_law(np.array(scale), np.array(exponent), frequency).value)
         if value not in BOUNDS[constant]:
             raise InputError(
-                f"{material}.{names[0]} = {scale:g} with {names[1]} = {exponent:g} gives {constant} = {value:.4g} at "
-                f"{frequency / 1e9:g} GHz, must be {BOUNDS[constant]}; narrow the bounds"
+                f"{material}.{scale_name} = {scale:g} with {exponent_name} = {exponent:g} gives "
+                f"{constant} = {value:.4g} at {frequency / 1e9:g} GHz, must be {BOUNDS[constant]}; narrow the bounds"
             )

@@ -1,4 +1,4 @@
-"""One free parameter: its name, its bounds, and its start in a scene."""
+"""One parameter: its name, its bounds, and its start value in a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
-from calibray.parameters.laws import CONSTANT, LAWS, PARAMETER_BOUNDS, frequency_independent_law
+from calibray.parameters.laws import CONSTANT_OF_FIELD, LAWS, PARAMETER_BOUNDS, frequency_independent_law
 from calibray.support.messages import did_you_mean
 
 Scale = Literal["linear", "log"]
@@ -28,18 +28,18 @@ _PATTERN_FIELDS: Final = ("alpha_r", "alpha_i", "lambda_")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One calibrated number: a field of a material or a coefficient of its law, with its bounds and its start.
+    """One calibrated number: a field of a material, with its bounds and its start value.
 
     Attributes:
-        name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are those of a material,
-            and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz.
+        name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are the constants of a
+            material and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz.
         lower: Lower bound, in the field's unit.
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.
         scale: "linear", or "log" for a constant that spans decades; then `lower` must be greater than 0.
 
     Raises:
-        InputError: The field is unknown, or bounds or start are out of order or outside physics.
+        InputError: The field is unknown, or bounds or start are out of order or physically impossible.
 
     Example:
         >>> Parameter("walls.relative_permittivity", lower=1.5, upper=12.0, start=5.0).material
@@ -88,17 +88,17 @@ class Parameter:
 
     @property
     def field(self) -> str:
-        """The field's name, one of `CONSTANT`."""
+        """The field's name, one of `CONSTANT_OF_FIELD`."""
         return split_name(self.name)[1]
 
     @property
     def constant(self) -> str:
-        """The material's constant that it acts on, one of `FIELDS`."""
-        return CONSTANT[self.field]
+        """The constant of the material that it changes, one of `FIELDS`."""
+        return CONSTANT_OF_FIELD[self.field]
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Material and field of a parameter's name: everything before the last dot, and what follows it.
+    """Split the name of a parameter at the last dot into material and field.
 
     Args:
         name: The name.
@@ -118,8 +118,8 @@ def split_name(name: str) -> tuple[str, str]:
         raise InputError(
             f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"
         )
-    if field not in CONSTANT:
-        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, CONSTANT)}")
+    if field not in CONSTANT_OF_FIELD:
+        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, CONSTANT_OF_FIELD)}")
     return material, field
 
 
@@ -132,24 +132,24 @@ def make_parameter(
     scale: Scale = "linear",
     laws: Mapping[str, ItuLaw] | None = None,
 ) -> Parameter:
-    """A parameter of a scene, its start resolved.
+    """Make a parameter of a scene and resolve its start value.
 
     Args:
         name: Material and field, as "walls.relative_permittivity".
         bounds: Lower and upper bound, in the field's unit.
         base: The scene's materials by name.
-        frequency: Frequency [Hz], at which ITU-R laws are taken.
+        frequency: Frequency [Hz] of the ITU-R laws.
         start: A value in the field's unit; "itu:concrete" or "itu:concrete@P.2040-1" for the ITU-R value;
-            None for the scene's own.
+            None for the scene's value.
         scale: "linear" or "log".
-        laws: How the materials' constants follow the frequency, by name; those not named do not.
+        laws: Laws of materials by name; the constants of other materials do not depend on frequency.
 
     Returns:
         The parameter.
 
     Raises:
         InputError: The scene has no such material, the field has no effect with the material's scattering
-            pattern, or what `Parameter` and `itu_material` refuse.
+            pattern, or as for `Parameter` and `itu_material`.
 
     Example:
         >>> walls = {"walls": Material(5.0, 0.1, 0.3)}
@@ -166,9 +166,8 @@ def make_parameter(
     if start is None and field in FIELDS:
         value = float(getattr(base[material], field))
     elif start is None:
-        value = float(
-            getattr((laws or {}).get(material) or frequency_independent_law(base[material]), field[-1])
-        )
+        law = (laws or {}).get(material) or frequency_independent_law(base[material])
+        value = _coefficient(law, field)
     elif isinstance(start, str):
         value = itu_start(name, start, frequency)
     elif isinstance(start, bool) or not isfinite(start):
@@ -179,10 +178,10 @@ def make_parameter(
 
 
 def itu_start(name: str, start: str, frequency: float) -> float:
-    """The value that ITU-R P.2040 gives for a start like "itu:concrete@P.2040-1".
+    """Look up the value of ITU-R P.2040 for a start such as "itu:concrete@P.2040-1".
 
     Args:
-        name: The parameter, of the field relative_permittivity or conductivity, or a coefficient of their laws.
+        name: The parameter; its field is relative_permittivity, conductivity or a coefficient of their laws.
         start: "itu:" and the ITU-R material, then "@" and the revision unless it is the default one.
         frequency: Frequency [Hz].
 
@@ -190,34 +189,39 @@ def itu_start(name: str, start: str, frequency: float) -> float:
         The value, in the field's unit.
 
     Raises:
-        InputError: The text has another form, the field has no ITU-R law, or what `itu_material` refuses.
+        InputError: The text has another form, the field has no ITU-R law, or as for `itu_material`.
     """
     field = split_name(name)[1]
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
             f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"
         )
-    if CONSTANT[field] not in LAWS:
+    if CONSTANT_OF_FIELD[field] not in LAWS:
         raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")
     itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
     try:
         if field not in FIELDS:
-            return float(getattr(itu_law(itu_name, frequency, revision or DEFAULT_REVISION), field[-1]))
+            return _coefficient(itu_law(itu_name, frequency, revision or DEFAULT_REVISION), field)
         material = itu_material(itu_name, frequency, revision=revision or DEFAULT_REVISION)
     except InputError as error:
         raise InputError(f"{name}: start = {start!r}: {error}") from None
     return float(getattr(material, field))
 
 
+def _coefficient(law: ItuLaw, field: str) -> float:
+    """The coefficient of a law that the field `itu_a`, `itu_b`, `itu_c` or `itu_d` names."""
+    return float(getattr(law, field.removeprefix("itu_")))
+
+
 def check_material(name: str, materials: Collection[str]) -> None:
-    """Refuse a parameter of a material that a scene lacks.
+    """Refuse a parameter whose material is not in the scene.
 
     Args:
         name: The parameter's name.
-        materials: The scene's materials.
+        materials: The names of the scene's materials.
 
     Raises:
-        InputError: The material is not among them; the message offers the nearest name.
+        InputError: The material is not among them; the message suggests the nearest name.
     """
     material = split_name(name)[0]
     if material not in materials:

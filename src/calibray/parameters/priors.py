@@ -1,4 +1,4 @@
-"""What is known of parameters before they are calibrated: log-normal around a value, as that of ITU-R P.2040."""
+"""Priors of parameters: log-normal around a value, such as that of ITU-R P.2040."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Independent Gaussian priors of the logarithms of some parameters.
+    """Independent Gaussian priors of the logarithms of k parameters.
 
     Attributes:
-        index: Places of the parameters that have one.
-        centre: The values around which they lie, in the parameters' units.
-        spread: Standard deviations of the logarithms: 0.3 stands for about 30 %.
+        index: Numbers of the parameters that have a prior.
+        centre: Medians, in the parameters' units.
+        spread: Standard deviations of the logarithms: 0.3 is about 30 %.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -32,31 +32,24 @@ class LogNormal:
         return len(self.index)
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rows of residuals, in units of the noise, that stand for the priors.
+        """Residuals that add the priors to a least-squares problem.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units, greater than 0.
 
         Returns:
-            Standard deviations between the logarithms and their centres [n, k].
+            (log value - log centre) / spread [n, k].
         """
-        return (np.log(candidates[:, self._place]) - np.log(self.centre)) / self.spread
+        return (np.log(candidates[:, self._columns]) - np.log(self.centre)) / self.spread
 
     def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of the rows by the parameters.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units, greater than 0.
-
-        Returns:
-            Derivatives [n, k, d].
-        """
-        found = np.zeros((len(candidates), len(self), candidates.shape[1]))
-        found[:, np.arange(len(self)), self._place] = 1.0 / (candidates[:, self._place] * self.spread)
-        return found
+        """Derivatives of the residuals with respect to the parameters [n, k, d]; arguments as for `residuals`."""
+        jacobian = np.zeros((len(candidates), len(self), candidates.shape[1]))
+        jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (candidates[:, self._columns] * self.spread)
+        return jacobian
 
     @property
-    def _place(self) -> NDArray[np.int64]:
+    def _columns(self) -> NDArray[np.int64]:
         return np.array(self.index, dtype=np.int64)
 
 
