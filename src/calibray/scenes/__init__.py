@@ -1,6 +1,29 @@
-"""Scenes: the geometry and the materials that a tracer is given."""
+"""Scenes: geometry and materials that a ray tracer reads.
+
+This package reads and writes scenes; `scenes.checks` finds faults in a scene and in positions, and `scenes.authoring`
+makes scenes from maps and floor plans. Both import from here, and not from each other.
+"""
 
 from calibray.scenes.export import export_scene
+from calibray.scenes.meshes import Mesh, MeshObject, join_meshes
 from calibray.scenes.scene import Scene, SceneObject, check_material_name, read_scene
+from calibray.scenes.scene_file import find_scene, read_frame, write_scene
+from calibray.scenes.triangles import Triangles, ground_heights, read_meshes, read_triangles
 
-__all__ = ["Scene", "SceneObject", "check_material_name", "export_scene", "read_scene"]
+__all__ = [
+    "Mesh",
+    "MeshObject",
+    "Scene",
+    "SceneObject",
+    "Triangles",
+    "check_material_name",
+    "export_scene",
+    "find_scene",
+    "ground_heights",
+    "join_meshes",
+    "read_frame",
+    "read_meshes",
+    "read_scene",
+    "read_triangles",
+    "write_scene",
+]

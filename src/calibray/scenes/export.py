@@ -1,4 +1,4 @@
-"""A scene written with other constants, for Sionna RT or whatever else reads Mitsuba scenes."""
+"""A scene exported with other constants, for Sionna RT or any other reader of Mitsuba scenes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from shutil import copyfile
 from typing import Final
 
 from calibray.errors import InputError
-from calibray.materials import ITU_MATERIALS, Material
-from calibray.scenes.scene import TRACED, Scene, material_element
+from calibray.materials import Material
+from calibray.scenes.scene import TRACED, Scene, is_itu_name, material_element
 from calibray.support.output_files import check_replaceable, replacing, write_text
 
 MESHES: Final = "meshes"
-"""The folder that copies of meshes are put into, beside the scene file."""
+"""Folder for copies of meshes, next to the scene file."""
 
 
 def export_scene(
@@ -25,20 +25,20 @@ def export_scene(
     copy_meshes: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene file with other constants; it refers to the meshes of the original, or to copies.
+    """Write a scene file with other constants; it refers to the original meshes or to copies.
 
-    Sionna RT refuses a plain `radio-material` under an ITU name, so such a material becomes `calibrated-NAME`. Its
-    scene files know no scattering pattern but the Lambertian one; another has to be set by who loads the scene.
+    Sionna RT refuses a plain `radio-material` with an ITU name, so such a material becomes `calibrated-NAME`. Sionna's
+    scene files support the Lambertian scattering pattern only; set another pattern after loading the scene.
 
     Args:
         scene: The scene as it was read.
         materials: Constants by material name.
         target: File to write.
-        copy_meshes: Whether the meshes are copied beside the file, so that the folder can be given away.
+        copy_meshes: Whether to copy the meshes next to the file, so that the folder is complete.
         overwrite: Let copies replace files that Calibray did not write; meshes of the scene are never replaced.
 
     Raises:
-        InputError: A material of the scene is missing, or a copy must not take a file's place.
+        InputError: A material of the scene is missing, or a copy would replace a protected file.
         OSError: A file cannot be written.
     """
     missing = [name for name in scene.materials if name not in materials]
@@ -49,16 +49,16 @@ def export_scene(
     root = ElementTree.fromstring(scene.xml)
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
-    written = {f"{TRACED}{index}": exported_id(name) for index, name in enumerate(scene.materials)}
+    exported = {f"{TRACED}{index}": exported_id(name) for index, name in enumerate(scene.materials)}
     copies: dict[str, Path] = {}
     for shape in root.findall("shape"):
         for reference in shape.findall("ref"):
-            reference.set("id", written[reference.get("id", "")])
+            reference.set("id", exported[reference.get("id", "")])
         filename = shape.find("string[@name='filename']")
         if filename is not None:
             mesh = (scene.path.parent / filename.get("value", "")).resolve()
             if copy_meshes:
-                mesh = _copied(mesh, target.parent.resolve() / MESHES, copies, overwrite)
+                mesh = _copy(mesh, target.parent.resolve() / MESHES, copies, overwrite)
             filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
     for index, (name, material) in enumerate(materials.items()):
         root.insert(index, material_element(exported_id(name), material))
@@ -67,19 +67,19 @@ def export_scene(
 
 
 def exported_id(name: str) -> str:
-    """The id under which a material is written.
+    """The id of a material in an exported scene.
 
     Args:
-        name: Its name.
+        name: The material's name.
 
     Returns:
-        `mat-` and its name, which Sionna RT calls it by.
+        `mat-NAME`, so that Sionna RT calls the material NAME; `mat-calibrated-NAME` for an ITU name.
     """
-    return f"mat-calibrated-{name}" if _is_itu_name(name) else f"mat-{name}"
+    return f"mat-calibrated-{name}" if is_itu_name(name) else f"mat-{name}"
 
 
-def _copied(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
-    """A copy of a mesh; meshes of one name from different folders get numbers."""
+def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
+    """Copy a mesh; meshes of the same name from different folders get numbers."""
     name, number = mesh.name, 1
     while copies.setdefault(name, mesh) != mesh:
         number += 1
@@ -91,8 +91,3 @@ def _copied(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) 
     with replacing(folder / name) as partial:
         copyfile(mesh, partial)
     return folder / name
-
-
-def _is_itu_name(name: str) -> bool:
-    names = {known for table in ITU_MATERIALS.values() for known in table}
-    return name in names or name.startswith(("itu_", "itu-"))

@@ -1,23 +1,31 @@
-"""Triangle meshes of a scene: joined, and written as PLY and XML files for Mitsuba, byte for byte alike.
+"""Triangle meshes: joined and welded, read from PLY and OBJ files, and written as PLY.
 
-Mitsuba and Sionna RT find neighbouring faces by the vertices that they share, within one mesh; where two meshes meet
-there is no wedge, and so no diffraction.
+Mitsuba and Sionna RT find wedges between faces that share vertices within one mesh. Where two meshes meet there is no
+wedge and hence no diffraction.
+
+Mitsuba trusts mesh files. A vertex index out of range ends the process or removes a reflection without a message;
+integer coordinates remove the reflections of the whole mesh; vertices that are not numbers are never hit. `read_mesh`
+refuses such files before Mitsuba sees them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
-from xml.sax.saxutils import escape, quoteattr
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.support.output_files import replacing
+from calibray.errors import InputError
+from calibray.support.messages import first_line, shortened
 
-Place = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-"""Where corners lie."""
+_INDEX_PROPERTIES: Final = ("vertex_indices", "vertex_index")
+_TEXT_FACE: Final = re.compile(r"\s*3(\s+\d{1,9}){3}(\s.*)?")  # a face row of a text PLY file
 
 
 @dataclass(frozen=True)
@@ -26,7 +34,7 @@ class Mesh:
 
     Attributes:
         vertices: Positions [V, 3], [m].
-        faces: Vertex indices of every triangle, counter-clockwise seen from outside [F, 3].
+        faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
     """
 
     vertices: NDArray[np.float64]
@@ -38,7 +46,7 @@ class MeshObject:
     """One object of a scene file.
 
     Attributes:
-        name: Name of the object, unlike that of any material.
+        name: Name of the object, different from the name of any material.
         material: Name of its material.
         mesh: Its surface.
     """
@@ -48,14 +56,14 @@ class MeshObject:
     mesh: Mesh
 
 
-def joined(meshes: Iterable[Mesh]) -> Mesh:
-    """One mesh of several, the vertices of different parts kept apart.
+def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
+    """Join meshes into one; vertices of different meshes stay separate.
 
     Args:
         meshes: At least one mesh.
 
     Returns:
-        All faces in the order given, over the used vertices only.
+        All faces in the given order. Vertices that no face uses are dropped.
     """
     parts = list(meshes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -65,31 +73,163 @@ def joined(meshes: Iterable[Mesh]) -> Mesh:
     return Mesh(vertices[used], inverse.reshape(faces.shape))
 
 
-def welded(triangles: NDArray[np.int64], scale: float, place: Place | None = None) -> Mesh:
-    """A mesh of triangles whose corners are whole multiples of a length: equal corners become one vertex.
+def weld(
+    triangles: NDArray[np.int64],
+    scale: float,
+    position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None,
+) -> Mesh:
+    """Make a mesh of triangles with integer corners: equal corners become one vertex.
 
     Args:
-        triangles: Corners of every triangle, counter-clockwise seen from outside [F, 3, 3], [scale].
-        scale: The length [m].
-        place: Where corners lie, if not at these multiples: [n, 3], [scale] -> [n, 3], [m].
+        triangles: Corners of each triangle, counter-clockwise seen from outside [F, 3, 3], in units of `scale`.
+        scale: Unit of the corners [m].
+        position: Gives the position [n, 3], [m] of corners [n, 3], if it is not the corner times `scale`.
 
     Returns:
-        The mesh; triangles with two equal corners are left out.
+        The mesh, without the triangles that have two equal corners.
 
     Example:
-        >>> welded(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]]), 0.001).faces
+        >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]]), 0.001).faces
         array([[0, 2, 1],
                [2, 3, 1]])
     """
-    vertices, faces = np.unique(np.reshape(triangles, (-1, 3)), axis=0, return_inverse=True)
+    corners, faces = np.unique(np.reshape(triangles, (-1, 3)), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
-    corners = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    where = vertices.astype(np.float64) * scale if place is None else place(vertices)
-    return joined([Mesh(where, faces[corners])])
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    vertices = corners.astype(np.float64) * scale if position is None else position(corners)
+    return join_meshes([Mesh(vertices, faces[distinct])])
+
+
+def read_mesh(file: Path, kind: str) -> Mesh:
+    """Read a mesh file and refuse what Mitsuba would trace wrongly or crash on.
+
+    Args:
+        file: The file.
+        kind: Its format, "ply" or "obj".
+
+    Returns:
+        The mesh. Polygons of an OBJ file are split into triangles.
+
+    Raises:
+        InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face has a corner that
+            is not a vertex; or, in a PLY file, a face is not a triangle or coordinates are stored as integers.
+    """
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"mesh {file}: cannot be read ({error.strerror}); check the file") from None
+    try:
+        return _read_obj(content) if kind == "obj" else _read_ply(content)
+    except InputError as error:
+        fault = str(error)
+    except Exception as error:  # trimesh raises whatever its parser runs into
+        fault = f"cannot be read as PLY ({first_line(error)})"
+    raise InputError(f"mesh {file}: {fault}; export it again, as triangles with floating-point coordinates")
+
+
+def _read_ply(content: bytes) -> Mesh:
+    from trimesh.exchange.ply import load_ply
+
+    # trimesh refuses a binary file whose size differs from what its header declares, before it allocates anything.
+    with np.errstate(all="ignore"):
+        loaded = load_ply(BytesIO(content), fix_texture=False, skip_materials=True)
+    elements = loaded["metadata"]["_ply_raw"]
+    vertex, face = (elements.get(name, {"length": 0}) for name in ("vertex", "face"))
+    if not vertex["length"] or not face["length"]:
+        raise InputError("has no vertices or no faces")
+    for axis in "xyz":
+        stored = np.dtype(vertex["properties"][axis])
+        if stored.kind != "f":
+            raise InputError(f"stores {axis} of its vertices as {stored.name}, which Sionna RT does not read")
+    name = next((name for name in _INDEX_PROPERTIES if name in face["properties"]), None)
+    if name is None:
+        raise InputError("its faces have no list vertex_indices")
+    if isinstance(face["data"], dict):
+        _check_text_faces(content.decode(), elements)
+        corners = face["data"][name]
+    else:
+        # trimesh takes the number of corners of all faces from the first one.
+        counts, corners = face["data"][name]["f0"], face["data"][name]["f1"]
+        if (other := np.flatnonzero(counts != 3)).size:
+            raise InputError(f"face {other[0]} has {counts[other[0]]} corners, must have 3")
+    vertices = np.stack(
+        [np.asarray(vertex["data"][axis], dtype=np.float64).ravel() for axis in "xyz"], axis=1
+    )
+    if len(vertices) != vertex["length"] or corners.shape != (face["length"], 3):
+        raise InputError("is cut short, or has a face with other than three corners")
+    if (wrong := ~np.isfinite(vertices)).any():
+        row, axis = np.argwhere(wrong)[0]
+        raise InputError(f"{'xyz'[axis]} of vertex {row} is {vertices[row, axis]}, must be finite")
+    if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
+        row, corner = np.argwhere(wrong)[0]
+        raise InputError(
+            f"face {row} names vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
+        )
+    return Mesh(vertices, corners.astype(np.int64))
+
+
+def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
+    """Refuse face rows of a text PLY file that trimesh would cut, round or drop without a message."""
+    lines = text.splitlines()
+    row = 1 + next(index for index, line in enumerate(lines) if "end_header" in line.split())
+    for name, element in elements.items():
+        if name == "face":
+            break
+        row += element["length"]
+    for index, line in enumerate(lines[row : row + elements["face"]["length"]]):
+        if not _TEXT_FACE.fullmatch(line):
+            raise InputError(f"face {index} is {shortened(line)!r}, must be 3 and three vertex indices")
+
+
+def _read_obj(content: bytes) -> Mesh:
+    """Read vertices and faces; as in Mitsuba, corners that differ in texture or normal are different vertices."""
+    # trimesh does not serve here: it drops faces that it cannot read, takes index 0 for the first vertex, and misreads
+    # faces whose corners are written in different forms (1/1/1 next to 1).
+    positions: list[list[float]] = []
+    vertices: dict[tuple[int, str], int] = {}
+    faces: list[tuple[int, int, int]] = []
+    for number, line in enumerate(content.decode("utf-8", errors="replace").splitlines(), start=1):
+        keyword, *words = line.split() or [""]
+        if keyword == "v":
+            positions.append([_number(word) for word in words[:3]])
+            if len(words) < 3 or not np.isfinite(positions[-1]).all():
+                raise InputError(
+                    f"line {number}: {shortened(line.strip())!r}: a vertex is three finite numbers"
+                )
+        elif keyword == "f":
+            parts = [word.partition("/") for word in words]
+            indices = [_obj_index(_number(index), len(positions)) for index, _, _ in parts]
+            if len(indices) < 3 or None in indices:
+                raise InputError(
+                    f"line {number}: {shortened(line.strip())!r}: a face names three or more of the {len(positions)} "
+                    "vertices before it"
+                )
+            first, *rest = (
+                vertices.setdefault((index, attributes), len(vertices))
+                for index, (_, _, attributes) in zip(indices, parts, strict=True)
+                if index is not None
+            )
+            faces += [(first, second, third) for second, third in pairwise(rest)]
+    if not faces:
+        raise InputError("has no faces")
+    return Mesh(np.array([positions[index] for index, _ in vertices]), np.array(faces, dtype=np.int64))
+
+
+def _obj_index(number: float, count: int) -> int | None:
+    """Index of the vertex that a number names: from 1, or backwards from the last one; None if there is none."""
+    index = number - 1 if number > 0 else number + count
+    return int(index) if 0 <= index < count and index == np.floor(index) else None
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return float("nan")
 
 
 def ply_bytes(mesh: Mesh) -> bytes:
-    """The mesh as a binary little-endian PLY file.
+    """Encode a mesh as a binary little-endian PLY file; equal meshes give equal bytes.
 
     Args:
         mesh: The mesh; its vertices are rounded to 32-bit floats.
@@ -106,68 +246,3 @@ def ply_bytes(mesh: Mesh) -> bytes:
     faces["count"] = 3
     faces["vertices"] = mesh.faces
     return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
-
-
-def scene_xml(
-    objects: Sequence[MeshObject],
-    materials: Mapping[str, Mapping[str, float | str]],
-    comment: str | None = None,
-) -> str:
-    """The Mitsuba XML of a scene whose meshes lie in `meshes/NAME.ply`.
-
-    Args:
-        objects: The objects of the scene.
-        materials: Constants by material name. A `type` names a material of ITU-R P.2040, which then gives
-            permittivity and conductivity.
-        comment: Text of a comment at its beginning.
-
-    Returns:
-        The text of the file.
-    """
-    lines = ['<scene version="2.1.0">']
-    if comment is not None:
-        # A comment may hold no double hyphen.
-        lines.append(f"    <!-- {escape(comment).replace('--', '- -')} -->")
-    for name, constants in materials.items():
-        kind = "itu-radio-material" if "type" in constants else "radio-material"
-        lines.append(f'    <bsdf type="{kind}" id={quoteattr(f"mat-{name}")}>')
-        for key, value in constants.items():
-            tag, text = ("string", value) if isinstance(value, str) else ("float", f"{value:.6g}")
-            lines.append(f'        <{tag} name="{key}" value={quoteattr(text)}/>')
-        lines.append("    </bsdf>")
-    for item in objects:
-        lines += [
-            f'    <shape type="ply" id={quoteattr(f"mesh-{item.name}")}>',
-            f'        <string name="filename" value={quoteattr(f"meshes/{item.name}.ply")}/>',
-            '        <boolean name="face_normals" value="true"/>',
-            f'        <ref id={quoteattr(f"mat-{item.material}")} name="bsdf"/>',
-            "    </shape>",
-        ]
-    return "\n".join([*lines, "</scene>", ""])
-
-
-def write_scene(
-    folder: Path,
-    objects: Sequence[MeshObject],
-    materials: Mapping[str, Mapping[str, float | str]],
-    comment: str | None = None,
-) -> Path:
-    """Write `scene.xml` and `meshes/NAME.ply` of every object.
-
-    Args:
-        folder: Where to write; made if it does not exist.
-        objects: The objects of the scene.
-        materials: Constants of the materials by name, as `scene_xml` takes them.
-        comment: Text of a comment at its beginning.
-
-    Returns:
-        Path of the XML file.
-    """
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    for item in objects:
-        with replacing(folder / "meshes" / f"{item.name}.ply") as partial:
-            partial.write_bytes(ply_bytes(item.mesh))
-    path = folder / "scene.xml"
-    with replacing(path) as partial:
-        partial.write_bytes(scene_xml(objects, materials, comment).encode("utf-8"))
-    return path

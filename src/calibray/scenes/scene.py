@@ -1,9 +1,9 @@
-"""Scenes: a Mitsuba XML file read into materials and objects, and written again in the form that the tracer takes.
+"""Scenes: a Mitsuba XML file read into materials and objects, and rewritten for the tracer.
 
-Every surface material becomes one of Sionna's plain `radio-material`s with constants and a name of our own choosing.
-That keeps the constants in one place (`Material`), lets a frequency lie outside an ITU table when the study gives the
-constants itself (NVlabs/sionna-rt#71, #72), and steps around Sionna's rules on names (an ITU name needs the prefix
-`itu_`, an object may not be called like a material).
+In the scene for the tracer each surface material is a plain `radio-material` of Sionna's with explicit constants and a
+name that Calibray chooses. This keeps the constants in one place (`Material`), allows a frequency outside an ITU table
+when the study gives the constants (NVlabs/sionna-rt#71, #72), and avoids Sionna's rules on names: an ITU name needs the
+prefix `itu_`, and an object must not have the name of a material.
 """
 
 from __future__ import annotations
@@ -19,22 +19,27 @@ from calibray.errors import InputError
 from calibray.materials import (
     BOUNDS,
     DEFAULT_REVISION,
+    ITU_MATERIALS,
     ItuLaw,
     Material,
     itu_law,
     itu_material,
 )
 from calibray.parameters.laws import frequency_independent_law
-from calibray.scenes.scene_file import check_files, check_shape, parse, scene_path
+from calibray.scenes.scene_file import check_files, parse, scene_path, shape_mesh
 from calibray.support.messages import did_you_mean
 
 DEFAULT_THICKNESS: Final = 0.1
-"""Sionna's default for a material without one [m]."""
+"""Sionna's thickness of a material that states none [m]."""
 
 TRACED: Final = "mat-calibray-"
-"""What the ids of materials begin with in a scene for the tracer; their place in `Scene.materials` follows."""
+"""Prefix of the ids of materials in the scene for the tracer; the index in `Scene.materials` follows."""
+
+ITU_NAMES: Final = frozenset(name for table in ITU_MATERIALS.values() for name in table)
+"""Names of materials in any revision of ITU-R P.2040; Sionna RT reserves them."""
 
 _MATERIAL_FIELDS: Final = frozenset(entry.name for entry in fields(Material))
+_BULK_FIELDS: Final = frozenset({"relative_permittivity", "conductivity"})
 
 
 @dataclass(frozen=True)
@@ -55,12 +60,12 @@ class Scene:
     """A scene as read from its file.
 
     Attributes:
-        source: What the user named: a path or `sionna:NAME`.
-        path: The XML file [path].
-        materials: The materials that some object uses, by name, at the frequency the scene was read for.
+        source: The user's name for the scene: a path or `sionna:NAME`.
+        path: The XML file.
+        materials: The materials that objects use, by name, at the frequency that the scene was read for.
         objects: The meshes, in the file's order.
-        xml: The scene for the tracer; material k of `materials` is the BSDF `calibray-k`.
-        laws: How the constants of each material follow the frequency: ITU-R's law where ITU-R gives them, else not.
+        xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
+        laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, else constant.
     """
 
     source: str
@@ -82,133 +87,138 @@ def read_scene(
     Args:
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
         frequency: Carrier frequency [Hz], at which ITU materials are evaluated.
-        overrides: Constants in place of the file's, by material name: a `Material`, or a mapping with any of its
+        overrides: Constants that replace the file's, by material name: a `Material`, or a mapping with any of its
             fields, or with `itu` (and `revision`) naming an ITU-R P.2040 material.
-        split: Materials to be made for some objects, by name: a pattern of the objects' names, with `*` for any
-            text. A name that ends in `*` makes one material for every object, `*` replaced by the object's name.
+        split: Separate materials for some objects: by name of the new material, a pattern of object names in which `*`
+            stands for any text. If the name ends in `*`, each object gets its own material, with `*` replaced by
+            the object's name.
 
     Returns:
         The scene.
 
     Raises:
-        InputError: The file does not exist or is no Mitsuba scene, a mesh is missing, a material has no radio
-            constants, an override names no material of the scene, a pattern matches no object or objects of
-            different materials, or a frequency lies outside an ITU range.
+        InputError: The file does not exist or is not a Mitsuba scene; a mesh is missing or malformed; a material has no
+            radio constants; an override names no material of the scene; a pattern matches no object, or objects of
+            different materials; or a frequency lies outside an ITU range.
     """
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
     root = parse(path, str(source))
-    definitions = _bsdf_definitions(root)
+    definitions = {
+        _material_name(bsdf): bsdf for bsdf in [*root.findall("bsdf"), *root.findall("shape/bsdf")]
+    }
     objects: list[SceneObject] = []
     materials: dict[str, Material] = {}
     laws: dict[str, ItuLaw] = {}
-    origin: dict[str, str] = {}
-    order: dict[str, int] = {}
+    index: dict[str, int] = {}
+    originals: dict[str, str] = {}  # material in the file, by the material that the object gets
     for shape in root.findall("shape"):
-        check_shape(shape, path)
-        original, name = _materials_of(shape, definitions, split, path)
-        if origin.setdefault(name, original) != original:
+        shape_mesh(shape, path)
+        object_name = (shape.get("id") or "").removeprefix("mesh-")
+        original = _file_material_name(shape, definitions, path)
+        name = _split_name(object_name, split, definitions) or original
+        if originals.setdefault(name, original) != original:
             raise InputError(
-                f"[objects] {name}: its objects have the materials {origin[name]!r} and {original!r}; "
+                f"[objects] {name}: its objects have the materials {originals[name]!r} and {original!r}; "
                 "name one material for each"
             )
         if name not in materials:
-            constants = _merged(overrides.get(original), overrides.get(name) if name != original else None)
-            bsdf = definitions.get(original)
-            materials[name] = _material(name, original, bsdf, constants, frequency, path)
-            laws[name] = _law(materials[name], original, bsdf, constants, frequency)
-        _refer(shape, f"{TRACED}{order.setdefault(name, len(order))}")
-        objects.append(SceneObject(_object_name(shape), name))
+            constants = _merge(overrides.get(original), overrides.get(name) if name != original else None)
+            materials[name], laws[name] = _material(
+                name, original, definitions.get(original), constants, frequency, path
+            )
+        _refer(shape, f"{TRACED}{index.setdefault(name, len(index))}")
+        objects.append(SceneObject(object_name, name))
     if not objects:
         raise InputError(f"{path}: the scene has no <shape>; export the scene with its meshes")
+    object_names = [entry.name for entry in objects]
     for name, pattern in split.items():
-        if not any(fnmatchcase(entry.name, pattern) for entry in objects):
-            known = [entry.name for entry in objects]
+        if not any(fnmatchcase(object_name, pattern) for object_name in object_names):
             raise InputError(
-                f"[objects] {name} = {pattern!r}: matches no object; {did_you_mean(pattern, known)}"
+                f"[objects] {name} = {pattern!r}: matches no object; {did_you_mean(pattern, object_names)}"
             )
     for name in overrides:
-        check_material_name(name, {**materials, **dict.fromkeys(origin.values())}, f"[materials] {name}")
+        check_material_name(name, {**materials, **dict.fromkeys(originals.values())}, f"[materials] {name}")
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
     check_files(root, path)
-    for index, material in enumerate(materials.values()):
-        root.insert(index, material_element(f"{TRACED}{index}", material))
+    for number, material in enumerate(materials.values()):
+        root.insert(number, material_element(f"{TRACED}{number}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
     return Scene(str(source), path, materials, tuple(objects), xml, laws)
 
 
 def check_material_name(name: str, materials: Mapping[str, object], place: str) -> None:
-    """Refuse a material that a scene lacks.
+    """Refuse a material that a scene does not have.
 
     Args:
-        name: The name to look for.
+        name: The material's name.
         materials: The scene's materials by name.
-        place: Where the name stands, for the message.
+        place: Where the user wrote the name, for the message.
 
     Raises:
-        InputError: There is no such material; the message offers the nearest name.
+        InputError: The scene has no such material; the message suggests the nearest name.
     """
-    if name in materials:
-        return
-    raise InputError(f"{place}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
+    if name not in materials:
+        raise InputError(f"{place}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
 
 
-def _bsdf_definitions(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
-    found = [*root.findall("bsdf"), *root.findall("shape/bsdf")]
-    return {_material_name(bsdf): bsdf for bsdf in found}
+def is_itu_name(name: str) -> bool:
+    """Whether Sionna RT reserves the name of a material for ITU-R P.2040.
+
+    Args:
+        name: The material's name.
+
+    Returns:
+        True for an ITU name, with or without the prefix `itu_`.
+    """
+    return name in ITU_NAMES or name.startswith(("itu_", "itu-"))
 
 
 def _material_name(bsdf: ElementTree.Element) -> str:
     return (bsdf.get("id") or bsdf.get("name") or "").removeprefix("mat-")
 
 
-def _shape_material(
-    shape: ElementTree.Element, definitions: dict[str, ElementTree.Element], path: Path
+def _file_material_name(
+    shape: ElementTree.Element, definitions: Mapping[str, ElementTree.Element], path: Path
 ) -> str:
-    name = shape.get("id") or "?"
+    """The material that the file gives an object."""
     nested = shape.find("bsdf")
     if nested is not None:
         return _material_name(nested)
-    references = [ref.get("id", "").removeprefix("mat-") for ref in shape.findall("ref")]
+    references = [reference.get("id", "").removeprefix("mat-") for reference in shape.findall("ref")]
     material = next((reference for reference in references if reference in definitions), None)
     if material is None:
-        raise InputError(f"{path}: shape {name!r} refers to no <bsdf> of the scene; give it a material")
+        raise InputError(
+            f"{path}: shape {shape.get('id') or '?'!r} refers to no <bsdf> of the scene; give it a material"
+        )
     return material
 
 
-def _object_name(shape: ElementTree.Element) -> str:
-    return (shape.get("id") or "").removeprefix("mesh-")
-
-
-def _materials_of(
-    shape: ElementTree.Element,
-    definitions: dict[str, ElementTree.Element],
-    split: Mapping[str, str],
-    path: Path,
-) -> tuple[str, str]:
-    """Material of an object in the file, and the one it gets: the first of `split` that matches, else the same."""
-    original, name = _shape_material(shape, definitions, path), _object_name(shape)
-    own = next((own for own, pattern in split.items() if fnmatchcase(name, pattern)), None)
-    if own is None:
-        return original, original
-    own = own[:-1] + name if own.endswith("*") else own
-    if own in definitions:
+def _split_name(
+    object_name: str, split: Mapping[str, str], definitions: Mapping[str, ElementTree.Element]
+) -> str | None:
+    """The separate material of an object: that of the first pattern that matches; None if none does."""
+    name = next((name for name, pattern in split.items() if fnmatchcase(object_name, pattern)), None)
+    if name is None:
+        return None
+    name = name[:-1] + object_name if name.endswith("*") else name
+    if name in definitions:
         raise InputError(
-            f"[objects] {own}: the scene has a material of that name already; choose another name"
+            f"[objects] {name}: the scene has a material of that name already; choose another name"
         )
-    return original, own
+    return name
 
 
-def _merged(
-    base: Material | Mapping[str, object] | None, more: Material | Mapping[str, object] | None
+def _merge(
+    base: Material | Mapping[str, object] | None, specific: Material | Mapping[str, object] | None
 ) -> Material | Mapping[str, object] | None:
-    """The constants given for a material, those for some of its objects put over those for all."""
-    if more is None or isinstance(more, Material) or base is None:
-        return base if more is None else more
+    """Merge constants given for a material with those given for some of its objects, which take precedence."""
+    if specific is None or isinstance(specific, Material) or base is None:
+        return base if specific is None else specific
     if isinstance(base, Material):
-        return {**{name: getattr(base, name) for name in _MATERIAL_FIELDS}, **more}
-    return {**base, **more}
+        base = {name: getattr(base, name) for name in _MATERIAL_FIELDS}
+    return {**base, **specific}
 
 
 def _material(
@@ -218,47 +228,39 @@ def _material(
     override: Material | Mapping[str, object] | None,
     frequency: float,
     path: Path,
-) -> Material:
-    """The constants of one material: the override's where it gives them, else the file's."""
+) -> tuple[Material, ItuLaw]:
+    """The constants of one material, from the override and else the file, and their law over frequency."""
     if isinstance(override, Material):
-        return override
-    given = {key: value for key, value in (override or {}).items() if value is not None}
-    itu, revision = given.pop("itu", None), given.pop("revision", DEFAULT_REVISION)
-    unknown = set(given) - _MATERIAL_FIELDS
+        return override, frequency_independent_law(override)
+    constants = {key: value for key, value in (override or {}).items() if value is not None}
+    itu, revision = constants.pop("itu", None), constants.pop("revision", DEFAULT_REVISION)
+    unknown = set(constants) - _MATERIAL_FIELDS
     if unknown:
         raise InputError(
             f"[materials] {name}: unknown key {sorted(unknown)[0]!r}; known: {sorted(_MATERIAL_FIELDS)}"
         )
+    bulk_given = set(constants) >= _BULK_FIELDS
     try:
         if itu is not None:
             base = itu_material(str(itu), frequency, DEFAULT_THICKNESS, revision=str(revision))
-            return replace(base, **{**_slab(bsdf), **given})
-        if {"relative_permittivity", "conductivity"} <= set(given):
-            return Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **given})
-        return replace(_file_material(original, bsdf, frequency), **given)
+            material = replace(base, **{**_slab(bsdf), **constants})
+        elif bulk_given:
+            material = Material(**{"thickness": DEFAULT_THICKNESS, **_slab(bsdf), **constants})
+        else:
+            material = replace(_file_material(original, bsdf, frequency), **constants)
     except InputError as error:
         raise InputError(f"{path}: material {name!r}: {error}") from None
-
-
-def _law(
-    material: Material,
-    original: str,
-    bsdf: ElementTree.Element | None,
-    override: Material | Mapping[str, object] | None,
-    frequency: float,
-) -> ItuLaw:
-    """How a material's constants follow the frequency: those given as numbers do not."""
     steady = frequency_independent_law(material)
-    if isinstance(override, Material):
-        return steady
-    given = {key: value for key, value in (override or {}).items() if value is not None}
-    itu, revision = given.get("itu", _itu_type(original, bsdf)), given.get("revision", DEFAULT_REVISION)
-    if itu is None or {"relative_permittivity", "conductivity"} <= set(given):
-        return steady
+    itu = _itu_type(original, bsdf) if itu is None else itu
+    if itu is None or bulk_given:
+        return material, steady
     law = itu_law(str(itu), frequency, str(revision))
-    if "relative_permittivity" in given:
+    # A constant given as a number does not depend on frequency.
+    if "relative_permittivity" in constants:
         law = law._replace(a=steady.a, b=0.0)
-    return law._replace(c=steady.c, d=0.0) if "conductivity" in given else law
+    if "conductivity" in constants:
+        law = law._replace(c=steady.c, d=0.0)
+    return material, law
 
 
 def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float) -> Material:
@@ -276,41 +278,45 @@ def _file_material(name: str, bsdf: ElementTree.Element | None, frequency: float
 
 
 def _itu_type(name: str, bsdf: ElementTree.Element | None) -> str | None:
-    """The ITU name that Sionna reads from a BSDF: its `type` string, or its own name after `itu_`."""
-    named = name.startswith(("itu_", "itu-"))
+    """The ITU name that Sionna takes from a BSDF: its `type` string, or its own name after `itu_`."""
+    has_itu_name = name.startswith(("itu_", "itu-"))
     declared = None if bsdf is None else bsdf.find("string[@name='type']")
-    if bsdf is not None and declared is not None and (named or bsdf.get("type") == "itu-radio-material"):
+    if (
+        bsdf is not None
+        and declared is not None
+        and (has_itu_name or bsdf.get("type") == "itu-radio-material")
+    ):
         return declared.get("value")
-    return name[4:] if named else None
+    return name[4:] if has_itu_name else None
 
 
 def _floats(bsdf: ElementTree.Element | None) -> dict[str, float]:
-    if bsdf is None:
-        return {}
-    found = {}
-    for element in bsdf.findall("float"):
+    """The numbers of a BSDF that are fields of a material."""
+    constants = {}
+    for element in [] if bsdf is None else bsdf.findall("float"):
         name, value = element.get("name", ""), element.get("value")
         if name in _MATERIAL_FIELDS:
             try:
-                found[name] = float(value or "")
+                constants[name] = float(value or "")
             except ValueError:
                 raise InputError(f"{name} = {value!r}: must be {BOUNDS[name]}") from None
-    return found
+    return constants
 
 
 def _slab(bsdf: ElementTree.Element | None) -> dict[str, float]:
-    constants = _floats(bsdf)
-    return {key: constants[key] for key in constants if key not in ("relative_permittivity", "conductivity")}
+    """The numbers of a BSDF that describe the slab and its surface, not the bulk."""
+    return {key: value for key, value in _floats(bsdf).items() if key not in _BULK_FIELDS}
 
 
 def _refer(shape: ElementTree.Element, identifier: str) -> None:
+    """Replace the material of a shape by a reference."""
     for child in [*shape.findall("ref"), *shape.findall("bsdf")]:
         shape.remove(child)
     ElementTree.SubElement(shape, "ref", {"id": identifier, "name": "bsdf"})
 
 
 def material_element(identifier: str, material: Material) -> ElementTree.Element:
-    """The BSDF of a material: the constants that Sionna's scene files know.
+    """Make the BSDF of a material, with the constants that Sionna's scene files can hold.
 
     Args:
         identifier: Its id.

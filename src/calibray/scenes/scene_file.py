@@ -1,29 +1,34 @@
-"""The file of a scene: found, parsed, and its shapes and the files it names checked before a ray tracer sees them."""
+"""The XML file of a scene: found, parsed and checked before a ray tracer sees it; written for new scenes."""
 
 from __future__ import annotations
 
+import json
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
+from xml.sax.saxutils import escape, quoteattr, unescape
 
 import numpy as np
 
+from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.scenes.checks.obj import check_obj
-from calibray.scenes.checks.ply import check_ply
+from calibray.scenes.meshes import Mesh, MeshObject, ply_bytes, read_mesh
 from calibray.support.messages import shortened
-from calibray.support.output_files import exists
+from calibray.support.output_files import exists, replacing
 
 BUNDLED_PREFIX: Final = "sionna:"
 
 SHAPES: Final = ("cube", "obj", "ply", "rectangle", "serialized")
-"""The types of shapes that are triangle meshes, which alone Sionna RT takes."""
+"""Types of shapes that are triangle meshes; Sionna RT takes no others."""
 
 MAX_DEPTH: Final = 64
-"""How deep the elements of a scene file may lie in each other."""
+"""Largest depth of nested elements in a scene file."""
+
+_FRAME_COMMENT: Final = "calibray frame "
 
 
 def scene_path(source: str) -> Path:
@@ -46,10 +51,12 @@ def scene_path(source: str) -> Path:
         folder = Path(next(iter(spec.submodule_search_locations))) / "rt" / "scenes"
         path = folder / name / f"{name}.xml"
         if not exists(path):
-            known = sorted(
+            bundled = sorted(
                 entry.name for entry in folder.iterdir() if (entry / f"{entry.name}.xml").is_file()
             )
-            raise InputError(f"scene {source!r}: Sionna RT bundles no such scene; it has {', '.join(known)}")
+            raise InputError(
+                f"scene {shortened(source, 300)!r}: Sionna RT bundles no such scene; it has {', '.join(bundled)}"
+            )
         return path
     path = Path(source)
     if not exists(path):
@@ -61,7 +68,7 @@ def scene_path(source: str) -> Path:
 
 
 def content(path: Path) -> bytes:
-    """The bytes of a scene's file; read once for as long as it stays the same.
+    """Read the bytes of a scene file; an unchanged file is read once.
 
     Args:
         path: The file.
@@ -82,20 +89,20 @@ def _content(path: Path, *_: int) -> bytes:
 
 
 def parse(path: Path, source: str) -> ElementTree.Element:
-    """Read the XML of a scene.
+    """Parse the XML of a scene.
 
     Args:
         path: The file.
-        source: What the user named, for messages.
+        source: The user's name for the scene, for messages.
 
     Returns:
         The root element.
 
     Raises:
-        InputError: The file cannot be read, is not well-formed, lies too deep in itself, or is no scene.
+        InputError: The file cannot be read, is not well-formed, is nested too deeply, or is not a Mitsuba scene.
     """
     try:
-        root = ElementTree.fromstring(content(path), ElementTree.XMLParser(target=_Builder()))
+        root = ElementTree.fromstring(content(path), ElementTree.XMLParser(target=_ShallowTree()))
     except InputError as error:
         raise InputError(f"scene file {source}: {error}") from None
     except OSError as error:
@@ -106,13 +113,13 @@ def parse(path: Path, source: str) -> ElementTree.Element:
         ) from None
     if root.tag != "scene":
         raise InputError(
-            f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>"
+            f"scene file {source}: the root element is <{root.tag}>, a Mitsuba scene has <scene>; give a Mitsuba file"
         )
     return root
 
 
 def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
-    """Find a scene's file and read its XML.
+    """Find the file of a scene and parse its XML.
 
     Args:
         source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
@@ -121,14 +128,14 @@ def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
         The file, and its root element.
 
     Raises:
-        InputError: The file does not exist or is no Mitsuba scene.
+        InputError: The file does not exist or is not a Mitsuba scene.
     """
     path = scene_path(str(source))
     return path, parse(path, str(source))
 
 
-class _Builder(ElementTree.TreeBuilder):
-    """Elements as ElementTree makes them, but not so deep in each other that nothing could walk them."""
+class _ShallowTree(ElementTree.TreeBuilder):
+    """Builds the elements and refuses deep nesting, on which recursive code would overflow the stack."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -137,7 +144,7 @@ class _Builder(ElementTree.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
         self._depth += 1
         if self._depth > MAX_DEPTH:
-            raise InputError(f"elements lie more than {MAX_DEPTH} deep in each other; export the scene again")
+            raise InputError(f"elements are nested more than {MAX_DEPTH} deep; export the scene again")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> ElementTree.Element:
@@ -145,15 +152,18 @@ class _Builder(ElementTree.TreeBuilder):
         return super().end(tag)
 
 
-def check_shape(shape: ElementTree.Element, path: Path) -> None:
-    """Refuse a shape that is no triangle mesh, or whose mesh is missing or malformed.
+def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
+    """Read the mesh of a shape, and refuse a shape that cannot be traced. Its transform is not applied.
 
     Args:
         shape: The element.
         path: The scene's file.
 
+    Returns:
+        The mesh; None for a rectangle or cube, and for Mitsuba's own `serialized` format.
+
     Raises:
-        InputError: It is such a shape.
+        InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
     """
     kind, name = shape.get("type", ""), shape.get("id")
     if kind not in SHAPES:
@@ -162,25 +172,35 @@ def check_shape(shape: ElementTree.Element, path: Path) -> None:
             "export it as a triangle mesh"
         )
     _check_transform(shape, path)
-    filename = shape.find("string[@name='filename']")
+    filename = mesh_filename(shape)
     if filename is None:
         if kind in ("obj", "ply", "serialized"):
             raise InputError(f"{path}: shape {name!r} names no file; give it a filename")
-        return
-    mesh = path.parent / filename.get("value", "")
+        return None
+    mesh = path.parent / filename
     if not exists(mesh):
         raise InputError(
-            f"{path}: mesh {shortened(filename.get('value', ''), 200)!r} of shape {name!r} does not exist in "
-            f"{path.parent}; copy the meshes folder beside the scene"
+            f"{path}: mesh {shortened(filename, 200)!r} of shape {name!r} does not exist in {path.parent}; copy the "
+            "meshes folder next to the scene"
         )
-    if kind == "ply":
-        check_ply(mesh)
-    if kind == "obj":
-        check_obj(mesh)
+    return read_mesh(mesh, kind) if kind in ("obj", "ply") else None
+
+
+def mesh_filename(shape: ElementTree.Element) -> str | None:
+    """The file that a shape names.
+
+    Args:
+        shape: The element; a texture or an emitter serves as well.
+
+    Returns:
+        The name, relative to the scene's folder; None if the element names no file.
+    """
+    filename = shape.find("string[@name='filename']")
+    return None if filename is None else filename.get("value", "")
 
 
 def _check_transform(shape: ElementTree.Element, path: Path) -> None:
-    """Refuse a transform that makes a shape flat or sends it nowhere: rays would pass as if it were not there."""
+    """Refuse a transform that flattens a shape or moves it to infinity: rays would pass through without a message."""
     for step in shape.findall("transform/*"):
         words = [value for key, value in step.attrib.items() if key in ("x", "y", "z", "value", "angle")]
         try:
@@ -194,30 +214,105 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
         if flat or not np.isfinite(numbers).all():
             raise InputError(
                 f"{path}: <{step.tag}> of shape {shape.get('id')!r} is {shortened(' '.join(words))!r}, must be finite "
-                "numbers that leave the shape its width; export the scene again"
+                "numbers that do not flatten the shape; export the scene again"
             )
 
 
 def check_files(root: ElementTree.Element, path: Path) -> None:
-    """Refuse textures and the like without their files, and scenes in several files.
+    """Refuse scenes in several files, and textures or emitters whose files are missing.
 
     Args:
-        root: The scene, without the materials of the file, which are replaced.
+        root: The scene without its materials.
         path: The scene's file.
 
     Raises:
-        InputError: It is such a scene.
+        InputError: The scene includes another file, or a file is missing.
     """
     if root.find(".//include") is not None:
         raise InputError(f"{path}: <include> is not supported; export the scene into one file")
     for element in root.iter():
-        filename = element.find("string[@name='filename']")
-        if (
-            element.tag != "shape"
-            and filename is not None
-            and not exists(path.parent / filename.get("value", ""))
-        ):
+        filename = mesh_filename(element)
+        if element.tag != "shape" and filename is not None and not exists(path.parent / filename):
             raise InputError(
-                f"{path}: file {shortened(filename.get('value', ''), 200)!r} of a {element.tag} does not exist; copy "
-                f"it beside the scene, or remove the {element.tag}, which radio waves do not see"
+                f"{path}: file {shortened(filename, 200)!r} of a {element.tag} does not exist; copy it next to the "
+                f"scene, or remove the {element.tag}, which has no effect on radio waves"
             )
+
+
+def write_scene(
+    folder: Path,
+    objects: Sequence[MeshObject],
+    materials: Mapping[str, Mapping[str, float | str]],
+    frame: Frame | None = None,
+) -> Path:
+    """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
+
+    Args:
+        folder: Where to write; made if it does not exist.
+        objects: The objects of the scene.
+        materials: Constants by material name. A `type` names a material of ITU-R P.2040, which then gives
+            permittivity and conductivity.
+        frame: Where the scene lies on the globe; kept in a comment, from which `read_frame` reads it.
+
+    Returns:
+        Path of the XML file.
+    """
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    for item in objects:
+        with replacing(folder / "meshes" / f"{item.name}.ply") as partial:
+            partial.write_bytes(ply_bytes(item.mesh))
+    path = folder / "scene.xml"
+    with replacing(path) as partial:
+        partial.write_bytes(_scene_xml(objects, materials, frame).encode("utf-8"))
+    return path
+
+
+def _scene_xml(
+    objects: Sequence[MeshObject], materials: Mapping[str, Mapping[str, float | str]], frame: Frame | None
+) -> str:
+    lines = ['<scene version="2.1.0">']
+    if frame is not None:
+        # XML comments must not contain a double hyphen.
+        comment = escape(f"{_FRAME_COMMENT}{frame}").replace("--", "- -")
+        lines.append(f"    <!-- {comment} -->")
+    for name, constants in materials.items():
+        kind = "itu-radio-material" if "type" in constants else "radio-material"
+        lines.append(f'    <bsdf type="{kind}" id={quoteattr(f"mat-{name}")}>')
+        for key, value in constants.items():
+            tag, text = ("string", value) if isinstance(value, str) else ("float", f"{value:.6g}")
+            lines.append(f'        <{tag} name="{key}" value={quoteattr(text)}/>')
+        lines.append("    </bsdf>")
+    for item in objects:
+        lines += [
+            f'    <shape type="ply" id={quoteattr(f"mesh-{item.name}")}>',
+            f'        <string name="filename" value={quoteattr(f"meshes/{item.name}.ply")}/>',
+            '        <boolean name="face_normals" value="true"/>',
+            f'        <ref id={quoteattr(f"mat-{item.material}")} name="bsdf"/>',
+            "    </shape>",
+        ]
+    return "\n".join([*lines, "</scene>", ""])
+
+
+def read_frame(source: str | Path) -> Frame | None:
+    """Read where a scene lies on the globe.
+
+    Args:
+        source: Path of the XML file, as `write_scene` writes it, or `sionna:NAME`.
+
+    Returns:
+        The frame; None if the file does not state it.
+
+    Raises:
+        InputError: The scene does not exist, or its file states an invalid frame.
+    """
+    path = scene_path(str(source))
+    with path.open(encoding="utf-8", errors="replace") as stream:
+        head = stream.read(8192)
+    comment = re.search(f"<!-- {_FRAME_COMMENT}(.*?) -->", head, re.DOTALL)
+    if comment is None:
+        return None
+    text = unescape(comment[1]).replace("- -", "--")
+    try:
+        return Frame.from_record(json.loads(text))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: its frame {text!r} is not JSON ({error}); make the scene again") from None

@@ -1,30 +1,72 @@
-"""The triangles of a scene, for drawing."""
+"""The meshes of a scene as Calibray uses them outside the tracer: for checks, maps and drawings; and its ground."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.scenes.scene import TRACED, Scene
+from calibray.errors import InputError
+from calibray.scenes.meshes import Mesh, MeshObject
+from calibray.scenes.scene import Scene
+from calibray.scenes.scene_file import find_scene, mesh_filename, shape_mesh
 
 LEVEL: Final = 0.5
-"""Cosine of the tilt [1] up to which a face counts as lying, as a roof or the ground does."""
+"""A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
+
+_EDGE: Final = 1e-9
+"""Points up to this far outside a triangle count as over it, as a share of its size [1]."""
+
+
+def read_meshes(source: str | Path) -> Iterator[MeshObject]:
+    """Read the PLY and OBJ meshes of a scene, one after the other.
+
+    Args:
+        source: Path of a Mitsuba XML file, or `sionna:NAME`.
+
+    Yields:
+        Each object with its mesh, faces reversed where the file flips normals. Transforms of shapes are not applied,
+        and shapes without a file (rectangles, cubes) are skipped.
+
+    Raises:
+        InputError: The scene or a mesh cannot be read, or the scene has no mesh.
+    """
+    path, root = find_scene(source)
+    count = 0
+    for shape in root.findall("shape"):
+        name = (shape.get("id") or "?").removeprefix("mesh-")
+        mesh = shape_mesh(shape, path)
+        if mesh is None:
+            if mesh_filename(shape) is not None:
+                raise InputError(
+                    f"{path}: the mesh of {name!r} is serialized, which only Mitsuba reads; export it as PLY"
+                )
+            continue
+        flip = shape.find("boolean[@name='flip_normals']")
+        if flip is not None and flip.get("value") == "true":
+            mesh = replace(mesh, faces=mesh.faces[:, ::-1])
+        references = (shape.find("ref"), shape.find("bsdf"))
+        material = next((reference.get("id", "") for reference in references if reference is not None), "")
+        count += 1
+        yield MeshObject(name, material.removeprefix("mat-"), mesh)
+    if not count:
+        raise InputError(f"{path}: the scene has no mesh; export the scene with its meshes")
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """The meshes of a scene, joined.
+    """The triangles of all meshes of a scene.
 
     Attributes:
         vertex: Positions [V, 3], [m].
-        face: Indices of every triangle's vertices [F, 3].
-        material: Place of every triangle's material in `Scene.materials` [F].
-        ground: Whether a triangle belongs to a sheet under the whole scene, as terrain is [F].
+        face: Vertex indices of each triangle [F, 3].
+        material: Index of each triangle's material in `Scene.materials` [F].
+        ground: Whether a triangle belongs to a sheet under the whole scene, such as terrain [F].
         left_out: Names of the objects that could not be read.
     """
 
@@ -36,81 +78,134 @@ class Triangles:
 
     @property
     def corners(self) -> NDArray[np.float64]:
-        """Positions of every triangle's corners [F, 3, 3], [m]."""
+        """Positions of the corners of each triangle [F, 3, 3], [m]."""
         return self.vertex[self.face]
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Normals, as long as the triangles are large [F, 3], [m^2]."""
+        """Normals, whose length is the area of the triangle [F, 3], [m^2]."""
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 
 
 def read_triangles(scene: Scene) -> Triangles:
-    """Read the meshes of a scene.
+    """Read the triangles of a scene.
 
     Args:
         scene: The scene.
 
     Returns:
-        Its triangles; an object that is no mesh file, or is moved by a transform, is left out and named.
+        The triangles. Objects without a mesh file, with a transform, or whose file became unreadable are left out and
+        named.
     """
-    vertices, faces, materials, objects, left_out = [np.zeros((0, 3))], [], [], [], []
-    count = 0
-    for number, (name, material, mesh) in enumerate(_meshes(scene)):
+    materials = list(scene.materials)
+    meshes: list[Mesh] = []
+    material: list[int] = []
+    left_out = []
+    shapes = ElementTree.fromstring(scene.xml).findall("shape")
+    for shape, item in zip(shapes, scene.objects, strict=True):
+        try:
+            mesh = shape_mesh(shape, scene.path) if shape.find("transform") is None else None
+        except InputError:
+            mesh = None
         if mesh is None:
-            left_out.append(name)
-            continue
-        vertices.append(mesh[0])
-        faces.append(mesh[1] + count)
-        materials.append(np.full(len(mesh[1]), material))
-        objects.append(np.full(len(mesh[1]), number))
-        count += len(mesh[0])
-    empty = np.zeros(0, dtype=np.int64)
-    joined = Triangles(
-        np.concatenate(vertices),
-        np.concatenate([empty.reshape(0, 3), *faces]),
-        np.concatenate([empty, *materials]),
-        np.zeros(sum(map(len, faces)), dtype=bool),
+            left_out.append(item.name or "?")
+        else:
+            meshes.append(mesh)
+            material.append(materials.index(item.material))
+    count = [len(mesh.faces) for mesh in meshes]
+    offset = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    triangles = Triangles(
+        np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in meshes)]),
+        np.concatenate(
+            [
+                np.zeros((0, 3), dtype=np.int64),
+                *(mesh.faces + k for mesh, k in zip(meshes, offset, strict=False)),
+            ]
+        ),
+        np.repeat(np.array(material, dtype=np.int64), count),
+        np.zeros(sum(count), dtype=bool),
         tuple(left_out),
     )
-    return _with_ground(joined, np.concatenate([empty, *objects]))
+    return replace(triangles, ground=_ground(triangles, np.repeat(np.arange(len(count)), count)))
 
 
-def _meshes(
-    scene: Scene,
-) -> Iterator[tuple[str, int, tuple[NDArray[np.float64], NDArray[np.int64]] | None]]:
-    """Name, material and mesh of every object; no mesh where there is none to be drawn."""
-    import trimesh
-
-    for shape in ElementTree.fromstring(scene.xml).findall("shape"):
-        name = (shape.get("id") or "?").removeprefix("mesh-")
-        reference = shape.find("ref")
-        material = int(("0" if reference is None else reference.get("id", "")).removeprefix(TRACED))
-        filename = shape.find("string[@name='filename']")
-        mesh = None
-        if filename is not None and shape.find("transform") is None:
-            try:
-                read = trimesh.load_mesh(scene.path.parent / filename.get("value", ""), process=False)
-                mesh = np.asarray(read.vertices, dtype=float), np.asarray(read.faces, dtype=np.int64)
-            # Whatever the reader raises on a file that it cannot read: the report says that it is left out.
-            except Exception:
-                mesh = None
-        yield name, material, mesh
-
-
-def _with_ground(triangles: Triangles, owner: NDArray[np.int64]) -> Triangles:
-    """Objects that lie flat under most of the scene are its ground."""
-    ground = triangles.ground.copy()
-    if not len(triangles.face):
-        return triangles
+def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Triangles of the objects that are level and extend under most of the scene [F]."""
+    ground = np.zeros(len(owner), dtype=bool)
+    if not len(owner):
+        return ground
     corners, normal = triangles.corners, triangles.normal
     area = np.linalg.norm(normal, axis=1)
-    lying = np.abs(normal[:, 2]) > LEVEL * area
-    whole = np.ptp(triangles.vertex[:, :2], axis=0)
+    level = np.abs(normal[:, 2]) > LEVEL * area
+    extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
-        own = owner == number
-        extent = np.ptp(corners[own][:, :, :2].reshape(-1, 2), axis=0)
-        if (extent > LEVEL * whole).all() and area[own & lying].sum() > 0.95 * area[own].sum():
-            ground |= own
-    return Triangles(triangles.vertex, triangles.face, triangles.material, ground, triangles.left_out)
+        mask = owner == number
+        own_extent = np.ptp(corners[mask][:, :, :2].reshape(-1, 2), axis=0)
+        if (own_extent > LEVEL * extent).all() and area[mask & level].sum() > 0.95 * area[mask].sum():
+            ground |= mask
+    return ground
+
+
+def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
+    """Whether a mesh is a sheet under the whole scene.
+
+    This is stricter than `Triangles.ground`, which also takes a ceiling for ground: here a ceiling covers the rooms.
+
+    Args:
+        mesh: The mesh.
+        extent: Extent of the scene to the east and to the north [2], [m].
+
+    Returns:
+        True if no face is steep and the mesh covers most of the scene.
+    """
+    sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    level = np.abs(normal[:, 2]) > LEVEL * np.linalg.norm(normal, axis=1)
+    wide = (np.ptp(mesh.vertices[:, :2], axis=0) > 0.8 * extent).all()
+    area_in_plan = np.abs(normal[:, 2]).sum() / 2
+    return bool(level.all() and wide and area_in_plan > 0.5 * float(np.prod(extent)))
+
+
+def ground_heights(
+    triangles: Triangles, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Heights of the ground over a grid, whatever stands on it.
+
+    Args:
+        triangles: The scene.
+        x: Eastings of the grid, ascending and equally spaced [nx], [m].
+        y: Northings, likewise [ny], [m].
+
+    Returns:
+        Heights of the lowest ground [ny, nx], [m]; where there is none, the height of the scene's lowest point.
+    """
+    heights = np.full((len(y), len(x)), np.inf)
+    corners = triangles.corners[triangles.ground]
+    # Grid points in the bounding box of each triangle, as (triangle, row, column).
+    first = [_grid_index(axis, corners[:, :, k].min(axis=1), "left") for k, axis in enumerate((x, y))]
+    last = [_grid_index(axis, corners[:, :, k].max(axis=1), "right") for k, axis in enumerate((x, y))]
+    columns, rows = (end - start for start, end in zip(first, last, strict=True))
+    triangle = np.repeat(np.arange(len(corners)), columns * rows)
+    within = np.arange(len(triangle)) - np.repeat(np.cumsum(columns * rows) - columns * rows, columns * rows)
+    column = first[0][triangle] + within % np.maximum(columns, 1)[triangle]
+    row = first[1][triangle] + within // np.maximum(columns, 1)[triangle]
+    # Barycentric coordinates u, v of the points; an upright triangle has none.
+    origin, along, across = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+    area = np.where(area == 0, np.nan, area)[triangle]
+    east, north = x[column] - origin[triangle, 0], y[row] - origin[triangle, 1]
+    u = (east * across[triangle, 1] - north * across[triangle, 0]) / area
+    v = (north * along[triangle, 0] - east * along[triangle, 1]) / area
+    over = (u >= -_EDGE) & (v >= -_EDGE) & (u + v <= 1 + _EDGE)
+    z = origin[triangle, 2] + u * along[triangle, 2] + v * across[triangle, 2]
+    np.minimum.at(heights, (row[over], column[over]), z[over])
+    return np.where(np.isfinite(heights), heights, triangles.vertex[:, 2].min())
+
+
+def _grid_index(
+    axis: NDArray[np.float64], value: NDArray[np.float64], side: Literal["left", "right"]
+) -> NDArray[np.int64]:
+    """Index of values on a grid axis, with a tolerance for points on the edge of a triangle."""
+    tolerance = _EDGE * max(float(np.ptp(axis)), 1.0) * (1 if side == "right" else -1)
+    return np.searchsorted(axis, value + tolerance, side=side)

@@ -1,1 +1,44 @@
-"""Authoring: scenes made of maps, footprints, height models and floor plans."""
+"""Making scenes: from OpenStreetMap extracts, vector files and height models, and from floor plans.
+
+Names are loaded when first used, because each source needs other libraries.
+"""
+
+from typing import TYPE_CHECKING
+
+from calibray.support.lazy import lazily
+
+if TYPE_CHECKING:
+    from calibray.scenes.authoring.building_scene import make_scene as make_scene
+    from calibray.scenes.authoring.extrusion import Windows as Windows
+    from calibray.scenes.authoring.floor_plan import Segment as Segment
+    from calibray.scenes.authoring.floor_plan import merge_faces as merge_faces
+    from calibray.scenes.authoring.floor_plan import read_plan as read_plan
+    from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
+    from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
+    from calibray.scenes.authoring.footprint_files import read_footprints as read_footprints
+    from calibray.scenes.authoring.footprint_files import read_openstreetmap as read_openstreetmap
+    from calibray.scenes.authoring.footprints import Footprints as Footprints
+    from calibray.scenes.authoring.footprints import HeightRule as HeightRule
+    from calibray.scenes.authoring.footprints import HeightSource as HeightSource
+    from calibray.scenes.authoring.footprints import clean_footprints as clean_footprints
+    from calibray.scenes.authoring.made_scene import MadeScene as MadeScene
+    from calibray.scenes.authoring.made_scene import Palette as Palette
+    from calibray.scenes.authoring.made_scene import SurfaceMaterial as SurfaceMaterial
+    from calibray.scenes.authoring.terrain import Terrain as Terrain
+    from calibray.scenes.authoring.terrain import lower_origin as lower_origin
+    from calibray.scenes.authoring.terrain import read_terrain as read_terrain
+
+_MODULES = {
+    "building_scene": ("make_scene",),
+    "extrusion": ("Windows",),
+    "floor_plan": ("Segment", "merge_faces", "read_plan"),
+    "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
+    "footprint_files": ("read_footprints", "read_openstreetmap"),
+    "footprints": ("Footprints", "HeightRule", "HeightSource", "clean_footprints"),
+    "made_scene": ("MadeScene", "Palette", "SurfaceMaterial"),
+    "terrain": ("Terrain", "lower_origin", "read_terrain"),
+}
+_HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
+
+__all__ = sorted(_HOMES)
+__getattr__, __dir__ = lazily(__name__, _HOMES)

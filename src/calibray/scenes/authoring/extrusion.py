@@ -1,9 +1,9 @@
-"""Extrusion: the walls, windows, roofs and undersides of buildings, from the cells that they stand on.
+"""Extrusion: walls, windows, roofs and undersides of buildings, raised on the cells of `overlaps`.
 
-A wall stands where one side of a border is built and the other is not, at any height: between neighbours of different
-heights it begins at the lower one's roof, and between equals there is none. A column of corners rises from each end
-of a border; all walls that meet there use the same corners, so the surface is closed and its wedges are connected.
-Lengths are whole millimetres while surfaces are made: corners are equal or they are not.
+A wall stands at each height where one side of a border is built and the other is not: between neighbours of different
+heights it begins at the lower one's roof, and between equals there is none. A column of corners rises from each end of
+a border. All walls that meet there use the same corners, so the surface is closed and its wedges are connected. Lengths
+are whole millimetres, so that corners are either equal or different.
 """
 
 from __future__ import annotations
@@ -18,29 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.scenes.authoring.building_parts import Cell, outside
+from calibray.scenes.authoring.overlaps import Cell, subtract
 from calibray.support.extras import library
 
 MILLIMETRE: Final = 0.001
+
 WALL, WINDOW, ROOF, UNDERSIDE = range(4)
 """Kinds of surfaces."""
 
-Point = tuple[int, int]
+Point = tuple[int, int]  # x, y [mm]
 Edge = tuple[Point, Point]
-Corner = tuple[int, int, int]
+Corner = tuple[int, int, int]  # x, y, z [mm]
 Stand = tuple[int, int, int]  # bottom [mm], top [mm], number of the building
+Strips = dict[Edge, list[tuple[Point, int]]]  # where the strips of an edge begin, and the kind of each
 
 
 @dataclass(frozen=True)
 class Windows:
-    """How outer walls are divided into wall and window: upright strips, by turns, a wall at both ends.
+    """How outer walls are divided into alternating upright strips of wall and window, with wall at both ends.
 
-    The strips are as high as the wall, so the share holds at the height of every antenna, and the wall at the ends
-    keeps the wedges at the corners of the building.
+    The strips are as high as the wall, so the share holds at the height of every antenna. The wall at both ends keeps
+    the wedges at the corners of the building in one material.
 
     Attributes:
-        share: Share of window in every wall [1], from 0 to below 1.
-        module: About how far the middles of two windows are apart [m].
+        share: Share of window in each wall, from 0 to below 1 [1].
+        module: Approximate distance between the centres of two windows [m].
 
     Raises:
         InputError: A number is out of its bounds.
@@ -56,13 +58,13 @@ class Windows:
             raise InputError(f"module = {self.module!r}: must be a finite number of metres greater than 0")
 
     def divide(self, edge: Edge) -> list[tuple[Point, int]]:
-        """Divide a wall.
+        """Divide a wall into strips.
 
         Args:
             edge: Its two ends [mm].
 
         Returns:
-            Where the strips begin, from the first end, and whether each is `WALL` or `WINDOW`.
+            Where the strips begin, from the first end, and the kind of each: `WALL` or `WINDOW`.
 
         Example:
             >>> Windows(0.5, module=2.0).divide(((0, 0), (2000, 0)))
@@ -74,21 +76,21 @@ class Windows:
         shares = np.cumsum([0.0, *([wall, window] * count)])
         points = np.rint(start + (end - start) * shares[:, None]).astype(int)
         strips = [((int(x), int(y)), (WALL, WINDOW)[index % 2]) for index, (x, y) in enumerate(points)]
-        # A strip that is thinner than the rounding is none.
+        # Drop strips that rounding reduced to nothing.
         return [
             strip
-            for strip, after in zip(strips, [*strips[1:], (edge[1], WALL)], strict=True)
-            if strip[0] != after[0]
+            for strip, following in zip(strips, [*strips[1:], (edge[1], WALL)], strict=True)
+            if strip[0] != following[0]
         ]
 
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """Triangles of buildings.
+    """The surface of buildings as triangles.
 
     Attributes:
         corners: Corners, counter-clockwise seen from outside [F, 3, 3], [mm].
-        owner: Number of the building that each belongs to [F].
+        owner: Number of the building of each triangle [F].
         kind: `WALL`, `WINDOW`, `ROOF` or `UNDERSIDE` [F].
     """
 
@@ -103,19 +105,21 @@ def extrude(
     """Raise buildings on their cells.
 
     Args:
-        cells: The cells, their stands in the scene's frame.
+        cells: The cells, with heights in the scene's frame.
         windows: How walls are divided; None for walls without windows.
-        ground: Height of the ground under every building [n], [m]: what stands on it stays open below. None closes all.
+        ground: Height of the ground under each building [n], [m]. Bodies that stand on it stay open at the bottom. None
+            closes all bodies.
 
     Returns:
-        The shell: closed, but for the bottoms that were to stay open.
+        The shell, closed except for the open bottoms.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
-        tuple((_whole(low), _whole(high), owner) for low, high, owner in cell.stands) for cell in cells
+        tuple((to_millimetres(low), to_millimetres(high), owner) for low, high, owner in cell.stands)
+        for cell in cells
     ]
     cell_of = {edge: index for index, rings in enumerate(outlines) for ring in rings for edge in _edges(ring)}
-    walls = {edge: _walls(standing, cell_of, edge) for edge in cell_of}
+    walls = {edge: _wall_stands(standing, cell_of, edge) for edge in cell_of}
     strips = _strips(walls, windows)
     triangles: list[tuple[Corner, Corner, Corner]] = []
     owner: list[int] = []
@@ -125,12 +129,12 @@ def extrude(
         points = strips.get((start, end), [(start, WALL)])
         for (left, strip), (right, _) in pairwise([*points, (end, WALL)]):
             for low, high, building in stands:
-                made = list(upright(left, right, levels[left], levels[right], low, high))
-                triangles += made
-                owner += [building] * len(made)
-                kind += [strip] * len(made)
+                wall = list(wall_triangles(left, right, levels[left], levels[right], low, high))
+                triangles += wall
+                owner += [building] * len(wall)
+                kind += [strip] * len(wall)
     lids = _lids(
-        outlines, standing, strips, None if ground is None else [_whole(height) for height in ground]
+        outlines, standing, strips, None if ground is None else [to_millimetres(height) for height in ground]
     )
     return Shell(
         np.concatenate([np.array(triangles, dtype=np.int64).reshape(-1, 3, 3), lids.corners]),
@@ -139,48 +143,55 @@ def extrude(
     )
 
 
-def _whole(length: float) -> int:
+def to_millimetres(length: float) -> int:
+    """Round a length.
+
+    Args:
+        length: The length [m].
+
+    Returns:
+        The length [mm].
+    """
     return round(length / MILLIMETRE)
 
 
 def _rings(polygon: Any) -> list[list[Point]]:
-    """Corners of the rings of a polygon, its inside to their left, the first corner not repeated."""
+    """Corners of the rings of a polygon, the interior on their left, without repeating the first corner."""
     oriented = library("shapely", "scenes").orient_polygons(polygon)
     rings = (oriented.exterior, *oriented.interiors)
-    return [[(_whole(x), _whole(y)) for x, y in ring.coords[:-1]] for ring in rings]
+    return [[(to_millimetres(x), to_millimetres(y)) for x, y in ring.coords[:-1]] for ring in rings]
 
 
 def _edges(ring: Sequence[Point]) -> Iterator[Edge]:
     return pairwise([*ring, ring[0]])
 
 
-def _walls(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
-    """What stands to the left of an edge and not to its right [mm]."""
-    twin = cell_of.get((edge[1], edge[0]))
-    rest = list(standing[cell_of[edge]])
-    for low, high, _ in standing[twin] if twin is not None else ():
-        rest = [part for one in rest for part in outside(one, low, high)]
-    return rest
+def _wall_stands(standing: Sequence[tuple[Stand, ...]], cell_of: dict[Edge, int], edge: Edge) -> list[Stand]:
+    """The buildings to the left of an edge, at the heights where nothing stands to its right [mm]."""
+    opposite = cell_of.get((edge[1], edge[0]))
+    free = list(standing[cell_of[edge]])
+    for low, high, _ in standing[opposite] if opposite is not None else ():
+        free = [part for stand in free for part in subtract(stand, low, high)]
+    return free
 
 
-def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> dict[Edge, list[tuple[Point, int]]]:
-    """Where the strips of every edge with a wall begin; both directions of an edge have the same corners."""
+def _strips(walls: dict[Edge, list[Stand]], windows: Windows | None) -> Strips:
+    """Strips of all edges with a wall; both directions of an edge get the same corners."""
     if windows is None or windows.share == 0:
         return {}
-    strips: dict[Edge, list[tuple[Point, int]]] = {}
+    strips: Strips = {}
     for edge, stands in walls.items():
         if stands:
             start, end = min(edge), max(edge)
-            strips[start, end] = forth = windows.divide((start, end))
-            ends = [*(point for point, _ in forth[1:]), end]
-            strips[end, start] = [(point, strip) for point, (_, strip) in zip(ends, forth, strict=True)][::-1]
+            forward = windows.divide((start, end))
+            ends = [*(point for point, _ in forward[1:]), end]
+            strips[start, end] = forward
+            strips[end, start] = [(point, kind) for point, (_, kind) in zip(ends, forward, strict=True)][::-1]
     return strips
 
 
-def _columns(
-    walls: dict[Edge, list[Stand]], strips: dict[Edge, list[tuple[Point, int]]]
-) -> dict[Point, list[int]]:
-    """The heights at which some wall that meets a corner begins or ends [mm], ascending."""
+def _columns(walls: dict[Edge, list[Stand]], strips: Strips) -> dict[Point, list[int]]:
+    """Heights at which a wall that meets a corner begins or ends [mm], ascending."""
     levels: dict[Point, set[int]] = defaultdict(set)
     for (start, end), stands in walls.items():
         heights = {height for low, high, _ in stands for height in (low, high)}
@@ -189,58 +200,60 @@ def _columns(
     return {point: sorted(heights) for point, heights in levels.items()}
 
 
-def upright(
+def wall_triangles(
     left: Point, right: Point, left_levels: Iterable[int], right_levels: Iterable[int], low: int, high: int
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
-    """An upright rectangle as triangles, counter-clockwise seen from the right of the way from left to right.
+    """Divide an upright rectangle into triangles, counter-clockwise seen from the right of the line left to right.
 
     Args:
         left: x and y of one side [mm].
-        right: x and y of the other [mm].
-        left_levels: Heights of corners on the column over `left` [mm], ascending, both ends among them.
-        right_levels: Those over `right`.
-        low: Where it begins [mm].
-        high: Where it ends [mm].
+        right: x and y of the other side [mm].
+        left_levels: Heights of the corners on the column over `left`, both ends included [mm], ascending.
+        right_levels: The same over `right`.
+        low: Bottom [mm].
+        high: Top [mm].
 
     Yields:
-        Three corners of every triangle [mm].
+        Three corners of each triangle [mm].
     """
-    here = [(*left, level) for level in left_levels if low <= level <= high]
-    there = [(*right, level) for level in right_levels if low <= level <= high]
+    left_column = [(*left, level) for level in left_levels if low <= level <= high]
+    right_column = [(*right, level) for level in right_levels if low <= level <= high]
+    # Climb both columns together; each step up one side makes a triangle with the current corner of the other.
     i = j = 0
-    while i < len(here) - 1 or j < len(there) - 1:
-        if j < len(there) - 1 and (i == len(here) - 1 or there[j + 1][2] <= here[i + 1][2]):
-            yield here[i], there[j], there[j + 1]
+    while i < len(left_column) - 1 or j < len(right_column) - 1:
+        left_done, right_done = i == len(left_column) - 1, j == len(right_column) - 1
+        if not right_done and (left_done or right_column[j + 1][2] <= left_column[i + 1][2]):
+            yield left_column[i], right_column[j], right_column[j + 1]
             j += 1
         else:
-            yield here[i], there[j], here[i + 1]
+            yield left_column[i], right_column[j], left_column[i + 1]
             i += 1
 
 
 def _lids(
     outlines: Sequence[list[list[Point]]],
     standing: Sequence[tuple[Stand, ...]],
-    strips: dict[Edge, list[tuple[Point, int]]],
+    strips: Strips,
     ground: Sequence[int] | None,
 ) -> Shell:
-    """Roofs, and undersides of what does not stand on the ground."""
+    """Roofs, and undersides of the bodies that do not stand on the ground."""
     shapely = library("shapely", "scenes")
-    rings = [[_with_strips(ring, strips) for ring in of_cell] for of_cell in outlines]
+    rings = [[_with_strips(ring, strips) for ring in cell_rings] for cell_rings in outlines]
     polygons = np.array([shapely.Polygon(outer, holes) for outer, *holes in rings], dtype=object)
-    triangles, cell = flat_triangles(polygons)
+    triangles, cell = triangulate(polygons)
     first = np.searchsorted(cell, np.arange(len(polygons) + 1))
     corners, owner, kind = [np.zeros((0, 3, 3), dtype=np.int64)], [], []
     for index, stands in enumerate(standing):
         flat = triangles[first[index] : first[index + 1]]
-        faces = [
-            (high, building, ROOF)
-            for low, high, building in stands
-            if all(high != other[0] for other in stands)
+        # A body that touches the next one above or below it has no lid there.
+        bottoms, tops = {low for low, _, _ in stands}, {high for _, high, _ in stands}
+        lids = [(high, building, ROOF) for _, high, building in stands if high not in bottoms]
+        lids += [
+            (low, building, UNDERSIDE)
+            for low, _, building in stands
+            if low not in tops and (ground is None or low > ground[building])
         ]
-        for low, _, building in stands:
-            if all(low != other[1] for other in stands) and (ground is None or low > ground[building]):
-                faces.append((low, building, UNDERSIDE))
-        for height, building, face in faces:
+        for height, building, face in lids:
             lid = np.concatenate([flat, np.full((len(flat), 3, 1), height)], axis=2)
             corners.append(lid if face == ROOF else lid[:, ::-1])
             owner += [building] * len(flat)
@@ -248,12 +261,12 @@ def _lids(
     return Shell(np.concatenate(corners), np.array(owner, dtype=np.int64), np.array(kind, dtype=np.int64))
 
 
-def _with_strips(ring: Sequence[Point], strips: dict[Edge, list[tuple[Point, int]]]) -> list[Point]:
+def _with_strips(ring: Sequence[Point], strips: Strips) -> list[Point]:
     return [point for edge in _edges(ring) for point, _ in strips.get(edge, [(edge[0], WALL)])]
 
 
-def flat_triangles(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons over their own corners.
+def triangulate(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Triangulate polygons without new corners.
 
     Args:
         polygons: Polygons, holes allowed [n], [mm].

@@ -1,226 +1,227 @@
-"""Rooms: scenes made of floor plans, one upright sheet for every wall, door and window."""
+"""Floor plans: walls drawn as lines, with doors and windows, read into upright rectangles.
+
+Sionna RT models a wall as one sheet whose material has a thickness. A plan that draws both faces of a wall therefore
+contains every wall twice. `merge_faces` replaces two parallel lines of one type, a wall's thickness apart, by one sheet
+midway between them.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.materials import ITU_MATERIALS
-from calibray.scenes.authoring.building_parts import outside
-from calibray.scenes.authoring.extrusion import MILLIMETRE, Point, Stand, flat_triangles, upright
-from calibray.scenes.authoring.floor_plan_file import OPENINGS, Segment, merge_faces
-from calibray.scenes.authoring.scene_folder import Made, SurfaceMaterial, finish
-from calibray.scenes.authoring.wall_alignment import align
-from calibray.scenes.meshes import MeshObject, welded
-from calibray.support.extras import library
 from calibray.support.messages import did_you_mean
-from calibray.support.output_files import check_folder
+from calibray.support.output_files import exists
 
-TYPES: Final = {
-    "wall": SurfaceMaterial("wall", "plasterboard", 0.12),
-    "door": SurfaceMaterial("door", "wood", 0.04),
-    "window": SurfaceMaterial("window", "glass", 0.01),
-    "floor": SurfaceMaterial("floor", "concrete", 0.2),
-    "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
-}
-"""Types that are no materials of ITU-R P.2040's by themselves."""
+OPENINGS: Final = frozenset({"door", "window"})
+"""Types that replace the wall on which they are drawn."""
 
-WALL_THICKNESS: Final = 0.12  # [m], of a wall of a P.2040 material whose thickness nothing tells
-ROUNDING: Final = 2.0
-"""Distance from its line at which a corner may lie by rounding [mm]: where walls of a plan cross, they are cut."""
-_REACH: Final = 0.03  # [m], how far beyond the middle of a wall another's end may miss it
+SHORTEST: Final = 0.001  # length of a segment [m]
+_PARALLEL: Final = np.cos(np.radians(2.0))
+_ENDS: Final = ("x0", "y0", "x1", "y1")
 
 
-def make_plan_scene(
-    segments: Sequence[Segment],
-    folder: str | Path,
-    types: Mapping[str, SurfaceMaterial] | None = None,
-    floor: bool = True,
-    ceiling: bool = True,
-    merge: bool = True,
-    frame: Frame | None = None,
-) -> Made:
-    """Make a scene of a floor plan.
+@dataclass(frozen=True)
+class Segment:
+    """An upright rectangle over a line of a plan.
 
-    Walls that cross or meet share their corners, and ends that stop at another wall's face are led to its middle. A
-    door or window takes the place of the wall that it is drawn on, at the heights that it has; the wall goes on
-    above and below.
+    Attributes:
+        start: x and y of one end [m].
+        end: x and y of the other end [m].
+        kind: Its type, such as `brick` or `door`.
+        bottom: Height at which it begins [m].
+        top: Height at which it ends [m].
+        thickness: Its thickness [m]; None if unknown.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    kind: str
+    bottom: float
+    top: float
+    thickness: float | None = None
+
+    @property
+    def length(self) -> float:
+        """Its length [m]."""
+        return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
+
+    @property
+    def direction(self) -> NDArray[np.float64]:
+        """Unit vector from start to end [2]."""
+        step = np.subtract(self.end, self.start)
+        return step / np.hypot(*step)
+
+
+def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[Segment]:
+    """Read a floor plan.
 
     Args:
-        segments: Lines of the plan.
-        folder: Where to write `scene.xml`, `scene.json` and the meshes.
-        types: Materials by type, beside or in place of `TYPES`; a type that is a material of ITU-R P.2040's, such as
-            `brick`, becomes the material `brick_wall`. Several thicknesses of one type become several materials.
-        floor: Whether to make one: a sheet over all that walls enclose, at the lowest bottom.
-        ceiling: Whether to make one, at the highest top.
-        merge: Whether two parallel lines are made one wall (`merge_faces`).
-        frame: Where the scene lies on the globe, if that is known.
+        path: A CSV table with the columns x0, y0, x1, y1 and type, and optionally thickness, bottom and height.
+        height: Height of the top of segments without a height [m].
+        unit: The table's unit of length [m]: 0.001 for millimetres.
 
     Returns:
-        What was made.
+        The segments in the table's order.
 
     Raises:
-        InputError: A type has no material, there is no segment, or the folder cannot be written.
+        InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.
     """
-    folder = check_folder(folder)
-    if not segments:
-        raise InputError("the floor plan holds no segment; give at least one wall")
-    sheets, merged = merge_faces(segments) if merge else (list(segments), 0)
-    materials = _materials(sheets, {**TYPES, **(types or {})})
-    pieces = _pieces(_joined(sheets), [material.name for material in materials])
-    objects = _walls(pieces)
-    outline = _enclosed(pieces)
-    lids = [
-        (wanted, kind, height)
-        for wanted, kind, height in (
-            (floor, "floor", min(sheet.bottom for sheet in sheets)),
-            (ceiling, "ceiling", max(sheet.top for sheet in sheets)),
-        )
-        if wanted
-    ]
-    for _, kind, height in lids:
-        material = {**TYPES, **(types or {})}[kind]
-        materials.append(material)
-        objects.append(
-            MeshObject(f"all-{material.name}", material.name, welded(_lid(outline, height), MILLIMETRE))
-        )
-    counts = {
-        "lines": len(segments),
-        "sheets": len(sheets),
-        **({"lines merged as faces of one wall": merged} if merged else {}),
-    }
-    return finish(folder, objects, materials, frame, counts, {})
-
-
-def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:
-    """The material of every sheet; a type with several thicknesses has as many."""
-    known = {name for table in ITU_MATERIALS.values() for name in table}
-    found = []
-    for sheet in sheets:
-        if sheet.kind in types:
-            base = types[sheet.kind]
-        elif sheet.kind in known:
-            base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
-        else:
-            names = sorted({*types, *known})
+    if not exists(path):
+        raise InputError(f"floor plan {path}: is not a file; check the path")
+    try:
+        frame = pd.read_csv(path, skipinitialspace=True)
+    except OSError as error:
+        raise InputError(f"floor plan {path}: cannot be read ({error.strerror}); check the file") from None
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise InputError(f"floor plan {path}: is not a table ({error}); give a CSV file") from None
+    for column in (*_ENDS, "type"):
+        if column not in frame:
             raise InputError(
-                f"type {sheet.kind!r}: has no material, {did_you_mean(sheet.kind, names)} Or name its own"
+                f"floor plan {path}: no column {column!r}; {did_you_mean(column, map(str, frame))}"
             )
-        found.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
-    thicknesses: dict[str, set[float]] = defaultdict(set)
-    for material in found:
-        thicknesses[material.name].add(material.thickness)
-    return [
-        replace(material, name=f"{material.name}_{round(material.thickness * 1000)}mm")
-        if len(thicknesses[material.name]) > 1
-        else material
-        for material in found
-    ]
+    numbers = {name: _numbers(path, frame, name) * unit for name in (*_ENDS, "thickness", "bottom", "height")}
+    segments = []
+    for index, kind in enumerate(frame["type"]):
+        x0, y0, x1, y1, thickness, bottom, extent = (float(values[index]) for values in numbers.values())
+        row = f"floor plan {path}, row {index + 2}"
+        if not isinstance(kind, str) or not np.isfinite([x0, y0, x1, y1]).all():
+            raise InputError(f"{row}: lacks its type or a coordinate; complete or remove it")
+        bottom = 0.0 if np.isnan(bottom) else bottom
+        extent = height - bottom if np.isnan(extent) else extent
+        segment = Segment(
+            (x0, y0), (x1, y1), kind.strip().lower(), bottom, bottom + extent,
+            None if np.isnan(thickness) else thickness,
+        )  # fmt: skip
+        if segment.length < SHORTEST or extent <= 0 or thickness <= 0:
+            raise InputError(
+                f"{row}: its length, height and thickness must be greater than 0; correct or remove it"
+            )
+        segments.append(segment)
+    if not segments:
+        raise InputError(f"floor plan {path}: holds no segment; give at least one wall")
+    return segments
 
 
-def _joined(sheets: Sequence[Segment]) -> list[Segment]:
-    """Sheets whose ends are led to the middle of a wall that they stop at."""
-    joined = list(sheets)
-    for index, sheet in enumerate(joined):
-        start, end = np.array(sheet.start), np.array(sheet.end)
-        others = [other for other in joined if other is not sheet]
-        start, end = _led(start, start - end, others), _led(end, end - start, others)
-        joined[index] = replace(
-            sheet, start=(float(start[0]), float(start[1])), end=(float(end[0]), float(end[1]))
+def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.float64]:
+    """A column as numbers [n], NaN where it is empty or absent."""
+    if name not in frame:
+        return np.full(len(frame), np.nan)
+    values = pd.Series(pd.to_numeric(frame[name], errors="coerce")).to_numpy(dtype=np.float64)
+    if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:
+        raise InputError(
+            f"floor plan {path}, row {bad[0] + 2}: {name} = {frame[name].iloc[bad[0]]!r} is not a number; correct it"
         )
-    return joined
+    return values
 
 
-def _led(
-    end: NDArray[np.float64], outward: NDArray[np.float64], others: Sequence[Segment]
-) -> NDArray[np.float64]:
-    """An end of a sheet, moved along the sheet to the nearest wall within reach."""
-    outward = outward / np.hypot(*outward)
-    steps = []
-    for other in others:
-        along = np.subtract(other.end, other.start)
-        to_end = end - other.start
-        turn = outward[0] * along[1] - outward[1] * along[0]
-        reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
-        if abs(turn) < 0.1 * np.hypot(*along):
-            continue
-        step = (along[0] * to_end[1] - along[1] * to_end[0]) / turn
-        at = (end + step * outward - other.start) @ along / (along @ along)
-        beyond = reach / np.hypot(*along)
-        if abs(step) <= reach and -beyond <= at <= 1 + beyond:
-            steps.append(step)
-    return end + outward * min(steps, key=abs) if steps else end
+def merge_faces(segments: Sequence[Segment], thickest: float = 0.6) -> tuple[list[Segment], int]:
+    """Merge the two faces of each wall into one sheet.
+
+    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, lie next to each other at
+    the distance of a wall's thickness, and no line nearer to one of them could be its other face. The distance is at
+    most `thickest`, and within a fifth or 2 cm of the thickness if that is given. Where one long face has several
+    short ones opposite, as between the rooms along a corridor, each pair makes a sheet, and gaps between the sheets up
+    to `thickest` are closed. Ends lie midway between the faces' ends, so that corners meet.
+
+    Args:
+        segments: Lines of a plan.
+        thickest: Largest thickness of a wall [m].
+
+    Returns:
+        The sheets, as thick as the distance of their faces, followed by the lines without another face; and the number
+        of lines merged.
+    """
+    pairs = _face_pairs(segments, thickest)
+    merged = [_merge_pair(segments[one], segments[other], thickest) for one, other in pairs]
+    paired = {index for pair in pairs for index in pair}
+    single = [segment for index, segment in enumerate(segments) if index not in paired]
+    return [*_close_gaps(merged, thickest), *single], len(paired)
 
 
-Pieces = dict[tuple[Point, Point], list[tuple[int, int, str]]]
-"""What stands over every piece of a line between two crossings: bottom [mm], top [mm] and material."""
-
-
-def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
-    """The lines cut where they cross, and on each piece what stands, doors and windows before walls."""
-    shapely = library("shapely", "scenes")
-    lines = np.array([shapely.LineString([sheet.start, sheet.end]) for sheet in sheets], dtype=object)
-    noded = shapely.get_parts(shapely.union_all(lines, grid_size=MILLIMETRE))
-    middle = shapely.line_interpolate_point(noded, 0.5, normalized=True)
-    piece, sheet = shapely.STRtree(lines).query(middle, predicate="dwithin", distance=2 * MILLIMETRE)
-    over: dict[int, list[int]] = defaultdict(list)
-    for index, owner in zip(piece.tolist(), sheet.tolist(), strict=True):
-        over[index].append(owner)
-    pieces: Pieces = {}
-    for index, owners in over.items():
-        stands: list[Stand] = []
-        for owner in sorted(owners, key=lambda one: (sheets[one].kind not in OPENINGS, one)):
-            rest = [(_whole(sheets[owner].bottom), _whole(sheets[owner].top), owner)]
-            for low, high, _ in stands:
-                rest = [part for one in rest for part in outside(one, low, high)]
-            stands += rest
-        (x0, y0), (x1, y1) = shapely.get_coordinates(noded[index])[[0, -1]]
-        edge = (_whole(x0), _whole(y0)), (_whole(x1), _whole(y1))
-        pieces[edge] = [(low, high, materials[owner]) for low, high, owner in stands]
-    return pieces
-
-
-def _whole(length: float) -> int:
-    return round(length / MILLIMETRE)
-
-
-def _walls(pieces: Pieces) -> list[MeshObject]:
-    """One mesh a material; sheets that meet share their corners."""
-    levels: dict[Point, set[int]] = defaultdict(set)
-    for edge, stands in pieces.items():
-        for point in edge:
-            levels[point] |= {height for low, high, _ in stands for height in (low, high)}
-    triangles: dict[str, list[Any]] = defaultdict(list)
-    for (left, right), stands in pieces.items():
-        for low, high, material in stands:
-            triangles[material] += upright(
-                left, right, sorted(levels[left]), sorted(levels[right]), low, high
-            )
-    sheets = {name: np.array(corners, dtype=np.int64) for name, corners in sorted(triangles.items())}
-    place = align(np.concatenate(list(sheets.values())), ROUNDING).placed
+def _face_pairs(segments: Sequence[Segment], thickest: float) -> list[tuple[int, int]]:
+    """Pairs of lines that are the two faces of one wall."""
+    distances: dict[tuple[int, int], float] = {}
+    nearest = np.full(len(segments), np.inf)
+    for one, first in enumerate(segments):
+        for other, second in enumerate(segments[:one]):
+            distance = _face_distance(first, second, thickest)
+            if distance is not None:
+                distances[other, one] = distance
+                nearest[[one, other]] = np.minimum(nearest[[one, other]], distance)
+    # A wall has one other face, but that may be drawn in pieces at nearly the same distance.
     return [
-        MeshObject(f"all-{name}", name, welded(corners, MILLIMETRE, place))
-        for name, corners in sheets.items()
+        pair for pair, distance in sorted(distances.items()) if (distance <= nearest[list(pair)] + 0.01).all()
     ]
 
 
-def _enclosed(pieces: Pieces) -> Any:
-    """What the walls enclose, or, if they enclose nothing, the ground between them [mm]."""
-    shapely = library("shapely", "scenes")
-    lines = shapely.linestrings(np.array(list(pieces), dtype=float))
-    rooms = shapely.union_all(shapely.get_parts(shapely.polygonize(lines)))
-    return shapely.convex_hull(shapely.union_all(lines)) if shapely.is_empty(rooms) else rooms
+def _face_distance(one: Segment, other: Segment, thickest: float) -> float | None:
+    """Distance of two lines that may be faces of one wall [m]; None if they cannot be."""
+    if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
+        return None
+    if abs(one.direction @ other.direction) < _PARALLEL:
+        return None
+    along, across = _relative(one, other)
+    distance = abs(float(np.mean(across)))
+    low, high = sorted(along)
+    overlap = min(high, one.length) - max(low, 0.0)
+    if not 0.01 < distance <= thickest or overlap < 0.5 * min(one.length, other.length):
+        return None
+    for stated in (one.thickness, other.thickness):
+        if stated is not None and abs(distance - stated) > max(0.2 * stated, 0.02):
+            return None
+    return distance
 
 
-def _lid(outline: Any, height: float) -> NDArray[np.int64]:
-    """A level sheet over an outline, seen from above counter-clockwise [F, 3, 3], [mm]."""
-    flat, _ = flat_triangles(library("shapely", "scenes").get_parts(outline))
-    return np.concatenate([flat, np.full((len(flat), 3, 1), _whole(height))], axis=2)
+def _relative(one: Segment, other: Segment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The ends of a segment along and across another one, from that one's start [2], [m]."""
+    direction = one.direction
+    offset = np.array([other.start, other.end]) - np.array(one.start)
+    return offset @ direction, offset @ [-direction[1], direction[0]]
+
+
+def _merge_pair(one: Segment, other: Segment, thickest: float) -> Segment:
+    """The sheet between two faces: over their overlap, its ends midway where both faces end near each other."""
+    along, across = _relative(one, other)
+    low, high = sorted(along)
+    start = low / 2 if abs(low) <= thickest else max(low, 0.0)
+    end = (high + one.length) / 2 if abs(high - one.length) <= thickest else min(high, one.length)
+    distance = float(np.mean(across))
+    direction = one.direction
+    base = np.array(one.start) + np.array([-direction[1], direction[0]]) * distance / 2
+    ends = [tuple((base + direction * position).tolist()) for position in (start, end)]
+    # A pane is thinner than the wall around it.
+    thickness = one.thickness if one.kind in OPENINGS else round(abs(distance), 3)
+    return replace(one, start=ends[0], end=ends[1], thickness=thickness)
+
+
+def _close_gaps(sheets: Sequence[Segment], longest: float) -> list[Segment]:
+    """Join sheets of one wall that only a crossing wall separates."""
+    joined: list[Segment] = []
+    for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
+        for index, before in enumerate(joined):
+            if (sheet.kind, sheet.bottom, sheet.top) != (before.kind, before.bottom, before.top):
+                continue
+            along, across = _relative(before, sheet)
+            if (
+                np.abs(across).max() < 0.02
+                and along.min() <= before.length + longest
+                and along.max() >= -longest
+            ):
+                reach = min(0.0, along.min()), max(before.length, along.max())
+                ends = [
+                    tuple((np.array(before.start) + before.direction * distance).tolist())
+                    for distance in reach
+                ]
+                joined[index] = replace(before, start=ends[0], end=ends[1])
+                break
+        else:
+            joined.append(sheet)
+    return joined

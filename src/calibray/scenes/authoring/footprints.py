@@ -1,10 +1,10 @@
-"""Footprints: the outlines of buildings in a scene's frame, with the heights between which they stand."""
+"""Footprints: the outlines of buildings in the scene's frame, with the heights between which the buildings stand."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -16,19 +16,13 @@ from calibray.errors import InputError
 from calibray.support.extras import library
 
 GRID: Final = 0.01
-"""The grid that the corners of buildings are moved to [m]."""
+"""Grid to which the corners of buildings are rounded [m]."""
 
 HeightSource = Literal["height", "levels", "default"]
 
-_UNITS: Final = {
-    "": 1.0,
-    "m": 1.0,
-    "metre": 1.0,
-    "meter": 1.0,
-    "metres": 1.0,
-    "meters": 1.0,
-    "ft": 0.3048,
-    "'": 0.3048,
+_METRES: Final = {
+    **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("ft", "'"), 0.3048),
 }
 _LENGTH: Final = re.compile(r"\s*(-?\d+(?:[.,]\d+)?)\s*([a-z]*|')\s*", re.IGNORECASE)
 _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
@@ -36,35 +30,35 @@ _FEET_AND_INCHES: Final = re.compile(r"\s*(\d+)'\s*(\d+(?:\.\d+)?)\"\s*")
 
 @dataclass(frozen=True)
 class HeightRule:
-    """How high a building is whose height is not given.
+    """How to guess the height of a building whose height is not given.
 
     Attributes:
-        level: Height of one storey [m].
-        default: Height where not even the storeys are given [m].
+        storey: Height of one storey [m].
+        default: Height of a building whose number of storeys is not given either [m].
 
     Raises:
-        InputError: One is not a finite number greater than 0.
+        InputError: A height is not a finite number greater than 0.
     """
 
-    level: float = 3.0
+    storey: float = 3.0
     default: float = 9.0
 
     def __post_init__(self) -> None:
-        for name in ("level", "default"):
+        for name in ("storey", "default"):
             if not (np.isfinite(value := getattr(self, name)) and value > 0):
                 raise InputError(f"{name} = {value!r}: must be a finite number of metres greater than 0")
 
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
-        """Where a building begins and ends above the ground, from OpenStreetMap's tags.
+        """Find the bottom and top of a building from OpenStreetMap tags.
 
-        `height` and `min_height` count first, then `building:levels` and `building:min_level` times `level`, then
-        `default`. Both heights are from the ground, the roof's shape is left aside: the roof is flat at `height`.
+        `height` and `min_height` have priority, then `building:levels` and `building:min_level` times `storey`, then
+        `default`. All heights are above the ground. Roof shapes are ignored: the roof is flat at `height`.
 
         Args:
             tags: The building's tags.
 
         Returns:
-            Bottom [m], top [m], and what the top comes from. A top that is not above its bottom is not believed.
+            Bottom [m], top [m], and the source of the top. A stated top that is not above the bottom is ignored.
 
         Example:
             >>> HeightRule().heights({"building": "yes", "building:levels": "4"})
@@ -73,23 +67,23 @@ class HeightRule:
             (2.5, 12.192, 'height')
         """
         low, floor = parse_length(tags.get("min_height")), parse_length(tags.get("building:min_level"))
-        bottom = max(low if low is not None else (floor or 0.0) * self.level, 0.0)
+        bottom = max(low if low is not None else (floor or 0.0) * self.storey, 0.0)
         height, levels = parse_length(tags.get("height")), parse_length(tags.get("building:levels"))
         if height is not None and height > bottom:
             return bottom, height, "height"
-        if levels is not None and levels * self.level > bottom:
-            return bottom, levels * self.level, "levels"
+        if levels is not None and levels * self.storey > bottom:
+            return bottom, levels * self.storey, "levels"
         return bottom, bottom + self.default, "default"
 
 
 def parse_length(text: str | None) -> float | None:
-    r"""A length as people write it on maps.
+    r"""Parse a length as written on maps.
 
     Args:
-        text: A number, with a unit or without: `12`, `12.5 m`, `40 ft`, `40'6"`.
+        text: A number with or without a unit: `12`, `12.5 m`, `40 ft`, `40'6"`.
 
     Returns:
-        The length [m]; None if there is none, or it cannot be read.
+        The length [m]; None if there is none or it cannot be read.
 
     Example:
         >>> parse_length("12,5 m"), parse_length("10'6\""), parse_length("tall")
@@ -97,26 +91,26 @@ def parse_length(text: str | None) -> float | None:
     """
     if text is None:
         return None
-    if found := _FEET_AND_INCHES.fullmatch(text):
-        return round((float(found[1]) + float(found[2]) / 12) * 0.3048, 6)
-    found = _LENGTH.fullmatch(text)
-    if found is None or found[2].lower() not in _UNITS:
+    if feet := _FEET_AND_INCHES.fullmatch(text):
+        return round((float(feet[1]) + float(feet[2]) / 12) * 0.3048, 6)
+    length = _LENGTH.fullmatch(text)
+    if length is None or length[2].lower() not in _METRES:
         return None
-    return round(float(found[1].replace(",", ".")) * _UNITS[found[2].lower()], 6)
+    return round(float(length[1].replace(",", ".")) * _METRES[length[2].lower()], 6)
 
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Outlines of buildings.
+    """Outlines and heights of buildings.
 
     Attributes:
-        polygon: Outline of every building, a shapely Polygon or MultiPolygon in the scene's frame [n], [m].
-        bottom: Where it begins above the ground [n], [m].
-        top: Where it ends above the ground [n], [m].
-        name: What it is called [n].
-        height_from: What its top comes from [n].
-        part: Whether it is a part of a building, which then tells more than the building's outline [n].
-        repairs: How many outlines were changed or left out, by what was the matter.
+        polygon: Outline of each building, a shapely Polygon or MultiPolygon in the scene's frame [n], [m].
+        bottom: Height above the ground at which it begins [n], [m].
+        top: Height above the ground at which it ends [n], [m].
+        name: Its name [n].
+        height_from: Source of its top [n].
+        part: Whether it is a part of a building, which takes precedence over the building's outline [n].
+        repairs: Number of outlines that were changed or left out, by reason.
     """
 
     polygon: NDArray[Any]
@@ -136,7 +130,7 @@ class Footprints:
         return library("shapely", "scenes").total_bounds(self.polygon)
 
     def guessed(self) -> dict[HeightSource, list[str]]:
-        """The buildings whose height is a guess, by what it was guessed from."""
+        """Names of the buildings whose height is a guess, by the source of the guess."""
         guesses: dict[HeightSource, list[str]] = {"levels": [], "default": []}
         for name, source in zip(self.name, self.height_from, strict=True):
             if source != "height":
@@ -144,23 +138,23 @@ class Footprints:
         return guesses
 
 
-def cleaned(raw: Footprints, grid: float = GRID, smallest: float = 1.0) -> Footprints:
-    """Footprints with outlines that can be built on: on a grid, without crossings, not too small.
+def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0) -> Footprints:
+    """Repair outlines so that buildings can be raised on them: on a grid, without self-crossings, not too small.
 
     Args:
-        raw: Footprints with outlines as they were found.
-        grid: Corners are moved to multiples of this [m].
-        smallest: Outlines of less area [m^2] are left out.
+        raw: Footprints as read from a map.
+        grid: Corners are rounded to multiples of this [m].
+        smallest: Outlines of less area are left out [m^2].
 
     Returns:
-        The footprints, every name once; what was repaired is counted.
+        The footprints, with unique names; repairs are counted.
     """
     shapely = library("shapely", "scenes")
     valid = shapely.is_valid(raw.polygon)
-    whole = raw.polygon.copy()
-    whole[~valid] = shapely.make_valid(whole[~valid], method="structure", keep_collapsed=False)
-    snapped = shapely.set_precision(whole, grid)
-    large = shapely.area(snapped) >= smallest
+    polygons = raw.polygon.copy()
+    polygons[~valid] = shapely.make_valid(polygons[~valid], method="structure", keep_collapsed=False)
+    polygons = shapely.set_precision(polygons, grid)
+    large = shapely.area(polygons) >= smallest
     repairs = {
         **raw.repairs,
         "crossing or touching themselves, repaired": int((~valid & large).sum()),
@@ -168,21 +162,21 @@ def cleaned(raw: Footprints, grid: float = GRID, smallest: float = 1.0) -> Footp
     }
     keep = np.flatnonzero(large)
     return Footprints(
-        polygon=snapped[keep],
+        polygon=polygons[keep],
         bottom=raw.bottom[keep],
         top=raw.top[keep],
-        name=tuple(unique_names([raw.name[index] for index in keep])),
+        name=tuple(make_unique([raw.name[index] for index in keep])),
         height_from=tuple(raw.height_from[index] for index in keep),
         part=raw.part[keep],
-        repairs={what: count for what, count in repairs.items() if count},
+        repairs={reason: count for reason, count in repairs.items() if count},
     )
 
 
-def in_frame(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
-    """Outlines in a scene's frame.
+def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
+    """Project outlines to the scene's frame.
 
     Args:
-        polygons: Outlines in some reference system [n]; their heights are left aside.
+        polygons: Outlines in a reference system [n]; their heights are ignored.
         frame: The scene's frame.
         crs: The reference system.
 
@@ -190,7 +184,7 @@ def in_frame(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
         Outlines [n], [m].
 
     Raises:
-        InputError: A corner lies where the frame's projection cannot be used.
+        InputError: A corner lies outside the area of the frame's projection.
     """
     shapely = library("shapely", "scenes")
     return shapely.transform(
@@ -198,28 +192,26 @@ def in_frame(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
     )
 
 
-def unique_names(names: list[str]) -> list[str]:
-    """Names that can be those of files and objects: letters, digits, `_`, `-`; every one once.
+def make_unique(names: Sequence[str]) -> list[str]:
+    """Make names usable for files and objects: letters, digits, `_` and `-` only, and no two alike.
 
     Args:
-        names: Names as they were found.
+        names: The original names.
 
     Returns:
-        As many names, in their order.
+        One name for each, in the same order.
 
     Example:
-        >>> unique_names(["Town hall", "Town/hall", '"><x'])
+        >>> make_unique(["Town hall", "Town/hall", '"><x'])
         ['Town_hall', 'Town_hall-2', '_x']
     """
-    seen: Counter[str] = Counter()
-    taken: set[str] = set()
-    found = []
+    repeats: Counter[str] = Counter()
+    unique: dict[str, None] = {}
     for name in names:
         plain = re.sub(r"[^0-9A-Za-z_-]+", "_", name)[:80] or "_"
-        own = plain
-        while own in taken:
-            seen[plain] += 1
-            own = f"{plain}-{seen[plain] + 1}"
-        taken.add(own)
-        found.append(own)
-    return found
+        candidate = plain
+        while candidate in unique:
+            repeats[plain] += 1
+            candidate = f"{plain}-{repeats[plain] + 1}"
+        unique[candidate] = None
+    return list(unique)

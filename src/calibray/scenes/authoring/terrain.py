@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,18 +16,19 @@ from calibray.errors import InputError
 from calibray.scenes.meshes import Mesh
 from calibray.support.extras import library
 
-MOST_POINTS = 4_000_000
+MAX_POINTS: Final = 4_000_000
+"""Largest number of points of a ground sheet, which bounds memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights of the ground over a grid; every cell is two triangles, parted from south-west to north-east.
+    """Heights of the ground over a grid; each cell is two triangles, divided from south-west to north-east.
 
     Attributes:
         x: Eastings of the grid, ascending [nx], [m].
         y: Northings, ascending [ny], [m].
         z: Heights [ny, nx], [m].
-        repairs: How many heights were filled in, by what was the matter.
+        repairs: Number of heights that were filled in, by reason.
     """
 
     x: NDArray[np.float64]
@@ -35,11 +37,11 @@ class Terrain:
     repairs: dict[str, int] = field(default_factory=dict)
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Heights of the triangles' surface.
+        """Interpolate heights on the triangles.
 
         Args:
             x: Eastings [n], [m].
-            y: Northings [n], [m]; beyond the grid its border goes on.
+            y: Northings [n], [m]; outside the grid the height at its border is taken.
 
         Returns:
             Heights [n], [m].
@@ -50,26 +52,26 @@ class Terrain:
         row = np.clip(np.searchsorted(self.y, y, side="right") - 1, 0, len(self.y) - 2)
         u = (x - self.x[column]) / (self.x[column + 1] - self.x[column])
         v = (y - self.y[row]) / (self.y[row + 1] - self.y[row])
-        here, across = self.z[row, column], self.z[row + 1, column + 1]
-        east, north = self.z[row, column + 1], self.z[row + 1, column]
-        below = here + u * (east - here) + v * (across - east)
-        above = here + v * (north - here) + u * (across - north)
-        return np.where(u >= v, below, above)
+        southwest, southeast = self.z[row, column], self.z[row, column + 1]
+        northwest, northeast = self.z[row + 1, column], self.z[row + 1, column + 1]
+        lower = southwest + u * (southeast - southwest) + v * (northeast - southeast)
+        upper = southwest + v * (northwest - southwest) + u * (northeast - northwest)
+        return np.where(u >= v, lower, upper)
 
     def mesh(self) -> Mesh:
-        """The ground as triangles, seen from above counter-clockwise."""
+        """The ground as triangles, counter-clockwise seen from above."""
         east, north = np.meshgrid(self.x, self.y)
         columns, rows = len(self.x), len(self.y)
-        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-        across = corner + columns + 1
-        faces = np.stack([[corner, corner + 1, across], [corner, across, corner + columns]]).transpose(
-            2, 0, 1
-        )
-        return Mesh(np.column_stack([east.ravel(), north.ravel(), self.z.ravel()]), faces.reshape(-1, 3))
+        southwest = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        northeast = southwest + columns + 1
+        lower = np.column_stack([southwest, southwest + 1, northeast])
+        upper = np.column_stack([southwest, northeast, southwest + columns])
+        faces = np.stack([lower, upper], axis=1).reshape(-1, 3)
+        return Mesh(np.column_stack([east.ravel(), north.ravel(), self.z.ravel()]), faces)
 
 
-def level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
-    """A level rectangle.
+def make_level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
+    """Make a level rectangle.
 
     Args:
         bounds: West, south, east and north [4], [m].
@@ -82,15 +84,15 @@ def level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
     return Terrain(np.array([west, east]), np.array([south, north]), np.full((2, 2), float(height)))
 
 
-def lowered(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:
-    """Move the frame's origin down or up so that the lowest ground is less than a metre above z = 0.
+def lower_origin(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:
+    """Move the frame's origin vertically so that the lowest ground is less than a metre above z = 0.
 
     Args:
         terrain: The ground.
         frame: The scene's frame.
 
     Returns:
-        The same ground, and the frame that it is in now.
+        The same ground in the new frame, and the new frame.
     """
     lowest = float(np.floor(terrain.z.min()))
     return replace(terrain, z=terrain.z - lowest), replace(frame, height=frame.height + lowest)
@@ -100,23 +102,26 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     """Read the ground from a height model.
 
     Args:
-        path: A GeoTIFF, or another raster with a reference system that GDAL reads; heights in metres.
+        path: A GeoTIFF, or another raster that GDAL reads and that states its reference system; heights in metres.
         frame: The scene's frame.
-        bounds: What the ground has to cover: west, south, east and north [4], [m], in the frame.
-        spacing: Width of the grid's cells [m]; that of the model if none is given.
+        bounds: The area to cover in the frame: west, south, east and north [4], [m].
+        spacing: Width of the grid's cells [m]; by default that of the model, but at least 1 m.
 
     Returns:
-        The terrain, interpolated linearly between the middles of the model's cells. Where the model has no height,
-        as on water, the nearest one is taken and counted.
+        The terrain, interpolated linearly between the centres of the model's cells. Where the model has no height, as
+        on water, the nearest height is taken and counted.
 
     Raises:
-        InputError: The file does not exist, cannot be read, has no reference system, does not cover the bounds, has
-            no height in them, or the grid would be too fine.
+        InputError: The file does not exist, cannot be read, states no reference system, does not cover the bounds or
+            has no height in them, or the grid would be too fine.
     """
     path = Path(path)
     rasterio = library("rasterio", "scenes")
     if not path.is_file():
         raise InputError(f"height model {path}: does not exist; check the path")
+    west, south, east, north = np.asarray(bounds, dtype=float)
+    share = np.linspace(0, 1, 21)
+    sample_x, sample_y = np.meshgrid(west + (east - west) * share, south + (north - south) * share)
     try:
         with rasterio.open(path) as model:
             if model.crs is None:
@@ -124,10 +129,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
                     f"height model {path}: has no reference system; give a GeoTIFF that states it"
                 )
             crs, affine = model.crs.to_wkt(), model.transform
-            west, south, east, north = np.asarray(bounds, dtype=float)
-            along = np.linspace(0, 1, 21)
-            rim_x, rim_y = np.meshgrid(west + (east - west) * along, south + (north - south) * along)
-            column, row = _pixels(rim_x, rim_y, frame, crs, affine)
+            column, row = _pixels(sample_x, sample_y, frame, crs, affine)
             # One cell more on each side, for the interpolation.
             first = np.floor([row.min() - 1, column.min() - 1]).astype(int)
             last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
@@ -137,41 +139,40 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
                 or column.max() > model.width - 1
                 or row.max() > model.height - 1
             ):
+                centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
                 raise InputError(
                     f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
-                    f"around {frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2].round(5).tolist()}; "
-                    "give a larger one, or lower the margin"
+                    f"around {centre.round(5).tolist()}; give a larger one, or lower the margin"
                 )
             first, last = np.maximum(first, 0), np.minimum(last, [model.height - 1, model.width - 1])
             window = rasterio.windows.Window.from_slices((first[0], last[0] + 1), (first[1], last[1] + 1))
             heights = model.read(1, window=window, masked=True).astype(float)
     except rasterio.errors.RasterioIOError as error:
         raise InputError(f"height model {path}: cannot be read ({error}); give a GeoTIFF") from None
-    filled, repairs = _filled(path, heights)
+    filled, repairs = _fill(path, heights)
     if spacing is None:
-        spacing = max(float(np.ptp(rim_x) / np.ptp(column)), 1.0)
+        spacing = max(float(np.ptp(sample_x) / np.ptp(column)), 1.0)
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"spacing = {spacing!r}: must be a finite number of metres greater than 0")
     columns, rows = (max(2, int(np.ceil(length / spacing)) + 1) for length in (east - west, north - south))
-    if columns * rows > MOST_POINTS:
+    if columns * rows > MAX_POINTS:
         raise InputError(
-            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MOST_POINTS}; "
+            f"spacing = {spacing:g} m: makes {columns * rows} points of ground, more than {MAX_POINTS}; "
             "give a wider one"
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
-    grid_x, grid_y = np.meshgrid(x, y)
-    column, row = _pixels(grid_x, grid_y, frame, crs, affine)
+    column, row = _pixels(*np.meshgrid(x, y), frame, crs, affine)
     axes = tuple(np.arange(low, high + 1, dtype=float) for low, high in zip(first, last, strict=True))
-    at = np.stack(
+    points = np.stack(
         [np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1
     )
-    return Terrain(x, y, RegularGridInterpolator(axes, filled)(at) - frame.height, repairs)
+    return Terrain(x, y, RegularGridInterpolator(axes, filled)(points) - frame.height, repairs)
 
 
 def _pixels(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, crs: str, affine: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Column and row of a raster, whole numbers in the middles of its cells."""
+    """Column and row of a raster at positions in the frame; integers at the centres of cells."""
     east, north = transformer(frame.crs, crs).transform(x + frame.easting, y + frame.northing)
     inverse = ~affine  # type: ignore[operator]
     column = inverse.a * east + inverse.b * north + inverse.c
@@ -179,14 +180,13 @@ def _pixels(
     return column - 0.5, row - 0.5
 
 
-def _filled(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], dict[str, int]]:
-    """Heights without gaps: each has that of the nearest cell with one."""
-    missing = np.ma.getmaskarray(heights) | ~np.isfinite(heights.filled(np.nan))
+def _fill(path: Path, heights: np.ma.MaskedArray) -> tuple[NDArray[np.float64], dict[str, int]]:
+    """Fill gaps with the height of the nearest cell that has one, and count them."""
+    values = heights.filled(np.nan)
+    missing = np.ma.getmaskarray(heights) | ~np.isfinite(values)
     if missing.all():
         raise InputError(f"height model {path}: has no height within the scene; give one that covers it")
     if not missing.any():
-        return heights.filled(np.nan), {}
+        return values, {}
     nearest = np.asarray(distance_transform_edt(missing, return_distances=False, return_indices=True))
-    return heights.filled(np.nan)[tuple(nearest)], {
-        "heights missing, taken from the nearest": int(missing.sum())
-    }
+    return values[tuple(nearest)], {"heights missing, taken from the nearest": int(missing.sum())}

@@ -1,1 +1,20 @@
-"""Checks of scenes: meshes, positions and what a ray tracer would stumble over."""
+"""Checks of scenes: faults of their files and meshes, and positions that do not fit them."""
+
+from calibray.scenes.checks.positions import (
+    SceneSurfaces,
+    building_outlines,
+    count_crossings,
+    move_outside,
+)
+from calibray.scenes.checks.scene_check import Finding, MeshFaults, SceneCheck, check_scene
+
+__all__ = [
+    "Finding",
+    "MeshFaults",
+    "SceneCheck",
+    "SceneSurfaces",
+    "building_outlines",
+    "check_scene",
+    "count_crossings",
+    "move_outside",
+]

@@ -1,4 +1,4 @@
-"""Diagnosis: what is wrong with a scene before an hour of tracing shows it."""
+"""Faults of a scene, found before an hour of tracing shows them: materials, names, units and meshes."""
 
 from __future__ import annotations
 
@@ -9,52 +9,85 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from calibray.errors import InputError
-from calibray.materials import ITU_MATERIALS
-from calibray.scenes.checks.mesh_check import ObjectHealth, health
-from calibray.scenes.meshes import Mesh
+from calibray.scenes.meshes import MeshObject
+from calibray.scenes.scene import ITU_NAMES
 from calibray.scenes.scene_file import find_scene
-from calibray.support.extras import library
+from calibray.scenes.triangles import read_meshes
 from calibray.support.progress import Progress
 
 Severity = Literal["error", "warning", "note"]
 
 LARGEST: Final = 50_000.0
-"""An extent [m] beyond which a scene is hardly in metres about a local origin."""
+"""Extent above which a scene is hardly in metres about a local origin [m]."""
+
+_SAME: Final = 0.001  # corners closer than this count as one position [m]
+_FLAT: Final = 1e-10  # a face of less area counts as empty [m^2]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a scene suffers from.
+    """One fault of a scene or of positions in it.
 
     Attributes:
         severity: "error" if Sionna RT or Calibray will refuse the scene, "warning" if results suffer, else "note".
-        place: The object or the material that it is about; the scene itself if empty.
-        problem: What is wrong.
+        subject: The object, material or file concerned; empty for the scene itself.
+        problem: The fault.
         remedy: What to do about it.
     """
 
     severity: Severity
-    place: str
+    subject: str
     problem: str
     remedy: str
 
 
 @dataclass(frozen=True)
-class SceneDiagnosis:
-    """What a scene is like.
+class MeshFaults:
+    """Size and faults of one mesh of a scene.
 
     Attributes:
-        source: What was examined.
+        name: Name of the object.
+        material: Name of its material.
+        vertices: Number of vertices.
+        faces: Number of triangles.
+        open_edges: Edges with a face on one side only, even if corners at one position count as one.
+        unwelded_edges: Edges at which two faces meet without sharing vertices, so that no wedge is found.
+        crowded_edges: Edges that more than two faces share, so that no wedge is found.
+        flipped_faces: Faces whose normal points inward, or against the normals of their neighbours.
+        empty_faces: Faces without area.
+        repeated_faces: Faces with the same corners as another one.
+    """
+
+    name: str
+    material: str
+    vertices: int
+    faces: int
+    open_edges: int
+    unwelded_edges: int
+    crowded_edges: int
+    flipped_faces: int
+    empty_faces: int
+    repeated_faces: int
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """The result of checking a scene.
+
+    Attributes:
+        source: The scene that was checked.
         bounds: West, south, bottom, east, north and top [6], in the scene's unit.
-        objects: Its meshes, counted.
-        findings: What is wrong, the worst first.
+        objects: Its meshes and their faults.
+        findings: The faults, worst first.
     """
 
     source: str
     bounds: tuple[float, ...]
-    objects: tuple[ObjectHealth, ...]
+    objects: tuple[MeshFaults, ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -63,87 +96,38 @@ class SceneDiagnosis:
         return sum(item.faces for item in self.objects)
 
 
-def diagnose(source: str | Path, progress: Progress | None = None) -> SceneDiagnosis:
-    """Examine a scene.
+def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCheck:
+    """Find the faults of a scene.
 
     Args:
         source: Path of a Mitsuba XML file, or `sionna:NAME`.
         progress: Called with ("examining", meshes done, meshes in all).
 
     Returns:
-        What it is like.
+        Size, meshes and faults.
 
     Raises:
-        InputError: It does not exist, is no scene, or a mesh of it is missing or cannot be read.
+        InputError: The scene does not exist or is not a Mitsuba scene, or a mesh is missing or cannot be read.
     """
-    path, root = find_scene(source)
-    examined: list[ObjectHealth] = []
+    _, root = find_scene(source)
+    checked: list[MeshFaults] = []
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for name, material, mesh in read_meshes(path, root):
-        examined.append(health(name, material, mesh))
-        low, high = np.minimum(low, mesh.vertices.min(axis=0)), np.maximum(high, mesh.vertices.max(axis=0))
+    for item in read_meshes(source):
+        checked.append(count_faults(item))
+        low = np.minimum(low, item.mesh.vertices.min(axis=0))
+        high = np.maximum(high, item.mesh.vertices.max(axis=0))
         if progress is not None:
-            progress("examining", len(examined), len(root.findall("shape")))
-    objects, bounds = tuple(examined), (*low.tolist(), *high.tolist())
-    findings = [*_material_findings(root, objects), *_scale_findings(bounds)]
-    for item in objects:
-        findings += _object_findings(item)
+            progress("examining", len(checked), len(root.findall("shape")))
+    findings = [*_material_findings(root, checked), *_scale_findings(low, high)]
+    for item in checked:
+        findings += _mesh_findings(item)
     order = ("error", "warning", "note")
-    return SceneDiagnosis(
-        str(source), bounds, objects, tuple(sorted(findings, key=lambda one: order.index(one.severity)))
-    )
+    findings.sort(key=lambda finding: order.index(finding.severity))
+    return SceneCheck(str(source), (*low.tolist(), *high.tolist()), tuple(checked), tuple(findings))
 
 
-def read_meshes(path: Path, root: ElementTree.Element) -> Iterator[tuple[str, str, Mesh]]:
-    """Read the meshes of a scene, PLY and OBJ files, one after the other.
-
-    Args:
-        path: Its XML file.
-        root: The element `scene`.
-
-    Yields:
-        Object, material and mesh, turned over where the file says so; shapes without a file are passed by.
-
-    Raises:
-        InputError: A mesh is missing or cannot be read, or there is none.
-    """
-    trimesh = library("trimesh", "scenes")
-    found = 0
-    for shape in root.findall("shape"):
-        name = (shape.get("id") or "?").removeprefix("mesh-")
-        filename = shape.find("string[@name='filename']")
-        if filename is None:
-            continue
-        file = path.parent / filename.get("value", "")
-        if not file.is_file():
-            raise InputError(
-                f"{path}: mesh {file} of {name!r} does not exist; copy the meshes folder beside the scene"
-            )
-        try:
-            loaded = trimesh.load_mesh(file, process=False, maintain_order=True)
-            mesh = Mesh(np.asarray(loaded.vertices, dtype=float), np.asarray(loaded.faces, dtype=np.int64))
-        except Exception as error:  # whatever trimesh's readers raise on a broken file
-            raise InputError(
-                f"{path}: mesh {file} of {name!r} cannot be read ({error}); export it again"
-            ) from None
-        if not len(mesh.faces):
-            raise InputError(
-                f"{path}: mesh {file} of {name!r} has no face; remove the object, or export it again"
-            )
-        reference = shape.find("ref")
-        nested = shape.find("bsdf")
-        material = next((part.get("id", "") for part in (reference, nested) if part is not None), "")
-        turned = shape.find("boolean[@name='flip_normals']")
-        if turned is not None and turned.get("value") == "true":
-            mesh = Mesh(mesh.vertices, mesh.faces[:, ::-1])
-        found += 1
-        yield name, material.removeprefix("mat-"), mesh
-    if not found:
-        raise InputError(f"{path}: the scene has no mesh; export the scene with its meshes")
-
-
-def _object_findings(item: ObjectHealth) -> list[Finding]:
-    share = f"of {item.faces} faces" if item.faces else ""
+def _mesh_findings(item: MeshFaults) -> list[Finding]:
+    share = f"of {item.faces} faces"
     faults: Sequence[tuple[int, Severity, str, str]] = (
         (
             item.unwelded_edges,
@@ -155,19 +139,19 @@ def _object_findings(item: ObjectHealth) -> list[Finding]:
             item.crowded_edges,
             "note",
             "edges that more than two faces share: no diffraction there",
-            "remove inner walls, or part the bodies that touch",
+            "remove inner walls, or separate bodies that touch",
         ),
         (
             item.flipped_faces,
             "note",
-            f"{share} with the normal turned inward or against their neighbours'; Sionna RT copes, others do not",
+            f"{share} with the normal inward or against their neighbours'; Sionna RT accepts this, others may not",
             "recalculate normals outside (Blender: Shift-N)",
         ),
         (item.empty_faces, "warning", f"{share} without area", "dissolve degenerate faces, and export again"),
         (
             item.repeated_faces,
             "warning",
-            f"{share} that lie on another one: waves pass the wall twice",
+            f"{share} that coincide with another one: waves pass through the wall twice",
             "remove the copies",
         ),
     )
@@ -178,92 +162,152 @@ def _object_findings(item: ObjectHealth) -> list[Finding]:
     ]
 
 
-def _material_findings(root: ElementTree.Element, objects: Sequence[ObjectHealth]) -> list[Finding]:
-    known = {name for table in ITU_MATERIALS.values() for name in table}
-    findings = []
+def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults]) -> Iterator[Finding]:
+    defined = set()
     for bsdf in [*root.findall("bsdf"), *root.findall("shape/bsdf")]:
-        identifier = bsdf.get("id") or bsdf.get("name")
+        identifier = bsdf.get("id") or bsdf.get("name") or ""
+        name = identifier.removeprefix("mat-")
+        defined.add(name)
         if not identifier:
-            findings.append(
-                Finding(
-                    "error", "", f"a BSDF of type {bsdf.get('type')!r} has no id", "give it one: mat-NAME"
-                )
-            )
-        elif bsdf.get("type") != "itu-radio-material" and identifier.removeprefix("mat-") in known:
-            findings.append(
-                Finding(
-                    "error",
-                    identifier,
-                    "has a name of ITU-R P.2040's, which Sionna RT refuses",
-                    f"name it mat-itu_{identifier.removeprefix('mat-')} for ITU's constants, or otherwise",
-                )
-            )
-    defined = {
-        (bsdf.get("id") or bsdf.get("name") or "").removeprefix("mat-")
-        for bsdf in [*root.findall("bsdf"), *root.findall("shape/bsdf")]
-    }
+            problem = f"a BSDF of type {bsdf.get('type')!r} has no id"
+            yield Finding("error", "", problem, "give it the id mat-NAME")
+        elif bsdf.get("type") != "itu-radio-material" and name in ITU_NAMES:
+            remedy = f"name it mat-itu_{name} for ITU's constants, or choose another name"
+            yield Finding("error", identifier, "has a name of ITU-R P.2040, which Sionna RT refuses", remedy)
     for item in objects:
         if item.material not in defined:
-            findings.append(
-                Finding(
-                    "error",
-                    item.name,
-                    f"refers to no material of the scene ({item.material!r})",
-                    "give it one",
-                )
-            )
+            problem = f"refers to no material of the scene ({item.material!r})"
+            yield Finding("error", item.name, problem, "give it a material")
         if item.name in defined:
-            findings.append(
-                Finding(
-                    "error",
-                    item.name,
-                    "is called like a material, which Sionna RT refuses",
-                    "rename the object",
-                )
-            )
-    return findings
+            problem = "has the name of a material, which Sionna RT refuses"
+            yield Finding("error", item.name, problem, "rename the object")
 
 
-def _scale_findings(bounds: Sequence[float]) -> list[Finding]:
-    low, high = np.array(bounds[:3]), np.array(bounds[3:])
+def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
+    """Faults of unit and origin, from the corners of the scene's bounds [3]."""
     extent = high - low
-    across, centre = float(extent[:2].max()), float(np.abs((low + high) / 2)[:2].max())
+    width, centre = float(extent[:2].max()), float(np.abs((low + high) / 2)[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
-    if across < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
-        return [
-            Finding(
-                "error",
-                "",
-                f"the scene is {size} large, as if in degrees of longitude and latitude",
-                "project it to metres (calibray scene does)",
-            )
+    if width < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
+        problem = f"the scene is {size} large, as if in degrees of longitude and latitude"
+        yield Finding("error", "", problem, "project it to metres (calibray scene does)")
+        return
+    if width > LARGEST:
+        problem = f"the scene is {size} m large, as if in millimetres"
+        yield Finding("error", "", problem, "scale it by 0.001 to metres")
+    elif centre > 100 * max(width, 1000.0):
+        problem = f"the scene lies {centre:.0f} m from its origin, where single precision is coarse"
+        yield Finding("error", "", problem, "move the origin into the scene (calibray scene does)")
+    if 0 < extent[2] < 0.005 * width and extent[2] < 1:
+        problem = f"the scene is {size} m large, flat as a sheet"
+        yield Finding("note", "", problem, "check that heights were exported")
+
+
+def count_faults(item: MeshObject) -> MeshFaults:
+    """Count the faults of a mesh.
+
+    Args:
+        item: The object.
+
+    Returns:
+        The counts.
+    """
+    mesh = item.mesh
+    _, position = np.unique(np.rint(mesh.vertices / _SAME).astype(np.int64), axis=0, return_inverse=True)
+    by_position = position.reshape(-1)[mesh.faces]
+    sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    empty = (area < _FLAT) | (by_position == np.roll(by_position, 1, axis=1)).any(axis=1)
+    _, repeats = np.unique(np.sort(by_position[~empty], axis=1), axis=0, return_counts=True)
+    _, _, uses = _edges(mesh.faces[~empty])
+    _, _, uses_by_position = _edges(by_position[~empty])
+    open_edges = int((uses_by_position == 1).sum())
+    return MeshFaults(
+        name=item.name,
+        material=item.material,
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        open_edges=open_edges,
+        # Such an edge is open twice, once for each face.
+        unwelded_edges=max(0, (int((uses == 1).sum()) - open_edges) // 2),
+        crowded_edges=int((uses_by_position > 2).sum()),
+        flipped_faces=_count_flipped(mesh.vertices, mesh.faces[~empty], by_position[~empty]),
+        empty_faces=int(empty.sum()),
+        repeated_faces=int((repeats - 1).sum()),
+    )
+
+
+def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The directed sides of all faces [3 F, 2], the undirected edge of each [3 F], and the sides of each edge [E]."""
+    sides = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    _, edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return sides, edge.reshape(-1), uses
+
+
+def _count_flipped(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], by_position: NDArray[np.int64]
+) -> int:
+    """Count the faces with a wrong normal.
+
+    Faces of a connected piece are first oriented alike. The right orientation of a piece is known if it is closed, or
+    open only at its bottom (its volume is positive), or a level sheet (it looks up). For any other piece, such as a
+    wall, either side may be outside, and the faces that differ from the majority are counted.
+    """
+    if not len(faces):
+        return 0
+    orientation, piece = _orient(by_position)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    base = np.full((piece.max() + 1, 3), np.inf)
+    np.minimum.at(base, piece, np.minimum(np.minimum(a, b), c))
+    normal = np.cross(b - a, c - a) * orientation[:, None]
+    volume = np.bincount(piece, (normal * (a - base[piece])).sum(axis=1) / 6)
+    area = np.bincount(piece, np.linalg.norm(normal, axis=1) / 2)
+    upward = np.bincount(piece, normal[:, 2])
+    is_sheet = np.abs(volume) < 1e-3 * area**1.5
+    is_level = np.abs(upward) > area
+    is_closed = np.bincount(piece, _open_above(vertices, faces, by_position, base[piece, 2])) == 0
+    right = np.where(
+        is_sheet & is_level, np.sign(upward), np.where(is_closed & ~is_sheet, np.sign(volume), 0.0)
+    )
+    wrong = orientation * right[piece] < 0
+    minority = np.minimum(np.bincount(piece, orientation > 0), np.bincount(piece, orientation < 0))
+    return int(wrong.sum() + minority[np.unique(piece[right[piece] == 0])].sum())
+
+
+def _open_above(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    by_position: NDArray[np.int64],
+    lowest: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Number of open edges of each face above the bottom of its piece, whose height is `lowest` [F]."""
+    _, edge, uses = _edges(by_position)
+    is_open = (uses == 1)[edge].reshape(-1, 3)
+    height = vertices[faces][:, :, 2]
+    above = np.maximum(height, np.roll(height, -1, axis=1)) > lowest[:, None] + 2 * _SAME
+    return (is_open & above).sum(axis=1)
+
+
+def _orient(faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """+1 or -1 for each face so that neighbours have the same orientation [F], and its connected piece [F]."""
+    count = len(faces)
+    sides, edge, uses = _edges(faces)
+    order = np.argsort(edge, kind="stable")
+    pairs = order[uses[edge[order]] == 2].reshape(-1, 2)
+    one, other = pairs.T // 3
+    same = (sides[pairs[:, 0]] == sides[pairs[:, 1]][:, ::-1]).all(axis=1)
+    # A graph with two nodes for each face: node f is the face as given, node count + f the face reversed. Links join
+    # the orientations of neighbours that agree, so all nodes of one component agree.
+    links = np.concatenate(
+        [
+            np.column_stack([one, np.where(same, other, other + count)]),
+            np.column_stack([one + count, np.where(same, other + count, other)]),
         ]
-    findings = []
-    if across > LARGEST:
-        findings.append(
-            Finding(
-                "error",
-                "",
-                f"the scene is {size} m large, as if in millimetres",
-                "scale it by 0.001 to metres",
-            )
-        )
-    elif centre > 100 * max(across, 1000.0):
-        findings.append(
-            Finding(
-                "error",
-                "",
-                f"the scene lies {centre:.0f} m from its origin, where single precision is coarse",
-                "move the origin into the scene (calibray scene does)",
-            )
-        )
-    if 0 < extent[2] < 0.005 * across and extent[2] < 1:
-        findings.append(
-            Finding(
-                "note",
-                "",
-                f"the scene is {size} m large, flat as a sheet",
-                "check that heights were exported",
-            )
-        )
-    return findings
+    )
+    graph = coo_array((np.ones(len(links)), links.T), shape=(2 * count, 2 * count))
+    _, side = connected_components(graph, directed=False)
+    pieces = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
+    _, piece = connected_components(pieces, directed=False)
+    first = np.full(piece.max() + 1, count)
+    np.minimum.at(first, piece, np.arange(count))
+    return np.where(side[:count] == side[first[piece]], 1.0, -1.0), piece

@@ -1,9 +1,8 @@
-"""Cells: buildings that touch or overlap, taken apart into pieces of ground that lie side by side.
+"""Overlapping buildings, divided into cells: pieces of ground that lie side by side.
 
-Over each cell every building that covers it stands once, between its bottom and its top. Where buildings overlap the
-taller one owns the ground; where parts of a building are drawn, they tell more than its outline, which then counts
-only where no part is. Two neighbouring cells have the same corners along their common border, whoever drew them, so
-walls and roofs that meet share their vertices.
+In each cell every building that covers it stands once, between its bottom and its top. Where buildings overlap, the
+taller one owns the ground. Where parts of a building are mapped, they replace the building's outline. Neighbouring
+cells have the same corners along their common border, so walls and roofs that meet share their vertices.
 """
 
 from __future__ import annotations
@@ -20,19 +19,20 @@ from calibray.scenes.authoring.footprints import GRID, Footprints
 from calibray.support.extras import library
 
 Interval = tuple[float, float, int]
-"""Bottom [m], top [m] and number of the building that stands between them."""
+"""Bottom [m] and top [m] of a building, and its number."""
 
 Length = TypeVar("Length", int, float)
 
 SLIVER: Final = 0.1
-"""Overlaps of less area [m^2] come from the grid and are not counted."""
+"""Overlaps of less area come from rounding to the grid and are not counted [m^2]."""
 
-THINNEST: Final = 0.005  # [m], half of the grid: what is thinner is an artefact of it
+THINNEST: Final = GRID / 2
+"""Intervals thinner than this come from rounding and are dropped [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A piece of ground, and what stands on it.
+    """A piece of ground and the buildings on it.
 
     Attributes:
         polygon: Its outline, a shapely Polygon [m].
@@ -43,18 +43,18 @@ class Cell:
     stands: tuple[Interval, ...]
 
 
-def take_apart(
+def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Take buildings apart into cells.
+    """Divide buildings into cells.
 
     Args:
         footprints: The buildings.
-        bottom: Where each begins [n], [m], in the scene's frame.
-        top: Where each ends [n], [m].
+        bottom: Height at which each begins, in the scene's frame [n], [m].
+        top: Height at which each ends [n], [m].
 
     Returns:
-        The cells, and how many footprints share ground with another one.
+        The cells, and the number of footprints that share ground with another one.
     """
     shapely = library("shapely", "scenes")
     tree = shapely.STRtree(footprints.polygon)
@@ -64,28 +64,27 @@ def take_apart(
     _, cluster = connected_components(touching, directed=False)
     order = np.argsort(cluster, kind="stable")
     cells: list[Cell] = []
-    cut = 0
+    overlapping = 0
     for members in np.split(order, np.flatnonzero(np.diff(cluster[order])) + 1):
         if len(members) == 1:
-            alone = int(members[0])
-            stand = (float(bottom[alone]), float(top[alone]), alone)
-            cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[alone])]
+            single = int(members[0])
+            stand = (float(bottom[single]), float(top[single]), single)
+            cells += [Cell(part, (stand,)) for part in shapely.get_parts(footprints.polygon[single])]
             continue
         pieces, covers = _overlay(footprints.polygon[members])
-        twice = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > SLIVER)
-        cut += int(covers[:, twice].any(axis=1).sum())
+        shared = (covers.sum(axis=0) > 1) & (shapely.area(pieces) > SLIVER)
+        overlapping += int(covers[:, shared].any(axis=1).sum())
         for piece, cover in zip(pieces, covers.T, strict=True):
-            here = members[cover]
-            if footprints.part[here].any():
-                here = here[footprints.part[here]]
-            cells.append(
-                Cell(piece, _stacked([(float(bottom[one]), float(top[one]), int(one)) for one in here]))
-            )
-    return cells, cut
+            buildings = members[cover]
+            if footprints.part[buildings].any():
+                buildings = buildings[footprints.part[buildings]]
+            stands = [(float(bottom[k]), float(top[k]), int(k)) for k in buildings]
+            cells.append(Cell(piece, _stack(stands)))
+    return cells, overlapping
 
 
 def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
-    """The pieces that all borders together cut the ground into, and which polygon covers which [n, pieces]."""
+    """The pieces into which all borders cut the ground, and which polygon covers which piece [n, pieces]."""
     shapely = library("shapely", "scenes")
     borders = shapely.union_all(shapely.boundary(polygons), grid_size=GRID)
     pieces = shapely.get_parts(shapely.polygonize([borders]))
@@ -97,32 +96,32 @@ def _overlay(polygons: NDArray[Any]) -> tuple[list[Any], NDArray[np.bool_]]:
     return list(pieces[built]), covers[:, built]
 
 
-def _stacked(stands: list[Interval]) -> tuple[Interval, ...]:
-    """Intervals without overlaps: what is covered twice belongs to the one with the higher top."""
-    free: list[Interval] = []
+def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
+    """Resolve overlaps in height: what two buildings share belongs to the one with the higher top."""
+    stack: list[Interval] = []
     for bottom, top, owner in sorted(stands, key=lambda stand: (-stand[1], stand[0], stand[2])):
-        remains = [(bottom, top, owner)]
-        for taken_bottom, taken_top, _ in free:
-            remains = [rest for one in remains for rest in outside(one, taken_bottom, taken_top)]
-        free += remains
-    return tuple(sorted(free))
+        free = [(bottom, top, owner)]
+        for taken_bottom, taken_top, _ in stack:
+            free = [part for stand in free for part in subtract(stand, taken_bottom, taken_top)]
+        stack += free
+    return tuple(sorted(stack))
 
 
-def outside(
+def subtract(
     interval: tuple[Length, Length, int], bottom: Length, top: Length
 ) -> list[tuple[Length, Length, int]]:
-    """What is left of an interval outside another.
+    """Subtract a range of heights from an interval.
 
     Args:
-        interval: The interval.
-        bottom: Where the other begins [m].
-        top: Where it ends [m].
+        interval: The interval, [m] or [mm].
+        bottom: Where the range begins.
+        top: Where it ends.
 
     Returns:
         None, one or two intervals of the same owner.
 
     Example:
-        >>> outside((0.0, 10.0, 7), 2.0, 4.0)
+        >>> subtract((0.0, 10.0, 7), 2.0, 4.0)
         [(0.0, 2.0, 7), (4.0, 10.0, 7)]
     """
     low, high, owner = interval

@@ -1,0 +1,228 @@
+"""Scenes of rooms, made of floor plans: one upright sheet for each wall, door and window."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.coordinates import Frame
+from calibray.errors import InputError
+from calibray.scenes.authoring.extrusion import (
+    MILLIMETRE,
+    Point,
+    Stand,
+    to_millimetres,
+    triangulate,
+    wall_triangles,
+)
+from calibray.scenes.authoring.floor_plan import OPENINGS, Segment, merge_faces
+from calibray.scenes.authoring.made_scene import MadeScene, SurfaceMaterial, write_made_scene
+from calibray.scenes.authoring.overlaps import subtract
+from calibray.scenes.authoring.wall_alignment import align
+from calibray.scenes.meshes import MeshObject, weld
+from calibray.scenes.scene import ITU_NAMES
+from calibray.support.extras import library
+from calibray.support.messages import did_you_mean
+from calibray.support.output_files import check_folder
+
+TYPES: Final = {
+    "wall": SurfaceMaterial("wall", "plasterboard", 0.12),
+    "door": SurfaceMaterial("door", "wood", 0.04),
+    "window": SurfaceMaterial("window", "glass", 0.01),
+    "floor": SurfaceMaterial("floor", "concrete", 0.2),
+    "ceiling": SurfaceMaterial("ceiling", "concrete", 0.2),
+}
+"""Materials of the types that are not materials of ITU-R P.2040 themselves."""
+
+WALL_THICKNESS: Final = 0.12
+"""Thickness of a wall of an ITU material if the plan does not state it [m]."""
+
+ROUNDING: Final = 2.0
+"""Distance of a corner from its line that rounding explains [mm]: walls of a plan are cut where they cross."""
+
+_REACH: Final = 0.03  # distance beyond a wall's face at which the end of another wall still meets it [m]
+
+Pieces = dict[tuple[Point, Point], list[tuple[int, int, str]]]
+"""For each piece of a line between two crossings: bottom [mm], top [mm] and material of the sheets over it."""
+
+
+def make_plan_scene(
+    segments: Sequence[Segment],
+    folder: str | Path,
+    types: Mapping[str, SurfaceMaterial] | None = None,
+    floor: bool = True,
+    ceiling: bool = True,
+    merge: bool = True,
+    frame: Frame | None = None,
+) -> MadeScene:
+    """Make a scene of a floor plan.
+
+    Walls that cross or meet share their corners, and ends that stop at the face of another wall are extended to its
+    centre line. A door or window replaces the wall on which it is drawn, between its own bottom and top; the wall
+    continues above and below.
+
+    Args:
+        segments: Lines of the plan.
+        folder: Where to write `scene.xml`, `scene.json` and the meshes.
+        types: Materials by type, in addition to `TYPES` or replacing them. A type that is a material of ITU-R P.2040,
+            such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type become several
+            materials.
+        floor: Whether to make a floor: a sheet over all that walls enclose, at the lowest bottom.
+        ceiling: Whether to make a ceiling, at the highest top.
+        merge: Whether two parallel lines are merged into one wall (`merge_faces`).
+        frame: Where the scene lies on the globe, if known.
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: A type has no material, there is no segment, or the folder cannot be written.
+    """
+    folder, types = check_folder(folder), {**TYPES, **(types or {})}
+    if not segments:
+        raise InputError("the floor plan holds no segment; give at least one wall")
+    sheets, merged = merge_faces(segments) if merge else (list(segments), 0)
+    materials = _materials(sheets, types)
+    pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
+    objects = _wall_objects(pieces)
+    outline = _enclosed(pieces)
+    lids = {}
+    if floor:
+        lids["floor"] = min(sheet.bottom for sheet in sheets)
+    if ceiling:
+        lids["ceiling"] = max(sheet.top for sheet in sheets)
+    for kind, height in lids.items():
+        name = types[kind].name
+        materials.append(types[kind])
+        objects.append(MeshObject(f"all-{name}", name, weld(_lid(outline, height), MILLIMETRE)))
+    counts = {
+        "lines": len(segments),
+        "sheets": len(sheets),
+        **({"lines merged as faces of one wall": merged} if merged else {}),
+    }
+    return write_made_scene(folder, objects, materials, frame, counts)
+
+
+def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:
+    """The material of each sheet; a type with several thicknesses has several materials."""
+    materials = []
+    for sheet in sheets:
+        if sheet.kind in types:
+            base = types[sheet.kind]
+        elif sheet.kind in ITU_NAMES:
+            base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
+        else:
+            names = sorted({*types, *ITU_NAMES})
+            raise InputError(
+                f"type {sheet.kind!r}: has no material; {did_you_mean(sheet.kind, names)} (or give it one with "
+                "--material)"
+            )
+        materials.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
+    thicknesses: dict[str, set[float]] = defaultdict(set)
+    for material in materials:
+        thicknesses[material.name].add(material.thickness)
+    return [
+        replace(material, name=f"{material.name}_{round(material.thickness * 1000)}mm")
+        if len(thicknesses[material.name]) > 1
+        else material
+        for material in materials
+    ]
+
+
+def _extend_to_walls(sheets: Sequence[Segment]) -> list[Segment]:
+    """Move the ends of sheets to the centre line of a wall that they stop at."""
+    extended = list(sheets)
+    for index, sheet in enumerate(extended):
+        start, end = np.array(sheet.start), np.array(sheet.end)
+        others = [other for other in extended if other is not sheet]
+        start = _extend(start, start - end, others)
+        end = _extend(end, end - start, others)
+        extended[index] = replace(
+            sheet, start=(float(start[0]), float(start[1])), end=(float(end[0]), float(end[1]))
+        )
+    return extended
+
+
+def _extend(
+    end: NDArray[np.float64], outward: NDArray[np.float64], others: Sequence[Segment]
+) -> NDArray[np.float64]:
+    """The end of a sheet, moved along the sheet to the centre line of the nearest wall within reach."""
+    outward = outward / np.hypot(*outward)
+    steps = []
+    for other in others:
+        along = np.subtract(other.end, other.start)
+        offset = end - other.start
+        sine = outward[0] * along[1] - outward[1] * along[0]  # times the other's length
+        reach = (other.thickness or WALL_THICKNESS) / 2 + _REACH
+        if abs(sine) < 0.1 * np.hypot(*along):
+            continue
+        step = (along[0] * offset[1] - along[1] * offset[0]) / sine
+        share = (end + step * outward - other.start) @ along / (along @ along)
+        margin = reach / np.hypot(*along)
+        if abs(step) <= reach and -margin <= share <= 1 + margin:
+            steps.append(step)
+    return end + outward * min(steps, key=abs) if steps else end
+
+
+def _pieces(sheets: Sequence[Segment], materials: Sequence[str]) -> Pieces:
+    """The lines cut where they cross, and the sheets over each piece; doors and windows have priority over walls."""
+    shapely = library("shapely", "scenes")
+    lines = np.array([shapely.LineString([sheet.start, sheet.end]) for sheet in sheets], dtype=object)
+    cut = shapely.get_parts(shapely.union_all(lines, grid_size=MILLIMETRE))
+    middle = shapely.line_interpolate_point(cut, 0.5, normalized=True)
+    piece, sheet = shapely.STRtree(lines).query(middle, predicate="dwithin", distance=2 * MILLIMETRE)
+    over: dict[int, list[int]] = defaultdict(list)
+    for index, owner in zip(piece.tolist(), sheet.tolist(), strict=True):
+        over[index].append(owner)
+    pieces: Pieces = {}
+    for index, owners in over.items():
+        stands: list[Stand] = []
+        for owner in sorted(owners, key=lambda number: (sheets[number].kind not in OPENINGS, number)):
+            free = [(to_millimetres(sheets[owner].bottom), to_millimetres(sheets[owner].top), owner)]
+            for low, high, _ in stands:
+                free = [part for stand in free for part in subtract(stand, low, high)]
+            stands += free
+        (x0, y0), (x1, y1) = shapely.get_coordinates(cut[index])[[0, -1]]
+        edge = (to_millimetres(x0), to_millimetres(y0)), (to_millimetres(x1), to_millimetres(y1))
+        pieces[edge] = [(low, high, materials[owner]) for low, high, owner in stands]
+    return pieces
+
+
+def _wall_objects(pieces: Pieces) -> list[MeshObject]:
+    """One mesh per material; sheets that meet share their corners."""
+    levels: dict[Point, set[int]] = defaultdict(set)
+    for edge, stands in pieces.items():
+        for point in edge:
+            levels[point] |= {height for low, high, _ in stands for height in (low, high)}
+    triangles: dict[str, list[Any]] = defaultdict(list)
+    for (left, right), stands in pieces.items():
+        for low, high, material in stands:
+            triangles[material] += wall_triangles(
+                left, right, sorted(levels[left]), sorted(levels[right]), low, high
+            )
+    sheets = {name: np.array(corners, dtype=np.int64) for name, corners in sorted(triangles.items())}
+    position = align(np.concatenate(list(sheets.values())), ROUNDING).positions
+    return [
+        MeshObject(f"all-{name}", name, weld(corners, MILLIMETRE, position))
+        for name, corners in sheets.items()
+    ]
+
+
+def _enclosed(pieces: Pieces) -> Any:
+    """The area that the walls enclose or, if they enclose nothing, the convex hull of the walls [mm]."""
+    shapely = library("shapely", "scenes")
+    lines = shapely.linestrings(np.array(list(pieces), dtype=float))
+    rooms = shapely.union_all(shapely.get_parts(shapely.polygonize(lines)))
+    return shapely.convex_hull(shapely.union_all(lines)) if shapely.is_empty(rooms) else rooms
+
+
+def _lid(outline: Any, height: float) -> NDArray[np.int64]:
+    """A level sheet over an area, counter-clockwise seen from above [F, 3, 3], [mm]."""
+    flat, _ = triangulate(library("shapely", "scenes").get_parts(outline))
+    return np.concatenate([flat, np.full((len(flat), 3, 1), to_millimetres(height))], axis=2)

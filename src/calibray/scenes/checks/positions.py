@@ -1,0 +1,276 @@
+"""Positions in a scene: under a roof, under the ground, outside the scene, behind walls; moved out of buildings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibray.errors import InputError
+from calibray.scenes.triangles import is_ground, read_meshes
+from calibray.support.extras import library
+
+CLEARANCE: Final = 0.05
+"""A surface is above an antenna if it is higher by more than this [m]."""
+
+SAME_CROSSING: Final = 1e-3
+"""Crossings closer than this are one, on an edge that two triangles share [m]."""
+
+_STEEP: Final = 0.1  # a face is a wall if the vertical part of its unit normal is at most this [1]
+_BATCH: Final = 2_000_000  # pairs of a line and a triangle in memory at once
+
+
+def _is_wall(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.abs(normal[:, 2]) <= _STEEP * np.linalg.norm(normal, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSurfaces:
+    """The faces of a scene, walls apart from ground, floors and roofs.
+
+    Attributes:
+        level: Corners of the faces that are not walls [F, 3, 3], [m].
+        walls: Corners of the walls [W, 3, 3], [m].
+        bounds: West, south, bottom, east, north and top of the scene [6], [m].
+    """
+
+    level: NDArray[np.float64]
+    walls: NDArray[np.float64]
+    bounds: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, source: str | Path) -> SceneSurfaces:
+        """Read a scene.
+
+        Args:
+            source: Path of a Mitsuba XML file, or `sionna:NAME`.
+
+        Returns:
+            Its faces.
+
+        Raises:
+            InputError: The scene cannot be read.
+        """
+        corners = np.concatenate([item.mesh.vertices[item.mesh.faces] for item in read_meshes(source)])
+        wall = _is_wall(corners)
+        bounds = np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+        return cls(corners[~wall], corners[wall], bounds)
+
+    def under_roof(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Find the points that have a surface above them.
+
+        Args:
+            points: Positions [n, 3], [m].
+
+        Returns:
+            The mask [n].
+
+        Raises:
+            InputError: shapely is not installed.
+
+        Example:
+            >>> roof = np.array([[[0, 0, 3], [4, 0, 3], [0, 4, 3]]], float)
+            >>> surfaces = SceneSurfaces(roof, np.zeros((0, 3, 3)), np.array([0, 0, 3, 4, 4, 3.0]))
+            >>> surfaces.under_roof([[1, 1, 1.5], [1, 1, 5.0], [3, 3, 1.5]])
+            array([ True, False, False])
+        """
+        position = np.asarray(points, dtype=float).reshape(-1, 3)
+        _, above = self._count_surfaces(position)
+        return above > 0
+
+    def underground(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Find the points that lie below all surfaces at their position.
+
+        Args:
+            points: Positions [n, 3], [m].
+
+        Returns:
+            The mask [n].
+
+        Raises:
+            InputError: shapely is not installed.
+        """
+        position = np.asarray(points, dtype=float).reshape(-1, 3)
+        count, above = self._count_surfaces(position)
+        return (count > 0) & (above == count)
+
+    def outside(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Find the points that lie outside the scene's bounds in plan.
+
+        Args:
+            points: Positions [n, 3], [m].
+            margin: Distance from the bounds up to which a point counts as inside [m].
+
+        Returns:
+            The mask [n].
+        """
+        position = np.asarray(points, dtype=float).reshape(-1, 3)[:, :2]
+        low, high = self.bounds[:2] - margin, self.bounds[3:5] + margin
+        return np.asarray(((position < low) | (position > high)).any(axis=1))
+
+    def ground_height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+        """Find the height of the lowest surface.
+
+        Args:
+            x: Eastings [n], [m].
+            y: Northings [n], [m].
+
+        Returns:
+            Heights [n], [m].
+
+        Raises:
+            InputError: The scene has no surface at a position, or shapely is not installed.
+
+        Example:
+            >>> slope = np.array([[[0, 0, 0], [4, 0, 2], [0, 4, 0]], [[0, 0, 9], [4, 0, 9], [0, 4, 9]]], float)
+            >>> SceneSurfaces(slope, np.zeros((0, 3, 3)), np.zeros(6)).ground_height([1, 2], [1, 1])
+            array([0.5, 1. ])
+        """
+        position = np.column_stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)])
+        index, height = self._surfaces(position)
+        lowest = np.full(len(position), np.inf)
+        np.minimum.at(lowest, index, height)
+        if (missing := np.flatnonzero(np.isinf(lowest))).size:
+            east, north = position[missing[0]]
+            raise InputError(
+                f"heights above the ground: the scene has no ground at {len(missing)} of {len(position)} positions, "
+                f"the first at ({east:.1f}, {north:.1f}) m; make the scene with a wider --margin, or leave those rows "
+                "out"
+            )
+        return lowest
+
+    def _count_surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Number of surfaces at each position, and how many of them are above it [n]."""
+        index, height = self._surfaces(position)
+        above = height > position[index, 2] + CLEARANCE
+        return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
+
+    def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """All surfaces at some positions: index of the position, and height of the surface [m]."""
+        shapely = library("shapely", "scenes")
+        tree = shapely.STRtree(shapely.polygons(self.level[:, :, :2]))
+        index, face = tree.query(shapely.points(position[:, :2]), predicate="intersects")
+        a, b, c = np.moveaxis(self.level[face], 1, 0)
+        normal = np.cross(b - a, c - a)
+        offset = position[index, :2] - a[:, :2]
+        return index, a[:, 2] - (normal[:, :2] * offset).sum(axis=1) / normal[:, 2]
+
+
+def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> NDArray[np.int64]:
+    """Count the surfaces that straight lines cross (Moeller and Trumbore, J. Graphics Tools 2(1), 1997).
+
+    Args:
+        corners: Corners of the triangles [F, 3, 3], [m].
+        start: One end of each line [n, 3], [m].
+        end: The other end [n, 3], [m].
+
+    Returns:
+        Number of surfaces that each line crosses [n].
+
+    Example:
+        >>> sheet = np.array([[[1, -9, -9], [1, 9, -9], [1, 0, 9]]], float)
+        >>> count_crossings(sheet, [[0, 0, 0], [0, 0, 0]], [[2, 0, 0], [0.5, 0, 0]])
+        array([1, 0])
+    """
+    origin = np.asarray(start, dtype=float).reshape(-1, 3)
+    step = np.asarray(end, dtype=float).reshape(-1, 3) - origin
+    batch = max(1, _BATCH // max(len(corners), 1))
+    counts = [
+        _count_crossings(corners, origin[first : first + batch], step[first : first + batch])
+        for first in range(0, len(origin), batch)
+    ]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *counts])
+
+
+def _count_crossings(
+    corners: NDArray[np.float64], origin: NDArray[np.float64], step: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    # Intersection of origin + share * step with each triangle in barycentric coordinates u, v. A line parallel to the
+    # triangle divides by zero and gives NaN, which fails all comparisons.
+    base, one, other = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(step[:, None], other)
+    volume = (across * one).sum(axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / volume
+        offset = origin[:, None] - base
+        u = (offset * across).sum(axis=2) * inverse
+        normal = np.cross(offset, one)
+        v = (step[:, None] * normal).sum(axis=2) * inverse
+        share = (other * normal).sum(axis=2) * inverse
+        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (share > 0) & (share < 1)
+    length = np.linalg.norm(step, axis=1)
+    distance = np.sort(np.where(hit, share * length[:, None], np.inf), axis=1)
+    # Misses sort last. The difference of two of them is NaN, which is not a new crossing either.
+    with np.errstate(invalid="ignore"):
+        separate = np.diff(distance, axis=1, prepend=-np.inf) > SAME_CROSSING
+    return (np.isfinite(distance) & separate).sum(axis=1)
+
+
+def building_outlines(source: str | Path, height: float = 2.0) -> Any:
+    """Find the area that buildings and other bodies of a scene cover in plan.
+
+    Args:
+        source: Path of a Mitsuba XML file, or `sionna:NAME`.
+        height: Faces lower than this above the scene's lowest point cover nothing: kerbs, floors, the ground [m].
+
+    Returns:
+        A shapely Polygon or MultiPolygon [m], empty if there is no body.
+
+    Raises:
+        InputError: The scene cannot be read, or shapely is not installed.
+    """
+    shapely = library("shapely", "scenes")
+    meshes = [item.mesh for item in read_meshes(source)]
+    extent = np.ptp(np.concatenate([mesh.vertices[:, :2] for mesh in meshes]), axis=0)
+    lowest = min(mesh.vertices[:, 2].min() for mesh in meshes)
+    bodies = [mesh.vertices[mesh.faces] for mesh in meshes if not is_ground(mesh, extent)]
+    corners = np.concatenate([np.zeros((0, 3, 3)), *bodies])
+    high = corners[:, :, 2].max(axis=1) >= lowest + height
+    return shapely.union_all(shapely.polygons(corners[~_is_wall(corners) & high][:, :, :2]), grid_size=0.001)
+
+
+def move_outside(
+    points: ArrayLike, outlines: Any, clearance: float = 1.0, furthest: float = 20.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Move positions inside buildings to the nearest position outside.
+
+    Args:
+        points: Positions [n, 3], [m]; heights do not change.
+        outlines: The area that buildings cover, from `building_outlines`.
+        clearance: Distance from the wall at which a moved position lies [m].
+        furthest: Positions that would move further than this are given up [m].
+
+    Returns:
+        The positions [n, 3], [m], NaN where given up; and the distance that each was moved [n], [m].
+
+    Raises:
+        InputError: The clearance is not greater than 0, or a position is not finite.
+
+    Example:
+        >>> import shapely
+        >>> move_outside([[9.0, 5.0, 1.5], [12.0, 5.0, 1.5]], shapely.box(0, 0, 10, 10))
+        (array([[11. ,  5. ,  1.5],
+               [12. ,  5. ,  1.5]]), array([2., 0.]))
+    """
+    shapely = library("shapely", "scenes")
+    moved = np.array(points, dtype=float).reshape(-1, 3)
+    if not clearance > 0:
+        raise InputError(f"clearance = {clearance!r}: must be greater than 0 m")
+    if not np.isfinite(moved).all():
+        raise InputError("positions must be finite numbers of metres; correct or leave out the others")
+    inside = np.flatnonzero(shapely.contains_xy(outlines, moved[:, 0], moved[:, 1]))
+    distance = np.zeros(len(moved))
+    if not len(inside):
+        return moved, distance
+    # With mitred corners, positions leave a straight wall at a right angle.
+    border = shapely.boundary(shapely.buffer(outlines, clearance, join_style="mitre"))
+    lines = shapely.shortest_line(shapely.points(moved[inside, :2]), border)
+    nearest = shapely.get_coordinates(lines).reshape(-1, 2, 2)[:, 1]
+    distance[inside] = np.linalg.norm(nearest - moved[inside, :2], axis=1)
+    moved[inside, :2] = nearest
+    moved[distance > furthest] = np.nan
+    return moved, distance
