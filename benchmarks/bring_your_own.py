@@ -46,12 +46,15 @@ from calibray.measurements import (  # noqa: E402
     SourceTable,
     measured_links,
 )
-from calibray.scenes.authoring.floor_plan import make_plan_scene  # noqa: E402
-from calibray.scenes.authoring.floor_plan_file import read_plan  # noqa: E402
-from calibray.scenes.authoring.openstreetmap import read_openstreetmap  # noqa: E402
-from calibray.scenes.authoring.scene_folder import make_scene  # noqa: E402
-from calibray.scenes.authoring.terrain import lowered, read_terrain  # noqa: E402
-from calibray.scenes.authoring.vector_files import read_footprints  # noqa: E402
+from calibray.scenes.authoring import (  # noqa: E402
+    lower_origin,
+    make_plan_scene,  # noqa: E402
+    make_scene,  # noqa: E402
+    read_footprints,  # noqa: E402
+    read_openstreetmap,  # noqa: E402
+    read_plan,  # noqa: E402
+    read_terrain,
+)
 from calibray.study import Setup, Study  # noqa: E402
 from calibray.study.draft import draft  # noqa: E402
 from calibray.uncertainty.assessment import certainty  # noqa: E402
@@ -188,7 +191,7 @@ def hill_walk(folder: Path) -> Walk:
     gains = hill.heard()
     found, frame = read_footprints(hill.FOLDER / "houses.geojson", "height_m", 0.0)
     bounds = found.bounds + MARGIN * np.array([-1, -1, 1, 1])
-    terrain, frame = lowered(read_terrain(hill.FOLDER / "ground.tif", frame, bounds), frame)
+    terrain, frame = lower_origin(read_terrain(hill.FOLDER / "ground.tif", frame, bounds), frame)
     scene = make_scene(found, folder, frame, terrain).path
 
     @cache

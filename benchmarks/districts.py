@@ -20,7 +20,7 @@ from calibray.materials import Material, itu_material
 from calibray.paths import Paths
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import Building, building_meshes, district
-from calibray.scenes.meshes import Mesh, MeshObject, joined, write_scene
+from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
 
 DEVELOPMENT = tuple(f"district-{seed}" for seed in (100, 101, 102, 103, 104, 105, 106, 107, 108, 109))
@@ -163,8 +163,8 @@ def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
         np.array([[0, 1, 2], [0, 2, 3]]),
     )
     objects = [
-        MeshObject("structures", "walls", joined(structures)),
-        MeshObject("panes", "windows", joined(windows)),
+        MeshObject("structures", "walls", join_meshes(structures)),
+        MeshObject("panes", "windows", join_meshes(windows)),
         MeshObject("plane", "ground", ground),
     ]
     wall, earth = str(random.choice(["concrete", "brick", "marble"])), float(random.uniform(0.3, 3.0))

@@ -26,9 +26,7 @@ from osmium.geom import WKBFactory
 from osmium.osm import Area
 
 from calibray.coordinates import Frame
-from calibray.scenes.authoring.extrusion import Windows
-from calibray.scenes.authoring.openstreetmap import read_openstreetmap
-from calibray.scenes.authoring.scene_folder import Made, make_scene
+from calibray.scenes.authoring import MadeScene, Windows, make_scene, read_openstreetmap
 
 PLACE = (11.5755, 48.1374)
 ROW = 10  # houses that share walls
@@ -93,7 +91,7 @@ def timed(function: Callable[..., R], *arguments: object) -> tuple[float, R]:
     return time.process_time() - start, returned
 
 
-def trace(made: Made) -> float:
+def trace(made: MadeScene) -> float:
     """Processor time to load and trace ten links of the scene [s]."""
     from calibray.scenes import read_scene
     from calibray.tracing.settings import Antenna, TraceSettings

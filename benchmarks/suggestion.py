@@ -38,7 +38,7 @@ from calibray.fitting.problem import Problem
 from calibray.prediction.experiment_design import Beliefs, Errors, choose
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import AVENUES, STREETS, district, scene_objects
-from calibray.scenes.meshes import write_scene
+from calibray.scenes import write_scene
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render

@@ -13,8 +13,7 @@ from calibray.report.link_survey import survey
 from calibray.report.page import Shown
 from calibray.report.rays import strongest
 from calibray.result import Result
-from calibray.scenes import Scene
-from calibray.scenes.triangles import Triangles
+from calibray.scenes import Scene, Triangles
 
 BLOCK = 40.0
 """Distance of the streets [m]."""

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from calibray.coordinates import Frame
-from calibray.scenes.authoring.footprints import Footprints, HeightSource, cleaned
+from calibray.scenes.authoring import Footprints, HeightSource, clean_footprints
 
 FRAME = Frame.local(11.5755, 48.1374)
 Ring = Sequence[tuple[float, float]]
@@ -31,7 +31,7 @@ def footprints(
     """Footprints of known heights."""
     count = len(polygons)
     sources: tuple[HeightSource, ...] = ("height",) * count
-    return cleaned(
+    return clean_footprints(
         Footprints(
             polygon=np.array(polygons, dtype=object),
             bottom=np.zeros(count) if bottoms is None else np.array(bottoms, dtype=float),

@@ -18,8 +18,7 @@ from calibray.measurements import read_measurements, read_table
 from calibray.measurements.filters import evaluate
 from calibray.report.export import export
 from calibray.result import Result
-from calibray.scenes import export_scene, read_scene
-from calibray.scenes.checks.ply import check_ply
+from calibray.scenes import export_scene, read_mesh, read_scene
 from calibray.study import Study
 from calibray.study.toml_file import expand
 from calibray.support.output_files import check_file, check_folder
@@ -307,7 +306,7 @@ _header = st.lists(
 def test_any_mesh_is_whole_or_refused(header, body, tmp_path_factory):
     file = tmp_path_factory.mktemp("meshes") / "mesh.ply"
     file.write_bytes("\n".join(["ply", *header, "end_header", ""]).encode() + body)
-    _, refusal = outcome(check_ply, file)
+    _, refusal = outcome(read_mesh, file, "ply")
     assert refusal is None or "mesh.ply" in refusal
 
 

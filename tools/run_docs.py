@@ -30,7 +30,7 @@ from rasterio.transform import from_bounds
 
 import calibray as cb
 from calibray.scenarios.district import Building, building_meshes
-from calibray.scenes.meshes import Mesh, MeshObject, joined, write_scene
+from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -117,7 +117,7 @@ def own_scene(folder: Path) -> None:
         for number in range(7)
         for side in (10.0, -20.0)
     ]
-    walls = joined(building_meshes(house)[0] for house in houses)
+    walls = join_meshes(building_meshes(house)[0] for house in houses)
     ground = Mesh(
         np.array([[-60.0, -60, 0], [220, -60, 0], [220, 60, 0], [-60, 60, 0]]),
         np.array([[0, 1, 2], [0, 2, 3]]),

@@ -8,9 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from calibray.scenes.authoring.floor_plan import make_plan_scene
-from calibray.scenes.authoring.floor_plan_file import Segment
-from calibray.scenes.authoring.scene_folder import SurfaceMaterial
+from calibray.scenes.authoring import Segment, SurfaceMaterial, make_plan_scene
 from problem_families.sites import STUFFS, Site
 
 HEIGHT: Final = 3.0  # [m]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.scenarios.district import Layout, district, scene_objects
-from calibray.scenes.meshes import write_scene
+from calibray.scenes import write_scene
 
 Range = tuple[float, float]
 

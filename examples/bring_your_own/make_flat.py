@@ -16,8 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from calibray.scenes.authoring.floor_plan import make_plan_scene
-from calibray.scenes.authoring.floor_plan_file import merge_faces, read_plan
+from calibray.scenes.authoring import make_plan_scene, merge_faces, read_plan
 from synthetic import amplitudes, sample
 
 FOLDER = Path(__file__).parent / "flat"

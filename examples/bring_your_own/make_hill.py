@@ -20,10 +20,8 @@ import rasterio
 from rasterio.transform import from_origin
 
 from calibray.coordinates import Frame
-from calibray.scenes.authoring.scene_folder import make_scene
-from calibray.scenes.authoring.terrain import lowered, read_terrain
-from calibray.scenes.authoring.vector_files import read_footprints
-from calibray.scenes.checks.heights import Overhead
+from calibray.scenes.authoring import lower_origin, make_scene, read_footprints, read_terrain
+from calibray.scenes.checks import SceneSurfaces
 from synthetic import amplitudes, sample
 
 FOLDER = Path(__file__).parent / "hill"
@@ -97,15 +95,15 @@ def heard() -> list[np.ndarray]:
     with TemporaryDirectory() as folder:
         found, frame = read_footprints(FOLDER / "houses.geojson", "height_m", 0.0)
         bounds = found.bounds + 50 * np.array([-1, -1, 1, 1])
-        terrain, frame = lowered(read_terrain(FOLDER / "ground.tif", frame, bounds), frame)
+        terrain, frame = lower_origin(read_terrain(FOLDER / "ground.tif", frame, bounds), frame)
         scene = make_scene(found, Path(folder), frame, terrain).path
-        overhead = Overhead.of(scene)
+        overhead = SceneSurfaces.read(scene)
 
         def placed(points: np.ndarray, height: float) -> np.ndarray:
             """Places of `FRAME` in the scene's, above its ground."""
             degrees = FRAME.to_geographic(np.column_stack([points, np.zeros(len(points))]))
             place = frame.to_scene(degrees[:, 0], degrees[:, 1], 0.0)
-            place[:, 2] = overhead.ground(place[:, 0], place[:, 1]) + height
+            place[:, 2] = overhead.ground_height(place[:, 0], place[:, 1]) + height
             return place
 
         mast = placed(np.array([MAST[:2]]), MAST[2])

@@ -18,8 +18,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.coordinates import Frame
-from calibray.scenes.authoring.openstreetmap import read_openstreetmap
-from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring import make_scene, read_openstreetmap
 from synthetic import amplitudes, sample
 
 HERE = Path(__file__).parent

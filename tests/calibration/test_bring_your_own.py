@@ -12,9 +12,8 @@ import pandas as pd
 
 from calibray.fields import path_loss
 from calibray.measurements import Averaging, LinkColumns, Preparation, measured_links, read_table
-from calibray.scenes.authoring.openstreetmap import read_openstreetmap
-from calibray.scenes.authoring.outlines import led_outside, outlines
-from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring import make_scene, read_openstreetmap
+from calibray.scenes.checks import building_outlines, move_outside
 from calibray.tracing.default_tracer import trace
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "bring_your_own"
@@ -41,7 +40,7 @@ def test_planted_walls_and_phones_are_found_from_a_map_and_a_log(tmp_path):
     averages = measured_links(read_table(EXAMPLE / "rsrp.csv"), columns, steps).frame
     # If some samples of a stop are below the noise floor, the others are the strong ones.
     links = averages[averages["count"] == 10]
-    rx, moved = led_outside(links[["rx_x", "rx_y", "rx_z"]], outlines(made.path))
+    rx, moved = move_outside(links[["rx_x", "rx_y", "rx_z"]], building_outlines(made.path))
     assert len(links) > 100
     assert moved.max() == 0
 

@@ -12,9 +12,8 @@ from calibray.cli.app import Commands
 from calibray.cli.app import app as calibray
 from calibray.cli.scene import scene
 from calibray.report import scene_tables as report
-from calibray.scenes import read_scene
-from calibray.scenes.authoring.scene_folder import read_frame
-from calibray.scenes.checks.scene_check import diagnose
+from calibray.scenes import read_frame, read_scene
+from calibray.scenes.checks import check_scene
 from calibray.tables.text import render
 from planted_maps import write_extract
 
@@ -102,14 +101,14 @@ def test_what_cannot_be_made_is_told_in_a_line(tmp_path, monkeypatch, words, mes
 
 
 def test_a_diagnosis_is_told(tmp_path):
-    canyon = diagnose("sionna:simple_street_canyon")
+    canyon = check_scene("sionna:simple_street_canyon")
     text = render(*report.diagnosed(canyon), report.objects(canyon))
     assert "can be used" in text
-    assert "12 of 12 faces with the normal turned inward" in text
+    assert "12 of 12 faces with the normal inward" in text
     assert "building_6" in text
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
     typed("osm", extract, "-o", tmp_path / "out")
-    assert "Findings" not in render(*report.diagnosed(diagnose(tmp_path / "out" / "scene.xml")))
+    assert "Findings" not in render(*report.diagnosed(check_scene(tmp_path / "out" / "scene.xml")))
 
 
 def doctored(*words: object) -> tuple[int, str, str]:

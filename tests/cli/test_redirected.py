@@ -109,8 +109,8 @@ def test_a_calibration_whose_steps_last(tmp_path, slow):
 
 def test_a_scene_whose_steps_last(tmp_path):
     slow = [
-        "calibray.scenes.authoring.openstreetmap.read_openstreetmap",
-        "calibray.scenes.authoring.scene_folder.make_scene",
+        "calibray.scenes.authoring.read_openstreetmap",
+        "calibray.scenes.authoring.make_scene",
     ]
     status, told, printed = redirected(tmp_path, slow, "scene", "osm", TOWN, "--out", "town")
     assert status == 0, printed

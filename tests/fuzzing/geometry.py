@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from calibray.fields import path_loss
-from calibray.scenes.checks.ply import check_ply
+from calibray.scenes import read_mesh
 from calibray.study import Study
 from calibray.tracing.gain_table import read_gain_table
 from fuzzing import world
@@ -185,7 +185,7 @@ def mesh(rng: Random, found: World, folder: Path) -> Case:
     file.write_bytes(raw)
     whole = rng.random() < TRACED or bad
     if name.endswith("ply") and not whole:
-        return Case("mesh", f"{name} {note}", lambda: check_ply(file), bad, names=(name,))
+        return Case("mesh", f"{name} {note}", lambda: read_mesh(file, "ply").faces, bad, names=(name,))
     return Case("mesh", f"{name} {note}", _traced(study, whole), bad, names=(name, *_NAMES), own=OWN)
 
 

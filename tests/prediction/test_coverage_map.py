@@ -20,8 +20,7 @@ from calibray.errors import InputError
 from calibray.prediction import batches as shared_out
 from calibray.report.link_map import footprints
 from calibray.report.map_files import geotiff
-from calibray.scenes.authoring.ground import ground_heights
-from calibray.scenes.triangles import Triangles
+from calibray.scenes import Triangles, ground_heights
 
 LEGACY = Path(__file__).parents[1] / "legacy"
 TX = (0.0, 0.0, 12.0)

@@ -18,7 +18,7 @@ from calibray.prediction.residual_field import carried, measured_errors
 from calibray.prediction.suggestion import suggest
 from calibray.result import Result
 from calibray.result.residuals import ResidualField
-from calibray.scenes.triangles import Triangles
+from calibray.scenes import Triangles
 from calibray.uncertainty.residuals import shared_errors
 from calibray.validation.conformal import FEW, reach
 

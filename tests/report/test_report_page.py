@@ -25,8 +25,7 @@ from calibray.report.scene_mesh import Grid
 from calibray.report.value_list import values
 from calibray.report.wording import summary
 from calibray.result import Result
-from calibray.scenes import read_scene
-from calibray.scenes.triangles import read_triangles
+from calibray.scenes import read_scene, read_triangles
 from calibray.uncertainty.intervals import Interval
 from small_scenes import block, write_scene
 

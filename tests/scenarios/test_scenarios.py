@@ -15,7 +15,7 @@ import pytest
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.scenarios import campaign, demo_study_path, district, sounder, world
-from calibray.scenes.meshes import Mesh, joined, ply_bytes
+from calibray.scenes import Mesh, join_meshes, ply_bytes
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
 from calibray.tracing.default_tracer import trace
@@ -63,7 +63,7 @@ def directed_edges(faces: np.ndarray) -> Counter[tuple[int, int]]:
 
 def welded(meshes: list[Mesh]) -> Mesh:
     """One mesh in which vertices at the same place are one."""
-    mesh = joined(meshes)
+    mesh = join_meshes(meshes)
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     return Mesh(vertices, index.reshape(-1)[mesh.faces])
 
@@ -139,7 +139,7 @@ def test_a_ply_file_is_little_endian_and_complete():
 
 
 def test_the_district_has_the_papers_extent_and_heights():
-    everything = joined(item.mesh for item in district.scene_objects(BUILDINGS))
+    everything = join_meshes(item.mesh for item in district.scene_objects(BUILDINGS))
     span = np.ptp(everything.vertices, axis=0)
     assert span[:2].tolist() == [2100.0, 1700.0]
     assert everything.vertices[:, 2].min() == 0.0

@@ -1,4 +1,4 @@
-"""Floor plans: faces merged to sheets, walls that meet, doors in walls, floors; and what is refused."""
+"""Floor plans: faces merged into sheets, walls that meet, doors in walls, floors; bad plans are refused."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import trimesh
 
 from calibray.errors import InputError
 from calibray.scenes import read_scene
-from calibray.scenes.authoring.floor_plan import make_plan_scene
-from calibray.scenes.authoring.floor_plan_file import Segment, merge_faces, read_plan
-from calibray.scenes.authoring.scene_folder import SurfaceMaterial
+from calibray.scenes.authoring import Segment, SurfaceMaterial, make_plan_scene, merge_faces, read_plan
 
 
 def line(x0, y0, x1, y1, kind="brick", bottom=0.0, top=3.0, thickness=None) -> Segment:
@@ -46,14 +44,14 @@ def test_the_faces_of_a_house_become_five_sheets():
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
-def test_merging_does_not_depend_on_how_the_plan_is_turned(angle):
+def test_merging_does_not_depend_on_the_orientation_of_the_plan(angle):
     cosine, sine = np.cos(angle), np.sin(angle)
 
-    def turned(segment):
+    def rotated(segment):
         ends = [(cosine * x - sine * y, sine * x + cosine * y) for x, y in (segment.start, segment.end)]
         return Segment(*ends, segment.kind, segment.bottom, segment.top)
 
-    sheets, _ = merge_faces([turned(segment) for segment in [*OUTER, *ROOMS]])
+    sheets, _ = merge_faces([rotated(segment) for segment in [*OUTER, *ROOMS]])
     assert sorted(sheet.length for sheet in sheets) == pytest.approx([5.6, 5.8, 5.8, 9.8, 9.8])
 
 
@@ -71,9 +69,20 @@ def test_merging_does_not_depend_on_how_the_plan_is_turned(angle):
         (line(0, 0.3, 4, 1.2), False),
         (line(4.5, 0, 9, 0), False),
     ],
-    ids=["face", "reversed", "far", "type", "height", "thickness", "thick", "beside", "askew", "in line"],
+    ids=[
+        "face",
+        "reversed",
+        "far",
+        "type",
+        "height",
+        "thickness",
+        "thick",
+        "side by side",
+        "askew",
+        "in line",
+    ],
 )
-def test_which_lines_are_faces_of_one_wall(other, merges):
+def test_lines_are_faces_of_one_wall_only_if_all_conditions_hold(other, merges):
     assert merge_faces([line(0, 0, 4, 0), other])[1] == (2 if merges else 0)
 
 
@@ -90,7 +99,7 @@ def test_walls_that_meet_share_their_corners(tmp_path):
     assert made.counts == {"lines": 12, "sheets": 5, "lines merged as faces of one wall": 12}
 
 
-def test_a_door_takes_its_place_in_the_wall(tmp_path):
+def test_doors_and_windows_replace_the_wall(tmp_path):
     plan = [*OUTER, line(2, 0, 3, 0, "door", 0.0, 2.1), line(10, 2, 10, 4, "window", 0.9, 2.2)]
     make_plan_scene(plan, tmp_path, floor=False, ceiling=False)
     assert mesh(tmp_path, "door").area == pytest.approx(2.1)
@@ -109,14 +118,14 @@ def test_types_become_materials(tmp_path):
     types = {"drywall": SurfaceMaterial("drywall", "plasterboard", 0.09)}
     made = make_plan_scene(plan, tmp_path, types, ceiling=False)
     materials = read_scene(made.path, 5e9).materials
-    assert {name: each.thickness for name, each in materials.items()} == {
+    assert {name: material.thickness for name, material in materials.items()} == {
         "brick_wall_120mm": 0.12, "brick_wall_100mm": 0.1, "drywall": 0.09, "floor": 0.2,
     }  # fmt: skip
-    with pytest.raises(InputError, match="type 'brik': has no material, did you mean 'brick'"):
+    with pytest.raises(InputError, match="type 'brik': has no material; did you mean 'brick'"):
         make_plan_scene([line(0, 0, 1, 0, "brik")], tmp_path)
 
 
-def test_a_plan_is_read_with_its_unit(tmp_path):
+def test_a_plan_is_read_in_its_unit(tmp_path):
     path = tmp_path / "plan.csv"
     path.write_text(
         "x0,y0,x1,y1,type,thickness,height,bottom\n0,0,4000,0,Brick,115,,\n0,0,900,0,door,,2000,\n0,0,0,500,glass,,,1000\n"
@@ -140,12 +149,12 @@ def test_a_plan_is_read_with_its_unit(tmp_path):
         ("x0,y0,x1,y1,type,height\n0,0,1,1,brick,-2\n", "row 2: its length, height"),
     ],
 )
-def test_a_plan_that_cannot_be_used_is_refused(tmp_path, text, message):
+def test_bad_plans_are_refused(tmp_path, text, message):
     path = tmp_path / "plan.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         read_plan(path)
-    # What never ends, as /dev/full, is not read.
+    # A device such as /dev/full has no end and is not read.
     for name in (tmp_path / "nowhere.csv", tmp_path, "/dev/full"):
-        with pytest.raises(InputError, match="is no file; check the path"):
+        with pytest.raises(InputError, match="is not a file; check the path"):
             read_plan(name)

@@ -1,4 +1,4 @@
-"""Scene files: materials as Sionna reads them, faults told with place and remedy, and scenes written again."""
+"""Scene files: materials as Sionna reads them, faults named with file and remedy, and scenes exported."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ FLOOR = {"floor": [[(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.0, 0.0), (-9.0,
 ITU = '<bsdf type="itu-radio-material" id="mat-stone"><string name="type" value="{}"/></bsdf>'
 
 
-def test_every_bundled_scene_is_known() -> None:
+def test_bundled_scenes_are_found() -> None:
     assert {"munich", "etoile", "florence", "san_francisco", "simple_street_canyon", "box"} <= set(BUNDLED)
 
 
 @pytest.mark.parametrize("name", BUNDLED)
 def test_constants_equal_sionnas(name: str, tmp_path: Path) -> None:
-    """Against the materials that Sionna itself reads, with one mesh for each, as all meshes would take long."""
+    """Compared with the materials that Sionna itself reads, with one mesh for each, since all meshes take long."""
     root = ElementTree.parse(SCENES / name / f"{name}.xml").getroot()
-    met = set()
+    seen = set()
     for shape in root.findall("shape"):
         material = shape.find("ref").get("id")
-        if material in met:
+        if material in seen:
             root.remove(shape)
             continue
-        met.add(material)
+        seen.add(material)
         filename = shape.find("string[@name='filename']")
         filename.set("value", str(SCENES / name / filename.get("value")))
     ElementTree.ElementTree(root).write(tmp_path / "bare.xml")
     theirs = sionna.rt.load_scene(str(tmp_path / "bare.xml"), merge_shapes=False)
     theirs.frequency = 3.5e9
-    ours = read_scene(f"sionna:{name}", 3.5e9).materials
+    ours = read_scene(tmp_path / "bare.xml", 3.5e9).materials
     assert set(ours) == set(theirs.radio_materials)
     for key, material in ours.items():
         for field in SCALAR_CONSTANTS:
@@ -54,7 +54,11 @@ def test_constants_equal_sionnas(name: str, tmp_path: Path) -> None:
             assert getattr(material, field) == pytest.approx(value, rel=1e-6), (key, field)
 
 
-def test_objects_and_their_materials_in_the_files_order() -> None:
+def test_all_meshes_of_a_bundled_scene_are_read() -> None:
+    assert len(read_scene("sionna:etoile", 3.5e9).objects) == 565
+
+
+def test_objects_and_materials_are_in_the_files_order() -> None:
     scene = read_scene("sionna:box_one_screen", 1e9)
     assert [(entry.name, entry.material) for entry in scene.objects] == [
         ("box", "box-mat"),
@@ -63,7 +67,7 @@ def test_objects_and_their_materials_in_the_files_order() -> None:
     assert list(scene.materials) == ["box-mat", "screen-mat"]
 
 
-# Materials from a file of one's own
+# Materials of other files
 
 
 @pytest.mark.parametrize("bsdf", [
@@ -71,19 +75,19 @@ def test_objects_and_their_materials_in_the_files_order() -> None:
     '<bsdf type="twosided" id="mat-itu_concrete"><bsdf type="diffuse"/></bsdf>',
     '<bsdf type="radio-material" id="mat-itu_concrete"/>',
 ])  # fmt: skip
-def test_itu_materials_by_type_and_by_name(tmp_path: Path, bsdf: str) -> None:
+def test_itu_materials_are_named_by_type_or_by_id(tmp_path: Path, bsdf: str) -> None:
     identifier = re.search('id="(.*?)"', bsdf)[1]
     scene = read_scene(write_scene(tmp_path, FLOOR, bsdf, identifier), 2e9)
     assert scene.materials == {identifier.removeprefix("mat-"): itu_material("concrete", 2e9, thickness=0.1)}
 
 
-def test_constants_in_the_file(tmp_path: Path) -> None:
+def test_constants_are_read_from_the_file(tmp_path: Path) -> None:
     bsdf = CONCRETE.replace("</bsdf>", '<float name="scattering_coefficient" value="0.3"/></bsdf>')
     scene = read_scene(write_scene(tmp_path, FLOOR, bsdf), 2e9)
     assert scene.materials == {"stone": Material(5.0, 0.05, 0.2, 0.3)}
 
 
-def test_overrides_replace_what_they_name(tmp_path: Path) -> None:
+def test_overrides_replace_constants(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
 
     def stone(override: Material | dict[str, object]) -> Material:
@@ -111,31 +115,31 @@ def test_overrides_replace_what_they_name(tmp_path: Path) -> None:
         ("<scene/>", r"the scene has no <shape>"),
     ],
 )
-def test_file_that_is_no_scene(tmp_path: Path, content: str, message: str) -> None:
+def test_a_file_that_is_not_a_scene_is_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "scene.xml").write_text(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as refusal:
         read_scene(tmp_path / "scene.xml", 2e9)
-    assert str(tmp_path / "scene.xml") in str(caught.value)
+    assert str(tmp_path / "scene.xml") in str(refusal.value)
 
 
-def test_binary_file(tmp_path: Path) -> None:
+def test_a_binary_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match="is not well-formed XML"):
         read_scene(tmp_path / "scene.xml", 2e9)
 
 
 @pytest.mark.parametrize("name", ["absent.xml", "."])
-def test_missing_file(tmp_path: Path, name: str) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="does not exist; check the path"):
         read_scene(tmp_path / name, 2e9)
 
 
-def test_unknown_bundled_scene() -> None:
+def test_an_unknown_bundled_scene_is_refused() -> None:
     with pytest.raises(InputError, match=r"'sionna:munch'.*it has .*munich"):
         read_scene("sionna:munch", 2e9)
 
 
-def test_missing_mesh(tmp_path: Path) -> None:
+def test_a_missing_mesh_is_refused(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
     (tmp_path / "meshes" / "floor.ply").unlink()
     with pytest.raises(
@@ -144,7 +148,7 @@ def test_missing_mesh(tmp_path: Path) -> None:
         read_scene(file, 2e9)
 
 
-def test_damaged_mesh_is_told_by_the_tracer(tmp_path: Path) -> None:
+def test_a_damaged_serialized_mesh_is_refused_by_the_tracer(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
     (tmp_path / "meshes" / "floor.ply").rename(tmp_path / "meshes" / "floor.serialized")
     file.write_text(
@@ -153,31 +157,6 @@ def test_damaged_mesh_is_told_by_the_tracer(tmp_path: Path) -> None:
     links = SimpleNamespace(tx=np.zeros((1, 3)), rx=np.ones((1, 3)))
     with pytest.raises(InputError, match=r"scene\.xml: Sionna RT cannot load the scene"):
         cb.trace(file, links, frequency=2e9, max_depth=0, samples=1)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", r"line 3: 'v 0 nan 0': a vertex is three finite numbers"),
-        ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0': a vertex is"),
-        (
-            "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n",
-            "line 4: 'f 1 2 4': a face names three or more of the 3 vertices",
-        ),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 -2//1\n", "line 4: .*a face names three"),
-        ("v 0 0 0\n", "has no faces"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1/1 -2/2/2 -1\n", None),
-    ],
-)
-def test_an_obj_mesh_that_cannot_be_traced_is_refused(tmp_path: Path, text: str, message: str | None) -> None:
-    file = write_scene(tmp_path, FLOOR)
-    (tmp_path / "meshes" / "floor.obj").write_text(text)
-    file.write_text(file.read_text().replace("floor.ply", "floor.obj").replace('"ply"', '"obj"'))
-    if message is None:
-        assert read_scene(file, 2e9).materials
-        return
-    with pytest.raises(InputError, match=message):
-        read_scene(file, 2e9)
 
 
 @pytest.mark.parametrize(
@@ -202,11 +181,11 @@ def test_a_transform_that_flattens_a_shape_is_refused(tmp_path: Path, step: str,
     if sound:
         assert read_scene(file, 2e9).materials
         return
-    with pytest.raises(InputError, match=r"of shape 'mesh-sheet' is .*leave the shape its width"):
+    with pytest.raises(InputError, match=r"of shape 'mesh-sheet' is .*do not flatten the shape"):
         read_scene(file, 2e9)
 
 
-def test_shape_without_a_material(tmp_path: Path) -> None:
+def test_a_shape_without_a_material_is_refused(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR, material="mat-other")
     with pytest.raises(
         InputError, match=r"shape 'mesh-floor' refers to no <bsdf> of the scene; give it a material"
@@ -214,7 +193,7 @@ def test_shape_without_a_material(tmp_path: Path) -> None:
         read_scene(file, 2e9)
 
 
-def test_material_without_radio_constants(tmp_path: Path) -> None:
+def test_a_material_without_radio_constants_needs_an_override(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR, '<bsdf type="diffuse" id="mat-stone"/>')
     with pytest.raises(
         InputError, match=r"material 'stone': its BSDF of type 'diffuse' has no radio constants; give"
@@ -233,7 +212,7 @@ def test_material_without_radio_constants(tmp_path: Path) -> None:
         ("conductivity", "nan", r"conductivity = nan: must be"),
     ],
 )
-def test_constant_outside_physics_in_the_file(tmp_path: Path, field: str, value: str, message: str) -> None:
+def test_constants_out_of_bounds_are_refused(tmp_path: Path, field: str, value: str, message: str) -> None:
     bsdf = re.sub(rf'name="{field}" value="[^"]*"', f'name="{field}" value="{value}"', CONCRETE)
     with pytest.raises(InputError, match=rf"material 'stone': {message}"):
         read_scene(write_scene(tmp_path, FLOOR, bsdf), 2e9)
@@ -258,13 +237,13 @@ def test_constant_outside_physics_in_the_file(tmp_path: Path, field: str, value:
         ),
     ],
 )
-def test_override_that_cannot_be_used(tmp_path: Path, overrides: dict, message: str) -> None:
+def test_bad_overrides_are_refused(tmp_path: Path, overrides: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_scene(write_scene(tmp_path, FLOOR), 2e9, overrides)
 
 
 @pytest.mark.parametrize("frequency", [0.5e9, 150e9])
-def test_frequency_outside_the_itu_range_is_rescued_by_constants(tmp_path: Path, frequency: float) -> None:
+def test_a_frequency_outside_the_itu_range_needs_constants(tmp_path: Path, frequency: float) -> None:
     """NVlabs/sionna-rt#71: Sionna itself refuses the scene before the constants can be given."""
     file = write_scene(tmp_path, FLOOR, ITU.format("concrete"))
     with pytest.raises(InputError, match=r"material 'stone': .*concrete.*1.*100 GHz"):
@@ -277,7 +256,7 @@ def test_frequency_outside_the_itu_range_is_rescued_by_constants(tmp_path: Path,
     assert paths.num_paths == 2
 
 
-# Scenes written again
+# Exported scenes
 
 
 def links_in_the_canyon() -> SimpleNamespace:
@@ -285,8 +264,8 @@ def links_in_the_canyon() -> SimpleNamespace:
     return SimpleNamespace(tx=np.tile([-20.0, 2, 15], (4, 1)), rx=rx)
 
 
-def test_exported_scene_traces_to_the_same_path_loss(tmp_path: Path) -> None:
-    """Calibrated constants, written into a scene: read back by us, and loaded by Sionna alone."""
+def test_an_exported_scene_has_the_same_path_loss(tmp_path: Path) -> None:
+    """Calibrated constants in an exported scene, read by Calibray and by Sionna alone."""
     source, frequency, options = "sionna:simple_street_canyon", 3.5e9, {"max_depth": 2, "samples": 20_000}
     links = links_in_the_canyon()
     original = cb.trace(source, links, frequency=frequency, **options)
@@ -313,15 +292,15 @@ def test_exported_scene_traces_to_the_same_path_loss(tmp_path: Path) -> None:
     scene.add(sionna.rt.Transmitter("tx", links.tx[0].tolist()))
     for index, position in enumerate(links.rx):
         scene.add(sionna.rt.Receiver(f"rx-{index}", position.tolist()))
-    found = sionna.rt.PathSolver(deterministic=True)(
+    paths = sionna.rt.PathSolver(deterministic=True)(
         scene, max_depth=2, refraction=False, samples_per_src=20_000, seed=1
     )
-    power = sum(part.numpy() ** 2 for part in found.a).sum(axis=(1, 2, 3, 4))
+    power = sum(part.numpy() ** 2 for part in paths.a).sum(axis=(1, 2, 3, 4))
     np.testing.assert_allclose(-10 * np.log10(power), expected, atol=0.01)
     assert sorted(path.name for path in target.parent.iterdir()) == [SIGNATURES, "calibrated.xml"]
 
 
-def test_exported_material_avoids_names_that_sionna_keeps_for_itu(tmp_path: Path) -> None:
+def test_exported_materials_avoid_names_that_sionna_reserves(tmp_path: Path) -> None:
     target = tmp_path / "out.xml"
     scene = read_scene("sionna:floor_wall", 3.5e9)
     assert set(scene.materials) <= set(ITU_MATERIALS["P.2040-3"])
@@ -329,7 +308,7 @@ def test_exported_material_avoids_names_that_sionna_keeps_for_itu(tmp_path: Path
     assert set(read_scene(target, 3.5e9).materials) == {f"calibrated-{name}" for name in scene.materials}
 
 
-def test_exported_scene_keeps_its_meshes_when_exported_from_a_folder_to_another(tmp_path: Path) -> None:
+def test_an_exported_scene_finds_its_meshes_from_another_folder(tmp_path: Path) -> None:
     file = write_scene(tmp_path / "here", {"house": block((-1, -1, 0), (1, 1, 2)), **FLOOR})
     (tmp_path / "there").mkdir()
     export_scene(read_scene(file, 1e9), {"stone": Material(3.0, 0.2, 0.1)}, tmp_path / "there" / "scene.xml")
@@ -348,140 +327,7 @@ def test_export_needs_every_material(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# Meshes and shapes that would end the process, or lose reflections in silence
-
-HEADER = """ply
-format {} 1.0
-element vertex {}
-property float x
-property float y
-property float z
-element face {}
-property list uchar int vertex_indices
-end_header
-"""
-CORNERS = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
-FACES = [[0, 1, 2], [0, 2, 3]]
-KINDS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-def mesh(
-    kind: str = "ascii", corners: np.ndarray = CORNERS, faces: list[list[int]] = FACES, header: str = HEADER
-) -> bytes:
-    """A PLY file, its faces of any number of corners."""
-    head = header.format(kind, len(corners), len(faces)).encode()
-    if kind == "ascii":
-        rows = [*corners.tolist(), *([len(face), *face] for face in faces)]
-        return head + "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
-    order = KINDS[kind]
-    packed = [bytes([len(face)]) + np.array(face, dtype=f"{order}i4").tobytes() for face in faces]
-    return head + corners.astype(f"{order}f4").tobytes() + b"".join(packed)
-
-
-def scene_of(folder: Path, content: bytes) -> Path:
-    """A scene of one PLY mesh."""
-    file = write_scene(folder, FLOOR)
-    (folder / "meshes" / "floor.ply").write_bytes(content)
-    return file
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_sound_meshes_pass_and_reflect(tmp_path: Path, kind: str) -> None:
-    links = SimpleNamespace(tx=np.array([[0.0, 0, 3]]), rx=np.array([[4.0, 0, 2]]))
-    file = scene_of(tmp_path, mesh(kind))
-    assert [entry.name for entry in read_scene(file, 2e9).objects] == ["floor"]
-    if kind != "binary_big_endian":
-        assert cb.trace(file, links, frequency=2e9, max_depth=1, samples=1000).num_paths == 2
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        HEADER.replace("\n", "\r\n"),
-        HEADER.replace("float", "double"),
-        HEADER.replace("vertex_indices", "vertex_index").replace("int", "uint"),
-        HEADER.replace("element vertex", "comment made by hand\nobj_info none\nelement vertex"),
-        HEADER.replace("end_header", "element edge 0\nproperty int a\nend_header"),
-    ],
-)
-def test_meshes_written_in_other_ways_pass(tmp_path: Path, header: str) -> None:
-    read_scene(scene_of(tmp_path, mesh(header=header)), 2e9)
-
-
-def test_meshes_with_more_columns_pass(tmp_path: Path) -> None:
-    header = HEADER.replace("property float z\n", "property float z\nproperty float red\n")
-    coloured = np.hstack([CORNERS, np.ones((4, 1))])
-    for kind in KINDS:
-        read_scene(scene_of(tmp_path, mesh(kind, coloured, header=header)), 2e9)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    ("corners", "faces", "message"),
-    [
-        (CORNERS, [[0, 1, 2], [0, 2, 4]], r"face 1 names vertex 4, must be 0 to 3"),
-        (CORNERS, [[0, 1, 99_999_999], [0, 2, 3]], r"face 0 names vertex 1e\+08, must be 0 to 3"),
-        (CORNERS, [[0, 1, 2], [0, -1, 3]], r"face 1 names vertex -1, must be 0 to 3"),
-        (
-            CORNERS,
-            [[0, 1, 2, 3]],
-            "cut short|face 0 has 4 corners, must have 3|face of more than three corners",
-        ),
-        (np.where(CORNERS == 9, np.nan, CORNERS), FACES, r"x of vertex 1 is nan, must be finite"),
-        (np.where(CORNERS == 9, np.inf, CORNERS), FACES, r"x of vertex 1 is inf, must be finite"),
-        (CORNERS, [], "has no vertices or no faces"),
-        (CORNERS[:0], [], "has no vertices or no faces"),
-    ],
-)
-def test_malformed_meshes(
-    tmp_path: Path, kind: str, corners: np.ndarray, faces: list[list[int]], message: str
-) -> None:
-    """Sionna RT ends the process at the first, and loses the reflection of the second."""
-    with pytest.raises(InputError, match=rf"mesh .*floor\.ply: .*({message}).*; export it again") as caught:
-        read_scene(scene_of(tmp_path, mesh(kind, corners, faces)), 2e9)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_meshes_cut_or_flipped_anywhere_are_refused_or_as_sound_as_any(tmp_path: Path, kind: str) -> None:
-    whole, random = mesh(kind), np.random.default_rng(3)
-    file = scene_of(tmp_path, whole)
-    body = whole.index(b"end_header") + 11
-    for cut in random.integers(len(whole) - 4, size=40):
-        (tmp_path / "meshes" / "floor.ply").write_bytes(whole[:cut])
-        with pytest.raises(InputError, match=r"floor\.ply"):
-            read_scene(file, 2e9)
-    for place in random.integers(body if kind == "ascii" else len(whole), size=150):
-        flipped = bytearray(whole)
-        flipped[place] ^= 1 << int(random.integers(8))
-        (tmp_path / "meshes" / "floor.ply").write_bytes(flipped)
-        try:
-            read_scene(file, 2e9)
-        except InputError as error:
-            assert "\n" not in str(error)  # noqa: PT017
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (b"ply", b"plx", "is no PLY file"),
-        (b"end_header", b"end_of_it", "its header has no end"),
-        (b"format ascii 1.0\n", b"", "its header names no format"),
-        (b"ascii", b"morse", "cannot read its header's line 'format morse 1.0'"),
-        (b"vertex 4", b"vertex 9999999999999999", "is cut short"),
-        (b"vertex 4", b"vertex -4", "cannot read its header's line"),
-        (b"vertex 4", b"vertex " + b"9" * 5000, "cannot read its header's line"),
-        (b"float x", b"float w", "its vertices have no x"),
-        (b"float x", b"float y", "cannot be read"),
-        (b"list uchar int vertex_indices", b"list uchar int holes", "cannot be read"),
-        (b"list uchar int vertex_indices", b"int a", "no corners|cut short|face"),
-        (b"9.0", b"nine", "is cut short|holds what is no number"),
-        (b"9.0", b"\xff\xfe", "holds what is no number"),
-    ],
-)
-def test_malformed_headers(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
-    with pytest.raises(InputError, match=rf"floor\.ply: .*({message})"):
-        read_scene(scene_of(tmp_path, mesh().replace(old, new, 1)), 2e9)
+# Shapes and names
 
 
 @pytest.mark.parametrize(
@@ -505,8 +351,8 @@ def test_malformed_headers(tmp_path: Path, old: bytes, new: bytes, message: str)
             '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter><shape',
             "file 'sky.exr' of a emitter does not exist",
         ),
-        ("<shape", "<a>" * 100 + "</a>" * 100 + "<shape", "more than 64 deep in each other"),
-        ("<shape", "<a>" * 300_000, "more than 64 deep in each other"),
+        ("<shape", "<a>" * 100 + "</a>" * 100 + "<shape", "nested more than 64 deep"),
+        ("<shape", "<a>" * 300_000, "nested more than 64 deep"),
         ("<scene", '<?xml version="1.0" encoding="banana"?><scene', "is not well-formed XML .*unknown encoding"),
         ("<scene", '<?xml version="1.0" encoding="utf-32"?><scene', "is not well-formed XML .*as UTF-8"),
         (
@@ -524,16 +370,16 @@ def test_malformed_headers(tmp_path: Path, old: bytes, new: bytes, message: str)
     ],
     ids=lambda value: value[:20],
 )  # fmt: skip
-def test_scenes_that_cannot_be_taken(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_unsupported_scenes_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     file = write_scene(tmp_path, FLOOR)
     file.write_text(file.read_text().replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as refusal:
         read_scene(file, 2e9)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 1000
+    assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 1000
 
 
 @pytest.mark.parametrize("name", ["s" * 5000 + ".xml", "a\0b.xml", "sionna:" + "x" * 5000, "sionna:a\0b"])
-def test_names_that_no_file_can_have(name: str) -> None:
+def test_impossible_file_names_are_refused(name: str) -> None:
     with pytest.raises(InputError, match=r"does not exist|bundles no such scene"):
         read_scene(name, 2e9)

@@ -15,12 +15,8 @@ from calibray.cli.app import app
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, column_names
-from calibray.scenes.authoring.floor_plan import make_plan_scene
-from calibray.scenes.authoring.floor_plan_file import read_plan
-from calibray.scenes.authoring.footprints import Footprints
-from calibray.scenes.authoring.scene_folder import make_scene
-from calibray.scenes.authoring.terrain import Terrain
-from calibray.scenes.checks.heights import Overhead
+from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
+from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
 from calibray.study.draft import draft
 from calibray.study.schema import schema_text
@@ -152,8 +148,8 @@ def test_a_track_and_a_hill(tmp_path):
               track=tmp_path / "walk.gpx")  # fmt: skip
     # Beyond the scene there is no ground to count from.
     far = links.frame.assign(time=clock[:5])
-    with pytest.raises(InputError, match=r"no ground at 5 of 5 places"):
-        Overhead.of(scene).ground(far["rx_x"] + 500.0, far["rx_y"])
+    with pytest.raises(InputError, match=r"no ground at 5 of 5 positions"):
+        SceneSurfaces.read(scene).ground_height(far["rx_x"] + 500.0, far["rx_y"])
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import pytest
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import LINK_COLUMNS, SourceTable
-from calibray.scenes.authoring.footprints import Footprints
-from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring import Footprints, make_scene
 from calibray.study import Study, row_steps
 
 FRAME = Frame.local(9.99, 50.01)

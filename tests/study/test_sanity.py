@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 from calibray.cli.app import app
 from calibray.errors import InputError
-from calibray.scenes.authoring.footprints import Footprints
-from calibray.scenes.authoring.scene_folder import make_scene
+from calibray.scenes.authoring import Footprints, make_scene
 from calibray.study import Study
 from calibray.study.link_checks import examine
 

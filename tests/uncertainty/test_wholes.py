@@ -12,8 +12,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
-from calibray.scenes.buildings import wholes
-from calibray.scenes.triangles import Triangles
+from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
 from calibray.uncertainty import buildings as calibration_buildings
 from calibray.uncertainty import hierarchy
@@ -45,7 +44,7 @@ def scene(*boxes: np.ndarray) -> Triangles:
 
 def test_streets_part_buildings_and_what_touches_is_one():
     found = scene(upright((0, 0), (20, 10)), upright((20.0, 0), (40, 10)), upright((45, 0), (60, 10)))
-    first, second, beside, inside = wholes(
+    first, second, beside, inside = building_numbers(
         found, np.array([[0.0, 5.0, 3.0], [40.0, 5.0, 3.0], [45.0, 5.0, 3.0], [52.0, 5.0, 10.0]])
     )
     assert first == second
@@ -54,7 +53,7 @@ def test_streets_part_buildings_and_what_touches_is_one():
 
 
 def test_a_scene_of_ground_alone_has_none():
-    assert wholes(scene(), np.zeros((2, 3))).tolist() == [-1, -1]
+    assert building_numbers(scene(), np.zeros((2, 3))).tolist() == [-1, -1]
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
     with progress_bars(log()) as progress:
         from calibray.report import scene_tables as report
-        from calibray.scenes.checks.scene_check import diagnose
+        from calibray.scenes.checks import check_scene
         from calibray.study import Study
         from calibray.tables.text import render
 
@@ -67,7 +67,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
         if plot is not None and study is None:
             raise InputError(f"--plot: {subject} is a scene, whose antennas are not known; name a study file")
         source = subject if study is None else study.scene_source
-        found = diagnose(source, progress)
+        found = check_scene(source, progress)
     typer.echo(render(*report.diagnosed(found), report.objects(found)))
     if plot is not None and study is not None:
         _draw(study, plot, overwrite)

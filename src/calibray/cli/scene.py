@@ -12,8 +12,7 @@ from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
-    from calibray.scenes.authoring.footprints import Footprints
-    from calibray.scenes.authoring.scene_folder import Made, SurfaceMaterial
+    from calibray.scenes.authoring import Footprints, MadeScene, SurfaceMaterial
     from calibray.support.progress import Progress
 
 SUMMARY: Final = "Make a scene of an OpenStreetMap extract, of footprints with heights, or of a floor plan."
@@ -84,8 +83,7 @@ def osm(
 ) -> None:
     """Make a scene of the buildings of an OpenStreetMap extract."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring.footprints import HeightRule
-    from calibray.scenes.authoring.openstreetmap import read_openstreetmap
+    from calibray.scenes.authoring import HeightRule, read_openstreetmap
     from calibray.support.output_files import check_folder
 
     check_folder(out)
@@ -128,8 +126,7 @@ def footprints(
 ) -> None:
     """Make a scene of building footprints with heights."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring.footprints import HeightRule
-    from calibray.scenes.authoring.vector_files import read_footprints
+    from calibray.scenes.authoring import HeightRule, read_footprints
     from calibray.support.output_files import check_folder
 
     check_folder(out)
@@ -168,8 +165,7 @@ def plan(
 ) -> None:
     """Make a scene of a floor plan: one sheet for every wall, door and window."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring.floor_plan import make_plan_scene
-    from calibray.scenes.authoring.floor_plan_file import read_plan
+    from calibray.scenes.authoring import make_plan_scene, read_plan
 
     types = _types(material or [])
     with progress_bars(log()) as progress:
@@ -178,7 +174,7 @@ def plan(
     _tell(made)
 
 
-def _tell(made: Made) -> None:
+def _tell(made: MadeScene) -> None:
     """Print what was made."""
     from calibray.report import scene_tables as report
     from calibray.tables.text import render
@@ -199,13 +195,12 @@ def _made(
     margin: float,
     per_building: bool,
     progress: Progress,
-) -> Made:
+) -> MadeScene:
     """A scene of footprints."""
     import numpy as np
 
-    from calibray.scenes.authoring.extrusion import Windows as Division
-    from calibray.scenes.authoring.scene_folder import Palette, make_scene
-    from calibray.scenes.authoring.terrain import lowered, read_terrain
+    from calibray.scenes.authoring import Palette, lower_origin, make_scene, read_terrain
+    from calibray.scenes.authoring import Windows as Division
 
     palette = Palette(
         wall=_material("walls", wall, 0.3),
@@ -216,7 +211,7 @@ def _made(
     surface = None
     if terrain is not None:
         bounds = found.bounds + margin * np.array([-1, -1, 1, 1])
-        surface, frame = lowered(read_terrain(terrain, frame, bounds, spacing), frame)
+        surface, frame = lower_origin(read_terrain(terrain, frame, bounds, spacing), frame)
     typer.echo(f"Making a scene of {len(found)} buildings", err=True)
     progress("making", 0, None)
     return make_scene(found, out, frame, surface, palette, windows, margin, per_building=per_building)
@@ -239,7 +234,7 @@ def _frame(origin: str | None, utm: bool) -> Frame | None:
 
 def _types(given: list[str]) -> dict[str, SurfaceMaterial]:
     """Materials by type of wall, from words such as `drywall=plasterboard:0.1`."""
-    from calibray.scenes.authoring.floor_plan import WALL_THICKNESS
+    from calibray.scenes.authoring import WALL_THICKNESS
 
     types = {}
     for words in given:
@@ -259,7 +254,7 @@ def _number_or_column(text: str) -> str | float:
 
 def _material(name: str, text: str, thickness: float) -> SurfaceMaterial:
     """A material from a P.2040 name and, after a colon, a thickness [m]."""
-    from calibray.scenes.authoring.scene_folder import SurfaceMaterial
+    from calibray.scenes.authoring import SurfaceMaterial
 
     itu, parted, given = text.partition(":")
     try:

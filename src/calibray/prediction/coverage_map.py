@@ -22,8 +22,7 @@ from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import piece_size, predicted
 from calibray.prediction.predict import as_links, opened
-from calibray.scenes.authoring.ground import ground_heights
-from calibray.scenes.triangles import Triangles, read_triangles
+from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.study import Study
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
-from calibray.scenes.triangles import Triangles, read_triangles
+from calibray.scenes import Triangles, read_triangles
 from calibray.study import Setup
 
 if TYPE_CHECKING:

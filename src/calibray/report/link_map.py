@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.report.link_survey import Survey
-from calibray.scenes.triangles import LEVEL, Triangles
+from calibray.scenes import Triangles
+from calibray.scenes.triangles import LEVEL
 
 WIDTH: Final = 1000
 """Width of the map in its own units; its height follows."""

@@ -33,8 +33,7 @@ from calibray.report.value_list import values
 from calibray.report.wording import summary
 from calibray.result import tables
 from calibray.result.diagnostics import remarkable
-from calibray.scenes import Scene, read_scene
-from calibray.scenes.triangles import Triangles, read_triangles
+from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.tables import Column, Table, numbers
 from calibray.tables.display import hertz

@@ -11,10 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from calibray.report.style import BLUE, FAINT, INK, LINE, ORANGE, dress, styled
-from calibray.scenes.authoring.ground import is_ground
-from calibray.scenes.checks.scene_check import read_meshes
-from calibray.scenes.scene_file import find_scene
-from calibray.scenes.triangles import LEVEL
+from calibray.scenes import read_meshes
+from calibray.scenes.triangles import LEVEL, is_ground
 
 
 @styled()
@@ -35,12 +33,11 @@ def draw_positions(
     Raises:
         InputError: The scene cannot be read.
     """
-    path, root = find_scene(source)
     figure = Figure(figsize=(8, 8), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     dress(axes, "x, east [m]", "y, north [m]")
     axes.grid(visible=False)
-    meshes = [mesh for _, _, mesh in read_meshes(path, root)]
+    meshes = [item.mesh for item in read_meshes(source)]
     whole = np.ptp(np.concatenate([mesh.vertices[:, :2] for mesh in meshes]), axis=0)
     for mesh in meshes:
         if not is_ground(mesh, whole):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.report.link_survey import Survey
 from calibray.report.rays import Rays
-from calibray.scenes.triangles import Triangles
+from calibray.scenes import Triangles
 
 STEPS: Final = 65_535
 TRIANGLES: Final = 250_000

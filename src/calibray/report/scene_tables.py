@@ -14,8 +14,8 @@ from calibray.support.output_files import check_file, replacing
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
-    from calibray.scenes.authoring.scene_folder import Made
-    from calibray.scenes.checks.scene_check import Finding, SceneDiagnosis
+    from calibray.scenes.authoring import MadeScene
+    from calibray.scenes.checks import Finding, SceneCheck
     from calibray.study.draft import Draft
 
 LISTED: Final = 12  # names that are told before the rest is only counted
@@ -26,11 +26,11 @@ _GUESSES: Final = {
 }
 
 
-def made(scene: Made) -> Table:
+def made(scene: MadeScene) -> Table:
     """What was made and assumed.
 
     Args:
-        scene: What `calibray.scenes.authoring.scene_folder` returned.
+        scene: What `calibray.scenes.authoring` returned.
 
     Returns:
         A table of two columns without headings.
@@ -48,7 +48,7 @@ def made(scene: Made) -> Table:
     return Table("", (Column(), Column()), tuple(rows))
 
 
-def _origin(scene: Made) -> str:
+def _origin(scene: MadeScene) -> str:
     if scene.frame is None:
         return ""
     longitude, latitude, height = scene.frame.to_geographic([0.0, 0.0, 0.0])
@@ -60,11 +60,11 @@ def _listed(names: Sequence[str]) -> str:
     return f"{len(names)} buildings: {told}"
 
 
-def diagnosed(found: SceneDiagnosis) -> list[Table]:
+def diagnosed(found: SceneCheck) -> list[Table]:
     """What a scene is like and what is wrong with it.
 
     Args:
-        found: What `calibray.scenes.checks.scene_check.diagnose` found.
+        found: What `calibray.scenes.checks.check_scene` found.
 
     Returns:
         Two tables: size and verdict, then the findings, the worst first, like ones together.
@@ -86,7 +86,7 @@ def diagnosed(found: SceneDiagnosis) -> list[Table]:
         ),
     )
     rows = [
-        (finding.severity, finding.place or "scene", finding.problem, finding.remedy)
+        (finding.severity, finding.subject or "scene", finding.problem, finding.remedy)
         for finding in found.findings[:LISTED]
     ]
     if len(found.findings) > LISTED:
@@ -95,11 +95,11 @@ def diagnosed(found: SceneDiagnosis) -> list[Table]:
     return [size, Table("Findings", columns, tuple(rows))] if rows else [size]
 
 
-def objects(found: SceneDiagnosis) -> Table:
+def objects(found: SceneCheck) -> Table:
     """The meshes of a scene, counted.
 
     Args:
-        found: What `calibray.scenes.checks.scene_check.diagnose` found.
+        found: What `calibray.scenes.checks.check_scene` found.
 
     Returns:
         One row a mesh.
@@ -140,7 +140,7 @@ def warned(findings: Sequence[Finding]) -> str:
     Returns:
         The lines; empty if there are none.
     """
-    return "\n".join(f"Warning: {each.place}: {each.problem}; {each.remedy}" for each in findings)
+    return "\n".join(f"Warning: {each.subject}: {each.problem}; {each.remedy}" for each in findings)
 
 
 PICTURES: Final = (".png", ".svg", ".pdf")

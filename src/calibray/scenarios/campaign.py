@@ -16,7 +16,7 @@ from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import lamp_places, scene_objects
 from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
-from calibray.scenes.meshes import write_scene
+from calibray.scenes import write_scene
 from calibray.tracing.default_tracer import trace
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}

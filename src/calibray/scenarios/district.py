@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.scenes.meshes import Mesh, MeshObject, joined
+from calibray.scenes import Mesh, MeshObject, join_meshes
 
 SEED: Final = 2026
 EXTENT: Final = (2100.0, 1700.0)  # [m], east-west and north-south
@@ -167,8 +167,8 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
     roof = np.column_stack([here + 2 * count, there + 2 * count, np.full(count, 3 * count)])
     concrete = [walls[~is_window].reshape(-1, 3), walls.reshape(-1, 3) + count, roof]
     return (
-        joined([Mesh(np.vstack([rings, apex]), np.concatenate(concrete))]),
-        joined([Mesh(rings, walls[is_window].reshape(-1, 3))]),
+        join_meshes([Mesh(np.vstack([rings, apex]), np.concatenate(concrete))]),
+        join_meshes([Mesh(rings, walls[is_window].reshape(-1, 3))]),
     )
 
 
@@ -199,7 +199,7 @@ def lamp_posts() -> Mesh:
     sides = _quads(here, np.roll(here, -1), 4).reshape(-1, 3)
     faces = np.concatenate([sides, [[4, 5, 6], [4, 6, 7]]])
     corners = LAMP_HALF_WIDTH * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    return joined(Mesh(_rings(place + corners, (0.0, LAMP_HEIGHT)), faces) for place in lamp_places())
+    return join_meshes(Mesh(_rings(place + corners, (0.0, LAMP_HEIGHT)), faces) for place in lamp_places())
 
 
 def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -302,15 +302,15 @@ def _ground(layout: Layout) -> tuple[Mesh, Mesh]:
     cells = _quads(corner, corner + 1, len(x))
     is_roadway = (column % 2 == 1) | (row % 2 == 1)
     return (
-        joined([Mesh(vertices, cells[~is_roadway].reshape(-1, 3))]),
-        joined([Mesh(vertices, cells[is_roadway].reshape(-1, 3))]),
+        join_meshes([Mesh(vertices, cells[~is_roadway].reshape(-1, 3))]),
+        join_meshes([Mesh(vertices, cells[is_roadway].reshape(-1, 3))]),
     )
 
 
 def _by_material(name: str, meshes: dict[str, list[Mesh]]) -> list[MeshObject]:
     several = len(meshes) > 1
     return [
-        MeshObject(f"{name}_{index}" if several else name, material, joined(meshes[material]))
+        MeshObject(f"{name}_{index}" if several else name, material, join_meshes(meshes[material]))
         for index, material in enumerate(sorted(meshes))
     ]
 

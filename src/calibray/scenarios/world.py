@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.scenarios.district import Building, district, lamp_posts, scene_objects
-from calibray.scenes.meshes import MeshObject
+from calibray.scenes import MeshObject
 
 SEED: Final = 1
 FREQUENCY: Final = 4e9  # [Hz]

@@ -4,8 +4,9 @@ This package reads and writes scenes; `scenes.checks` finds faults in a scene an
 makes scenes from maps and floor plans. Both import from here, and not from each other.
 """
 
+from calibray.scenes.buildings import building_numbers
 from calibray.scenes.export import export_scene
-from calibray.scenes.meshes import Mesh, MeshObject, join_meshes
+from calibray.scenes.meshes import Mesh, MeshObject, join_meshes, ply_bytes, read_mesh
 from calibray.scenes.scene import Scene, SceneObject, check_material_name, read_scene
 from calibray.scenes.scene_file import find_scene, read_frame, write_scene
 from calibray.scenes.triangles import Triangles, ground_heights, read_meshes, read_triangles
@@ -16,12 +17,15 @@ __all__ = [
     "Scene",
     "SceneObject",
     "Triangles",
+    "building_numbers",
     "check_material_name",
     "export_scene",
     "find_scene",
     "ground_heights",
     "join_meshes",
+    "ply_bytes",
     "read_frame",
+    "read_mesh",
     "read_meshes",
     "read_scene",
     "read_triangles",

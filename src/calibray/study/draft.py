@@ -25,10 +25,8 @@ from calibray.measurements import (
     select_rows,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
-from calibray.scenes.authoring.scene_folder import read_frame
-from calibray.scenes.checks.crossings import crossings
-from calibray.scenes.checks.heights import Overhead
-from calibray.scenes.scene_file import find_scene
+from calibray.scenes import read_frame
+from calibray.scenes.checks import SceneSurfaces, count_crossings
 from calibray.study.draft_parameters import calibratable
 from calibray.study.draft_text import toml
 from calibray.study.model import BUNDLED, VERSION
@@ -127,9 +125,9 @@ class _Drafting:
         self.sites = None if self.transmitters is None else read_table(self.transmitters)
 
     @cached_property
-    def overhead(self) -> Overhead:
+    def overhead(self) -> SceneSurfaces:
         """What lies above and below places of the scene."""
-        return Overhead.of(self.scene)
+        return SceneSurfaces.read(self.scene)
 
     def content(self) -> dict[str, Any]:
         """The sections of the study."""
@@ -287,7 +285,7 @@ class _Drafting:
         self._assume("links.rx", ", ".join(map(str, section["rx"])), reason)
         if rx.position == "geographic":
             section["position"] = "geographic"
-            if read_frame(find_scene(self.scene)[0]) is None:
+            if read_frame(self.scene) is None:
                 raise InputError(
                     f"{self.links}: positions are in degrees, and {self.scene} does not say where it lies; make it "
                     "with `calibray scene`, or write scene.origin into a study of your own"
@@ -407,7 +405,7 @@ class _Drafting:
             return
         links = self._links(section)
         try:
-            ground = self.overhead.ground(*np.concatenate([links.tx, links.rx])[:, :2].T)
+            ground = self.overhead.ground_height(*np.concatenate([links.tx, links.rx])[:, :2].T)
         except InputError:
             return  # somewhere the scene ends, or has no floor
         if np.abs(ground).max() > _LEVEL:
@@ -420,7 +418,7 @@ class _Drafting:
     def _indoors(self, section: dict[str, Any]) -> bool:
         """Whether most receivers have a ceiling above them."""
         links = self._links(section)
-        share = float(self.overhead.roofed(links.rx).mean())
+        share = float(self.overhead.under_roof(links.rx).mean())
         indoors = share > 0.5
         told = f"{share:.0%} of the receivers have something above them"
         self._assume("trace", "through walls" if indoors else "around buildings", told)
@@ -429,7 +427,7 @@ class _Drafting:
     def _depth(self, section: dict[str, Any]) -> int:
         """As many interactions as the straight lines of nearly all links cross walls, and two for reflections."""
         links = self._links(section)
-        walls = int(np.quantile(crossings(self.overhead.walls, links.tx, links.rx), 0.95))
+        walls = int(np.quantile(count_crossings(self.overhead.walls, links.tx, links.rx), 0.95))
         depth = int(np.clip(walls + 2, *_DEPTHS))
         self._assume(
             "trace.max_depth",

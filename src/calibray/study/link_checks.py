@@ -15,8 +15,7 @@ from scipy.constants import speed_of_light
 from calibray.errors import InputError
 from calibray.measurements import Measurements
 from calibray.measurements.column_names import words
-from calibray.scenes.checks.heights import Overhead
-from calibray.scenes.checks.scene_check import Finding
+from calibray.scenes.checks import Finding, SceneSurfaces
 from calibray.tracing.gain_table import read_gain_table
 
 if TYPE_CHECKING:
@@ -53,27 +52,27 @@ def examine(study: Study, links: Measurements) -> tuple[Finding, ...]:
     Raises:
         InputError: All links lie far from the scene, the scene cannot be read, or shapely or trimesh is not installed.
     """
-    overhead = Overhead.of(study.scene_source)
+    overhead = SceneSurfaces.read(study.scene_source)
     return (*_places(overhead, links), *_levels(study, links), *_angles(study, links))
 
 
-def _places(overhead: Overhead, links: Measurements) -> Iterator[Finding]:
+def _places(overhead: SceneSurfaces, links: Measurements) -> Iterator[Finding]:
     tx, rx = np.unique(links.tx, axis=0), np.unique(links.rx, axis=0)
     _refuse_elsewhere(overhead, rx, links.source)
-    if (under := overhead.buried(rx) | (rx[:, 2] < overhead.bounds[2])).any():
+    if (under := overhead.underground(rx) | (rx[:, 2] < overhead.bounds[2])).any():
         yield _finding(
             links,
             f"{int(under.sum())} of {len(rx)} receivers lie under the ground",
             "check heights and their datum",
         )
-    if (under := overhead.buried(tx) | (tx[:, 2] < overhead.bounds[2])).any():
+    if (under := overhead.underground(tx) | (tx[:, 2] < overhead.bounds[2])).any():
         yield _finding(
             links,
             f"{int(under.sum())} of {len(tx)} transmitters lie under the ground",
             "check heights and their datum",
         )
-    roofed = overhead.roofed(rx)
-    if roofed.mean() > 0.8 and overhead.roofed(tx).any():
+    roofed = overhead.under_roof(rx)
+    if roofed.mean() > 0.8 and overhead.under_roof(tx).any():
         return  # indoors
     wrong = _misplaced(overhead, rx)
     turned = _turned(overhead, rx, wrong)
@@ -94,14 +93,14 @@ def _places(overhead: Overhead, links: Measurements) -> Iterator[Finding]:
             f"{off[1]:.0f} m north of the scene's",
             "check the origin that positions are relative to",
         )
-    inside = roofed & ~overhead.buried(rx)
+    inside = roofed & ~overhead.underground(rx)
     if inside.any():
         yield _finding(
             links,
             f"{int(inside.sum())} of {len(rx)} receivers stand inside buildings",
             "correct them, leave them out, or say links.inside = 'move'",
         )
-    if (inside := overhead.roofed(tx) & ~overhead.buried(tx)).any():
+    if (inside := overhead.under_roof(tx) & ~overhead.underground(tx)).any():
         yield _finding(
             links,
             f"{int(inside.sum())} of {len(tx)} transmitters stand inside buildings",
@@ -109,7 +108,7 @@ def _places(overhead: Overhead, links: Measurements) -> Iterator[Finding]:
         )
 
 
-def _refuse_elsewhere(overhead: Overhead, rx: NDArray[np.float64], source: str) -> None:
+def _refuse_elsewhere(overhead: SceneSurfaces, rx: NDArray[np.float64], source: str) -> None:
     size = max(float(np.max(overhead.bounds[3:5] - overhead.bounds[:2])), 100.0)
     if overhead.outside(rx, _FAR * size).all():
         middle = rx.mean(axis=0)
@@ -119,11 +118,11 @@ def _refuse_elsewhere(overhead: Overhead, rx: NDArray[np.float64], source: str) 
         )
 
 
-def _misplaced(overhead: Overhead, rx: NDArray[np.float64]) -> int:
-    return int((overhead.outside(rx) | overhead.roofed(rx)).sum())
+def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
+    return int((overhead.outside(rx) | overhead.under_roof(rx)).sum())
 
 
-def _turned(overhead: Overhead, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
+def _turned(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
     """The turn of the axes that puts receivers outside of buildings and into the scene, if they are not so."""
     if len(rx) < _FEW or wrong < 0.15 * len(rx):
         return None

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
-from calibray.scenes.scene_file import find_scene
 from calibray.study.model import StudyModel
 
 if TYPE_CHECKING:
@@ -90,15 +89,15 @@ def position_steps(study: StudyModel) -> Preparation:
 
 
 def _ground(study: StudyModel) -> Ground:
-    from calibray.scenes.checks.heights import Overhead
+    from calibray.scenes.checks import SceneSurfaces
 
-    return Overhead.of(study.scene_source).ground
+    return SceneSurfaces.read(study.scene_source).ground_height
 
 
 def _move_outside(study: StudyModel) -> MoveOutside:
-    from calibray.scenes.authoring.outlines import led_outside, outlines
+    from calibray.scenes.checks import building_outlines, move_outside
 
-    return partial(led_outside, covered=outlines(study.scene_source))
+    return partial(move_outside, outlines=building_outlines(study.scene_source))
 
 
 def scene_frame(study: StudyModel) -> Frame:
@@ -142,6 +141,6 @@ def known_frame(study: StudyModel) -> Frame | None:
         return Frame(crs, float(easting), float(northing))
     if origin is not None:
         return Frame.local(*origin)
-    from calibray.scenes.authoring.scene_folder import read_frame
+    from calibray.scenes import read_frame
 
-    return read_frame(find_scene(study.scene_source)[0])
+    return read_frame(study.scene_source)

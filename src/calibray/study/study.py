@@ -29,7 +29,7 @@ from calibray.measurements import (
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
-from calibray.scenes.scene_file import content as scene_content
+from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.engine_keys import split_engine_keys
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import link_columns, position_steps, row_steps

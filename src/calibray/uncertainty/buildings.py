@@ -19,9 +19,7 @@ from calibray.fitting.problem import Problem
 from calibray.materials import BOUNDS, Material
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
-from calibray.scenes import Scene
-from calibray.scenes.buildings import wholes
-from calibray.scenes.triangles import read_triangles
+from calibray.scenes import Scene, building_numbers, read_triangles
 from calibray.uncertainty.hierarchy import Hierarchy, besides, hierarchical
 from calibray.uncertainty.importance_sampling import Draws
 from calibray.uncertainty.indirect_inference import (
@@ -380,6 +378,6 @@ def _building(paths: Paths, scene: Scene) -> NDArray[np.int64]:
     """Building of every interaction, -1 where its material is that of the ground [I]."""
     triangles = read_triangles(scene)
     flat = [list(scene.materials)[k] for k in np.unique(triangles.material[triangles.ground])]
-    place = wholes(triangles, np.asarray(paths.vertex, dtype=np.float64))
+    place = building_numbers(triangles, np.asarray(paths.vertex, dtype=np.float64))
     ground = np.isin(paths.material, [k for k, name in enumerate(paths.materials) if name in flat])
     return np.where(ground, -1, place)

@@ -161,7 +161,8 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
             "give a wider one"
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
-    column, row = _pixels(*np.meshgrid(x, y), frame, crs, affine)
+    grid_x, grid_y = np.meshgrid(x, y)
+    column, row = _pixels(grid_x, grid_y, frame, crs, affine)
     axes = tuple(np.arange(low, high + 1, dtype=float) for low, high in zip(first, last, strict=True))
     points = np.stack(
         [np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1

@@ -1,4 +1,4 @@
-"""Maps read: OpenStreetMap extracts, vector files and height models with planted truth."""
+"""OpenStreetMap extracts, vector files and height models with known content."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ from rasterio.transform import Affine
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.scenes.authoring.footprints import HeightRule
-from calibray.scenes.authoring.openstreetmap import read_openstreetmap
-from calibray.scenes.authoring.scene_folder import make_scene
-from calibray.scenes.authoring.terrain import lowered, read_terrain
-from calibray.scenes.authoring.vector_files import read_footprints
+from calibray.scenes.authoring import (
+    HeightRule,
+    lower_origin,
+    make_scene,
+    read_footprints,
+    read_openstreetmap,
+    read_terrain,
+)
 from planted_maps import FRAME, write_extract
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]
@@ -52,22 +55,22 @@ def extract(tmp_path: Path) -> Path:
     )
 
 
-def test_an_extract_has_its_buildings_with_holes_and_heights(extract):
-    found, frame = read_openstreetmap(extract, FRAME)
+def test_buildings_of_an_extract_have_holes_and_heights(extract):
+    buildings, frame = read_openstreetmap(extract, FRAME)
     assert frame == FRAME
-    assert found.name == ("way-1", "way-2", "way-3", "way-4", "relation-1")
-    assert found.top == pytest.approx([12, 12, 9, 30, 12.3444])
-    assert found.bottom == pytest.approx([0, 0, 0, 20, 0])
-    assert found.height_from == ("height", "levels", "default", "height", "height")
-    assert found.guessed() == {"levels": ["way-2"], "default": ["way-3"]}
-    assert found.part.tolist() == [False, False, False, True, False]
-    assert found.repairs == {"incomplete in the extract, left out": 1}
+    assert buildings.name == ("way-1", "way-2", "way-3", "way-4", "relation-1")
+    assert buildings.top == pytest.approx([12, 12, 9, 30, 12.3444])
+    assert buildings.bottom == pytest.approx([0, 0, 0, 20, 0])
+    assert buildings.height_from == ("height", "levels", "default", "height", "height")
+    assert buildings.guessed() == {"levels": ["way-2"], "default": ["way-3"]}
+    assert buildings.part.tolist() == [False, False, False, True, False]
+    assert buildings.repairs == {"incomplete in the extract, left out": 1}
     # Corners come back to the grid of 1 cm.
-    assert shapely.area(found.polygon) == pytest.approx([400, 400, 400, 400, 300], rel=2e-3)
-    assert found.bounds == pytest.approx([0, 0, 220, 20], abs=0.011)
+    assert shapely.area(buildings.polygon) == pytest.approx([400, 400, 400, 400, 300], rel=2e-3)
+    assert buildings.bounds == pytest.approx([0, 0, 220, 20], abs=0.011)
 
 
-def test_a_binary_extract_says_the_same(extract, tmp_path):
+def test_a_binary_extract_gives_the_same_buildings(extract, tmp_path):
     binary = tmp_path / "town.osm.pbf"
     with osmium.SimpleWriter(str(binary)) as writer:
         for item in osmium.FileProcessor(extract):
@@ -80,12 +83,12 @@ def test_a_binary_extract_says_the_same(extract, tmp_path):
     assert shapely.equals(one.polygon, other.polygon).all()
 
 
-def test_a_frame_of_its_own_is_centred_on_the_buildings(extract):
-    found, frame = read_openstreetmap(extract, rule=HeightRule(default=5.0))
-    assert found.bounds == pytest.approx([-110, -10, 110, 10], abs=0.02)
-    assert found.top[2] == 5.0
-    where = frame.to_geographic([*found.bounds[:2], 0.0])
-    np.testing.assert_allclose(FRAME.to_scene(*where[:2])[:2], [0, 0], atol=0.02)
+def test_the_default_frame_is_centred_on_the_buildings(extract):
+    buildings, frame = read_openstreetmap(extract, rule=HeightRule(default=5.0))
+    assert buildings.bounds == pytest.approx([-110, -10, 110, 10], abs=0.02)
+    assert buildings.top[2] == 5.0
+    corner = frame.to_geographic([*buildings.bounds[:2], 0.0])
+    np.testing.assert_allclose(FRAME.to_scene(*corner[:2])[:2], [0, 0], atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +101,7 @@ def test_a_frame_of_its_own_is_centred_on_the_buildings(extract):
         ("<osm version='0.6'><node id='1' version='1' lat='50.0x' lon='9'/></osm>", "cannot be read"),
     ],
 )
-def test_a_file_that_is_no_extract_is_refused(tmp_path, text, message):
+def test_a_file_that_is_not_an_extract_is_refused(tmp_path, text, message):
     path = tmp_path / "x.osm"
     if text is not None:
         path.write_text(text)
@@ -106,8 +109,8 @@ def test_a_file_that_is_no_extract_is_refused(tmp_path, text, message):
         read_openstreetmap(path)
 
 
-@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"default": float("nan")}])
-def test_a_rule_without_sense_is_refused(wrong):
+@pytest.mark.parametrize("wrong", [{"storey": 0.0}, {"default": float("nan")}])
+def test_a_senseless_height_rule_is_refused(wrong):
     with pytest.raises(InputError, match="greater than 0"):
         HeightRule(**wrong)
 
@@ -116,7 +119,7 @@ def test_a_rule_without_sense_is_refused(wrong):
 
 
 def layer(path: Path, heights: list, driver: str, crs: str = "EPSG:32632", **columns) -> Path:
-    """Three squares in UTM metres about the planted place."""
+    """Three squares in UTM metres around the planted origin."""
     origin = Frame.utm(11.5755, 48.1374)
     squares = [
         shapely.Polygon(moved(SQUARE, 50 * index + origin.easting, origin.northing)) for index in range(3)
@@ -132,12 +135,12 @@ def layer(path: Path, heights: list, driver: str, crs: str = "EPSG:32632", **col
 @pytest.mark.parametrize(("driver", "ending"), [("GPKG", "gpkg"), ("ESRI Shapefile", "shp")])
 def test_footprints_of_a_vector_file(tmp_path, driver, ending):
     path = layer(tmp_path / f"town.{ending}", [7.5, np.nan, 0.0], driver, storeys=[1.0, 5.0, np.nan])
-    found, frame = read_footprints(path, "hoehe", levels="storeys", frame=Frame.utm(11.5755, 48.1374))
-    assert found.top == pytest.approx([7.5, 15.0, 9.0])
-    assert found.height_from == ("height", "levels", "default")
-    assert found.bounds == pytest.approx([0, 0, 120, 20], abs=1e-6)
+    buildings, frame = read_footprints(path, "hoehe", levels="storeys", frame=Frame.utm(11.5755, 48.1374))
+    assert buildings.top == pytest.approx([7.5, 15.0, 9.0])
+    assert buildings.height_from == ("height", "levels", "default")
+    assert buildings.bounds == pytest.approx([0, 0, 120, 20], abs=1e-6)
     assert frame.crs == "EPSG:32632"
-    assert found.name == ("building-1", "building-2", "building-3")
+    assert buildings.name == ("building-1", "building-2", "building-3")
 
 
 def test_footprints_of_geojson_are_projected(tmp_path):
@@ -149,10 +152,10 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     }
     path = tmp_path / "town.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature, feature]}))
-    found, frame = read_footprints(path, "h", name="name")
-    assert found.name == ("Hall", "Hall-2")
-    assert found.top == pytest.approx([12.5, 12.5])
-    assert shapely.area(found.polygon) == pytest.approx([400, 400], rel=1e-3)
+    buildings, frame = read_footprints(path, "h", name="name")
+    assert buildings.name == ("Hall", "Hall-2")
+    assert buildings.top == pytest.approx([12.5, 12.5])
+    assert shapely.area(buildings.polygon) == pytest.approx([400, 400], rel=1e-3)
     assert frame.crs.startswith("+proj=aeqd")
 
 
@@ -161,23 +164,23 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     [
         ({"height": "height"}, "no column 'height'"),
         ({"height": "word"}, "holds 'high', must hold metres"),
-        ({"height": "negative"}, "feature 2: negative = -1, must not be below 0"),
+        ({"height": "negative"}, "feature 2: negative = -1, must be finite and not negative"),
         ({"layer": "roads"}, "cannot be read"),
     ],
 )
-def test_a_vector_file_without_what_is_named_is_refused(tmp_path, change, message):
+def test_wrong_columns_and_layers_are_refused(tmp_path, change, message):
     path = layer(tmp_path / "t.gpkg", [1.0, 2.0, 3.0], "GPKG", word=["high"] * 3, negative=[1.0, -1.0, 2.0])
     with pytest.raises(InputError, match=message):
         read_footprints(path, **{"height": "hoehe", **change})
 
 
-@pytest.mark.filterwarnings("ignore")  # GDAL's own, of what it passes on
+@pytest.mark.filterwarnings("ignore")  # warnings of GDAL
 @pytest.mark.parametrize(
     ("old", "new"),
     [(b"[0, 0], [1, 0], [1, 1], [0, 0]", b"[0, 0], [1, 0], [1, 1], [0, 2]"), (b'"h"', b'"\x85"')],
     ids=["open ring", "encoding"],
 )
-def test_geojson_that_cannot_be_used_is_refused(tmp_path, old, new):
+def test_malformed_geojson_is_refused(tmp_path, old, new):
     sound = (
         b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"h": 5}, "geometry": '
         b'{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}}]}'
@@ -231,16 +234,16 @@ def test_a_plane_is_interpolated_exactly(tmp_path):
     np.testing.assert_allclose(terrain.heights(x, y), 10.0 + 0.05 * x + 0.02 * y, atol=1e-9)
 
 
-def test_the_origin_is_moved_to_the_lowest_ground(tmp_path):
+def test_the_origin_moves_to_the_lowest_ground(tmp_path):
     terrain = read_terrain(height_model(tmp_path / "dem.tif"), FRAME, (-100, -100, 100, 100))
-    low, frame = lowered(terrain, FRAME)
+    low, frame = lower_origin(terrain, FRAME)
     assert 0 <= low.z.min() < 1
     np.testing.assert_allclose(low.z + frame.height, terrain.z)
     assert frame.crs == FRAME.crs
 
 
-def test_a_model_in_another_system_lies_right(tmp_path):
-    """A local frame is turned against UTM by the convergence of the meridians, 2 degrees from the middle one."""
+def test_a_height_model_in_another_projection_is_placed_correctly(tmp_path):
+    """A local frame is rotated against UTM by the meridian convergence, here 2 degrees from the central meridian."""
     terrain = read_terrain(height_model(tmp_path / "dem.tif"), FRAME, (-100, -100, 100, 100))
     utm = Frame.utm(11.5755, 48.1374)
     corner = utm.to_scene(*FRAME.to_geographic([100.0, 100.0, 0.0])[:2])
@@ -255,9 +258,9 @@ def test_missing_heights_are_filled_and_counted(tmp_path):
     terrain = read_terrain(height_model(tmp_path / "dem.tif", missing=True), frame, (-100, -100, 100, 100))
     assert np.isfinite(terrain.z).all()
     assert terrain.repairs == {"heights missing, taken from the nearest": 12}
-    found, _ = read_footprints(layer(tmp_path / "t.gpkg", [5.0, 5.0, 5.0], "GPKG"), "hoehe", frame=frame)
+    buildings, _ = read_footprints(layer(tmp_path / "t.gpkg", [5.0, 5.0, 5.0], "GPKG"), "hoehe", frame=frame)
     wide = read_terrain(height_model(tmp_path / "dem.tif", missing=True), frame, (-100, -100, 200, 100))
-    made = make_scene(found, tmp_path / "scene", frame, wide)
+    made = make_scene(buildings, tmp_path / "scene", frame, wide)
     assert made.counts["heights missing, taken from the nearest"] == 12
 
 
@@ -269,7 +272,7 @@ def test_missing_heights_are_filled_and_counted(tmp_path):
         ((-100, -100, 100, 100), -1.0, "greater than 0"),
     ],
 )
-def test_a_height_model_that_does_not_do_is_refused(tmp_path, bounds, spacing, message):
+def test_an_unsuitable_height_model_is_refused(tmp_path, bounds, spacing, message):
     with pytest.raises(InputError, match=message):
         read_terrain(height_model(tmp_path / "dem.tif"), Frame.utm(11.5755, 48.1374), bounds, spacing)
     (tmp_path / "no.tif").write_text("text")

@@ -1,4 +1,4 @@
-"""Buildings raised on footprints: volumes and areas in closed form, closed surfaces, wedges, files."""
+"""Buildings raised on footprints: volumes and areas in closed form, closed surfaces, terrain, files."""
 
 from __future__ import annotations
 
@@ -10,34 +10,25 @@ import shapely
 import trimesh
 
 from calibray.errors import InputError
-from calibray.scenes import read_scene
-from calibray.scenes.authoring.building_parts import take_apart
-from calibray.scenes.authoring.extrusion import (
-    MILLIMETRE,
-    ROOF,
-    UNDERSIDE,
-    WALL,
-    WINDOW,
-    Shell,
-    Windows,
-    extrude,
-)
-from calibray.scenes.authoring.scene_folder import Palette, SurfaceMaterial, make_scene, read_frame
-from calibray.scenes.authoring.terrain import Terrain, level_ground
-from calibray.scenes.meshes import welded
+from calibray.scenes import read_frame, read_scene
+from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
+from calibray.scenes.authoring.extrusion import MILLIMETRE, ROOF, UNDERSIDE, WALL, WINDOW, Shell, extrude
+from calibray.scenes.authoring.overlaps import split_overlaps
+from calibray.scenes.authoring.terrain import make_level_ground
+from calibray.scenes.meshes import weld
 from planted_maps import FRAME, L_SHAPE, footprints
 
 BOX = shapely.box
 
 
 def shell_of(polygons, tops, windows=None, ground=None, **more) -> Shell:
-    found = footprints(polygons, tops, **more)
-    cells, _ = take_apart(found, found.bottom, found.top)
+    buildings = footprints(polygons, tops, **more)
+    cells, _ = split_overlaps(buildings, buildings.bottom, buildings.top)
     return extrude(cells, windows, ground)
 
 
 def body(shell: Shell) -> trimesh.Trimesh:
-    mesh = welded(shell.corners, MILLIMETRE)
+    mesh = weld(shell.corners, MILLIMETRE)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -50,7 +41,7 @@ def area(shell: Shell, kind: int) -> float:
 # Closed forms
 
 
-def test_an_l_shaped_building_with_a_courtyard_has_its_volume_and_its_areas():
+def test_an_l_shaped_building_with_a_courtyard_has_the_right_volume_and_areas():
     shell = shell_of([L_SHAPE], [10.0])
     assert body(shell).volume == pytest.approx(630.0 * 10.0)
     outer, inner = 30 + 10 + 18 + 30 + 12 + 40, 2 * (5 + 6)
@@ -60,7 +51,7 @@ def test_an_l_shaped_building_with_a_courtyard_has_its_volume_and_its_areas():
 
 
 @pytest.mark.parametrize("share", [0.25, 0.6])
-def test_windows_take_their_share_of_every_wall(share):
+def test_windows_take_their_share_of_each_wall(share):
     shell = shell_of([L_SHAPE], [10.0], Windows(share, module=4.0))
     whole = area(shell, WALL) + area(shell, WINDOW)
     assert whole == pytest.approx(area(shell_of([L_SHAPE], [10.0]), WALL), rel=1e-6)
@@ -84,26 +75,26 @@ CASES = {
 @pytest.mark.parametrize("windows", [None, Windows(0.4, module=3.0)], ids=["walls", "windows"])
 @pytest.mark.parametrize(("polygons", "tops", "volume"), CASES.values(), ids=CASES)
 def test_buildings_that_touch_or_overlap_are_one_closed_body(polygons, tops, volume, windows):
-    made = body(shell_of(polygons, tops, windows))
-    assert made.is_watertight
-    # Every edge is passed once each way, and outward normals make the volume positive.
-    assert made.is_winding_consistent
-    assert made.volume == pytest.approx(volume)
+    solid = body(shell_of(polygons, tops, windows))
+    assert solid.is_watertight
+    # Neighbouring faces have the same orientation, and outward normals make the volume positive.
+    assert solid.is_winding_consistent
+    assert solid.volume == pytest.approx(volume)
 
 
-def test_parts_tell_more_than_the_outline():
-    """A slab on 30 m with a passage under its right half: outline 10 x 10, parts beside and above each other."""
+def test_parts_replace_the_outline():
+    """A block of 30 m next to a low one with a slab above: outline 10 x 10, parts side by side and above each other."""
     polygons = [BOX(0, 0, 10, 10), BOX(0, 0, 5, 10), BOX(5, 0, 10, 10), BOX(5, 0, 10, 10)]
-    made = body(
+    solid = body(
         shell_of(
             polygons, [99, 30, 5, 12], bottoms=[0, 0, 0, 8], part=[False, True, True, True]
         )
     )  # fmt: skip
-    assert made.is_watertight
-    assert made.volume == pytest.approx(50 * 30 + 50 * 5 + 50 * 4)
+    assert solid.is_watertight
+    assert solid.volume == pytest.approx(50 * 30 + 50 * 5 + 50 * 4)
 
 
-def test_a_building_that_stands_on_the_ground_stays_open_and_a_canopy_is_closed_below():
+def test_buildings_on_the_ground_are_open_below_and_canopies_are_closed():
     shell = shell_of([BOX(0, 0, 10, 10), BOX(30, 0, 40, 10)], [5, 9], ground=np.zeros(2), bottoms=[0, 4])
     assert area(shell, UNDERSIDE) == pytest.approx(100.0)
     assert body(shell).is_winding_consistent
@@ -119,7 +110,7 @@ def test_random_towns_are_closed():
             for (x, y), angle in zip(corners, turn, strict=True)
         ]
         found = footprints(polygons, rng.choice([6.0, 9.0, 15.0], 60))
-        cells, cut = take_apart(found, found.bottom, found.top)
+        cells, cut = split_overlaps(found, found.bottom, found.top)
         made = body(extrude(cells, Windows(0.3)))
         covered = shapely.union_all(found.polygon).area
         assert cut > 20
@@ -132,7 +123,7 @@ def test_random_towns_are_closed():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_any_outlines_make_closed_bodies_of_the_volume_that_their_cells_have(seed):
+def test_any_outlines_make_closed_bodies_with_the_volume_of_their_cells(seed):
     """Outlines that cross themselves and each other, touch in corners, parts among them, some above the ground."""
     rng = np.random.default_rng(seed)
     polygons = []
@@ -142,7 +133,7 @@ def test_any_outlines_make_closed_bodies_of_the_volume_that_their_cells_have(see
     tops = rng.choice([3.0, 6.0, 9.0, 12.5], 25)
     bottoms = np.minimum(rng.choice([0.0, 0.0, 3.0], 25), tops - 3)
     found = footprints(polygons, tops, bottoms, rng.random(25) < 0.2)
-    cells, _ = take_apart(found, found.bottom, found.top)
+    cells, _ = split_overlaps(found, found.bottom, found.top)
     made = body(extrude(cells, Windows(0.3, module=3.0) if seed % 2 else None))
     _, uses = np.unique(np.sort(made.edges, axis=1), axis=0, return_counts=True)
     assert set(uses % 2) == {0}
@@ -150,7 +141,7 @@ def test_any_outlines_make_closed_bodies_of_the_volume_that_their_cells_have(see
     assert made.volume == pytest.approx(expected, rel=1e-4)
 
 
-def test_outlines_that_cross_themselves_are_repaired_and_counted():
+def test_self_crossing_outlines_are_repaired_and_counted():
     bow = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
     found = footprints([bow, BOX(20, 0, 20.5, 0.5), L_SHAPE], [5, 5, 5])
     assert found.repairs == {"crossing or touching themselves, repaired": 1, "of less than 1 m2, left out": 1}
@@ -173,7 +164,7 @@ def test_buildings_stand_on_the_lowest_ground_under_their_walls(tmp_path):
     assert (ground.face_normals[:, 2] > 0).all()
 
 
-def test_the_height_of_terrain_is_that_of_its_triangles():
+def test_terrain_is_interpolated_on_its_triangles():
     rng = np.random.default_rng(0)
     terrain = Terrain(np.array([0.0, 10.0, 30.0]), np.array([0.0, 5.0]), rng.uniform(0, 5, (2, 3)))
     mesh = terrain.mesh()
@@ -183,13 +174,13 @@ def test_the_height_of_terrain_is_that_of_its_triangles():
     np.testing.assert_allclose(terrain.heights(mesh.vertices[:, 0], mesh.vertices[:, 1]), mesh.vertices[:, 2])
     assert (solid.face_normals[:, 2] > 0).all()
     assert terrain.heights([-99.0], [0.0]) == terrain.z[0, 0]
-    assert level_ground((0, 0, 4, 2), 3.0).mesh().faces.shape == (2, 3)
+    assert make_level_ground((0, 0, 4, 2), 3.0).mesh().faces.shape == (2, 3)
 
 
 # Files
 
 
-def test_a_made_scene_is_read_again(tmp_path):
+def test_a_made_scene_can_be_read(tmp_path):
     made = make_scene(footprints([L_SHAPE], [10.0]), tmp_path, FRAME, windows=Windows(0.3))
     scene = read_scene(made.path, 5e9)
     assert list(scene.materials) == ["roofs", "walls", "windows", "ground"]
@@ -203,7 +194,7 @@ def test_a_made_scene_is_read_again(tmp_path):
     assert set(made.triangles) == set(scene.materials)
 
 
-def test_meshes_of_one_scene_share_the_places_of_their_corners(tmp_path):
+def test_meshes_of_one_scene_have_corners_at_the_same_positions(tmp_path):
     make_scene(footprints([L_SHAPE], [10.0]), tmp_path, windows=Windows(0.3), ground=False)
     parts = [trimesh.load_mesh(path, process=False) for path in (tmp_path / "meshes").glob("*.ply")]
     together = trimesh.util.concatenate(parts)
@@ -213,7 +204,7 @@ def test_meshes_of_one_scene_share_the_places_of_their_corners(tmp_path):
     assert together.volume == pytest.approx(6300.0, rel=1e-6)
 
 
-def test_a_mesh_for_each_building_carries_its_name_however_hostile(tmp_path):
+def test_a_mesh_per_building_has_the_name_of_the_building_made_safe(tmp_path):
     names = ['Town "hall" <&> ../..', "-->", "x", "x"]
     polygons = [BOX(20 * index, 0, 20 * index + 10, 10) for index in range(4)]
     made = make_scene(
@@ -231,19 +222,19 @@ def test_a_mesh_for_each_building_carries_its_name_however_hostile(tmp_path):
 @pytest.mark.parametrize(
     ("material", "message"),
     [
-        (("concrete", "concrete", 0.1), "is a name of ITU-R P.2040's"),
+        (("concrete", "concrete", 0.1), "is a name of ITU-R P.2040"),
         (("itu_brick", "brick", 0.1), "name it 'brick_wall'"),
         (("a b", "brick", 0.1), "letters, digits"),
         (("walls", "bricks", 0.1), "did you mean 'brick'"),
         (("walls", "brick", 0.0), "greater than 0"),
     ],
 )
-def test_materials_that_clash_are_refused(material, message):
+def test_bad_materials_are_refused(material, message):
     with pytest.raises(InputError, match=message):
         SurfaceMaterial(*material)
 
 
-def test_two_materials_of_one_name_are_refused(tmp_path):
+def test_two_materials_with_the_same_name_are_refused(tmp_path):
     palette = Palette(roof=SurfaceMaterial("walls", "wood", 0.1))
     with pytest.raises(InputError, match="given twice"):
         make_scene(footprints([L_SHAPE], [5.0]), tmp_path, palette=palette)
