@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +24,12 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.support.messages import first_line, shortened
 
+_HEADER: Final = re.compile(
+    rb"ply\r?\n(?:(?:comment|obj_info)\b.*\n)*"
+    rb"format (?:ascii|binary_little_endian|binary_big_endian) 1\.0\r?\n"
+    rb"(?:(?:comment|obj_info|element|property)\b.*\n)*end_header\r?\n"
+)
+_COMMENT: Final = re.compile(rb"^(?:comment|obj_info)\b.*\n", re.MULTILINE)
 _INDEX_PROPERTIES: Final = ("vertex_indices", "vertex_index")
 _TEXT_FACE: Final = re.compile(r"\s*3(\s+\d{1,9}){3}(\s.*)?")  # a face row of a text PLY file
 
@@ -130,9 +136,16 @@ def read_mesh(file: Path, kind: str) -> Mesh:
 def _read_ply(content: bytes) -> Mesh:
     from trimesh.exchange.ply import load_ply
 
+    # trimesh takes almost any line for a header line, and comments for UTF-8.
+    header = _HEADER.match(content)
+    if header is None:
+        raise InputError("is not a PLY file, or its header is damaged")
+    body = content[header.end() :]
     # trimesh refuses a binary file whose size differs from what its header declares, before it allocates anything.
     with np.errstate(all="ignore"):
-        loaded = load_ply(BytesIO(content), fix_texture=False, skip_materials=True)
+        loaded = load_ply(
+            BytesIO(_COMMENT.sub(b"", header[0]) + body), fix_texture=False, skip_materials=True
+        )
     elements = loaded["metadata"]["_ply_raw"]
     vertex, face = (elements.get(name, {"length": 0}) for name in ("vertex", "face"))
     if not vertex["length"] or not face["length"]:
@@ -145,7 +158,7 @@ def _read_ply(content: bytes) -> Mesh:
     if name is None:
         raise InputError("its faces have no list vertex_indices")
     if isinstance(face["data"], dict):
-        _check_text_faces(content.decode(), elements)
+        _check_text_faces(body.decode(), elements)
         corners = face["data"][name]
     else:
         # trimesh takes the number of corners of all faces from the first one.
@@ -170,13 +183,9 @@ def _read_ply(content: bytes) -> Mesh:
 
 def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
     """Refuse face rows of a text PLY file that trimesh would cut, round or drop without a message."""
-    lines = text.splitlines()
-    row = 1 + next(index for index, line in enumerate(lines) if "end_header" in line.split())
-    for name, element in elements.items():
-        if name == "face":
-            break
-        row += element["length"]
-    for index, line in enumerate(lines[row : row + elements["face"]["length"]]):
+    lengths = {name: element["length"] for name, element in elements.items()}
+    first = sum(lengths[name] for name in takewhile(lambda name: name != "face", lengths))
+    for index, line in enumerate(text.splitlines()[first : first + lengths["face"]]):
         if not _TEXT_FACE.fullmatch(line):
             raise InputError(f"face {index} is {shortened(line)!r}, must be 3 and three vertex indices")
 

@@ -148,19 +148,19 @@ def read_scene(
     return Scene(str(source), path, materials, tuple(objects), xml, laws)
 
 
-def check_material_name(name: str, materials: Mapping[str, object], place: str) -> None:
+def check_material_name(name: str, materials: Mapping[str, object], location: str) -> None:
     """Refuse a material that a scene does not have.
 
     Args:
         name: The material's name.
         materials: The scene's materials by name.
-        place: Where the user wrote the name, for the message.
+        location: Where the user wrote the name, for the message.
 
     Raises:
         InputError: The scene has no such material; the message suggests the nearest name.
     """
     if name not in materials:
-        raise InputError(f"{place}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
+        raise InputError(f"{location}: the scene has no material {name!r}; {did_you_mean(name, materials)}")
 
 
 def is_itu_name(name: str) -> bool:

@@ -67,7 +67,7 @@ def scene_path(source: str) -> Path:
     return path
 
 
-def content(path: Path) -> bytes:
+def read_content(path: Path) -> bytes:
     """Read the bytes of a scene file; an unchanged file is read once.
 
     Args:
@@ -102,7 +102,7 @@ def parse(path: Path, source: str) -> ElementTree.Element:
         InputError: The file cannot be read, is not well-formed, is nested too deeply, or is not a Mitsuba scene.
     """
     try:
-        root = ElementTree.fromstring(content(path), ElementTree.XMLParser(target=_ShallowTree()))
+        root = ElementTree.fromstring(read_content(path), ElementTree.XMLParser(target=_ShallowTree()))
     except InputError as error:
         raise InputError(f"scene file {source}: {error}") from None
     except OSError as error:
