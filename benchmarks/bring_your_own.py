@@ -48,11 +48,11 @@ from calibray.measurements import (  # noqa: E402
 )
 from calibray.scenes.authoring import (  # noqa: E402
     lower_origin,
-    make_plan_scene,  # noqa: E402
-    make_scene,  # noqa: E402
-    read_footprints,  # noqa: E402
-    read_openstreetmap,  # noqa: E402
-    read_plan,  # noqa: E402
+    make_plan_scene,
+    make_scene,
+    read_footprints,
+    read_openstreetmap,
+    read_plan,
     read_terrain,
 )
 from calibray.study import Setup, Study  # noqa: E402

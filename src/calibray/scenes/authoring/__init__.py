@@ -5,7 +5,7 @@ Names are loaded when first used, because each source needs other libraries.
 
 from typing import TYPE_CHECKING
 
-from calibray.support.lazy import lazily
+from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray.scenes.authoring.building_scene import make_scene as make_scene
@@ -41,4 +41,4 @@ _MODULES = {
 _HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = sorted(_HOMES)
-__getattr__, __dir__ = lazily(__name__, _HOMES)
+__getattr__, __dir__ = lazy_attributes(__name__, _HOMES)
