@@ -36,7 +36,17 @@ class Engine(Protocol):
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates [n, d] in the fields' units; [n, L], [dB], +inf without a path."""
+        """Path loss of every link for candidates.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB]; +inf where a link has no path.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite or unphysical.
+        """
         ...
 
 
@@ -57,7 +67,17 @@ class Differentiable(Engine, Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
+        """Path loss of every link, and its derivatives by the parameters.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite or unphysical.
+        """
         ...
 
 
@@ -127,10 +147,37 @@ class Answering(Engine, Protocol):
         """Number of links L."""
         ...
 
-    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates [n, d] in the fields' units, in any order.
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss as for every engine; all links of a candidate that failed have +inf.
 
-        Once `stop` is set from outside, no further call is begun; answers that have already arrived are still given.
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB].
+
+        Raises:
+            InputError: As for `Engine.path_loss`, or a read-only ledger lacks an answer.
+            EngineError: Every candidate of the first batch failed, or too many successive calls; or the ledger or a
+                call's files cannot be written.
+        """
+        ...
+
+    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
+        """Answer candidates, each as soon as its call ends.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+            stop: Set from outside to begin no further call, and to stop running calls where possible; answers that have
+                already arrived are still given.
+
+        Yields:
+            The answers, in the order in which they arrive.
+
+        Raises:
+            InputError: A value is unphysical.
+            EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers were
+                given.
         """
         ...
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import platformdirs
 from numpy.typing import NDArray
 
 RANGE_DB: Final = (-100.0, 10_000.0)
@@ -231,7 +232,5 @@ def _rescue_folders(ledger: Path) -> Iterator[tuple[Path, str]]:
     """Folders for rescue files, and the prefix of the ledger's files in each."""
     yield ledger.parent, RESCUE_PREFIX
     prefix = f"{RESCUE_PREFIX}{hashlib.sha256(str(ledger).encode()).hexdigest()[:16]}-"
-    state = os.environ.get("XDG_STATE_HOME") or str(Path("~/.local/state").expanduser())
-    if not state.startswith("~"):  # the user has a home folder
-        yield Path(state) / "calibray", prefix
+    yield platformdirs.user_state_path("calibray"), prefix
     yield Path(tempfile.gettempdir()) / f"calibray-rescue-{os.geteuid()}", prefix

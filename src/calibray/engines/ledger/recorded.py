@@ -63,19 +63,7 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger or else from the engine.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
-
-        Raises:
-            InputError: The candidates have another width, a value is unphysical, or a read-only ledger lacks an answer.
-            EngineError: Every candidate of the first batch failed; these failures are deleted from the ledger. Or the
-                ledger cannot be used; answers are kept in a rescue file.
-        """
+        """Path loss of every link for candidates, from the ledger or else the engine; see `Answering.path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         first = self.calls + self.hits == 0
         answers = list(self._answers(values))
