@@ -140,27 +140,15 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine with expensive calls: it gives each answer of a batch as soon as it arrives."""
+    """An engine with expensive calls, which gives each answer of a batch as soon as it arrives.
+
+    Its `path_loss` gives +inf for all links of a candidate that failed. It raises EngineError if every candidate of the
+    first batch fails, too many successive calls fail, or the ledger or a call's files cannot be written.
+    """
 
     @property
     def num_links(self) -> int:
         """Number of links L."""
-        ...
-
-    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss as for every engine; all links of a candidate that failed have +inf.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB].
-
-        Raises:
-            InputError: As for `Engine.path_loss`, or a read-only ledger lacks an answer.
-            EngineError: Every candidate of the first batch failed, or too many successive calls; or the ledger or a
-                call's files cannot be written.
-        """
         ...
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:

@@ -53,7 +53,7 @@ class Command:
         self._successive_failures, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, as the program answers; see `Answering.path_loss`."""
+        """Path loss of every link for candidates, as the program answers; see `Answering`."""
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
