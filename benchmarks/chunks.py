@@ -120,7 +120,7 @@ def speed_up(links: int, work: Work) -> None:
             # Dr.Jit and XLA would take every core for a single worker.
             for core, worker in enumerate(client.scheduler_info()["workers"]):
                 client.run(on_core, core % (os.cpu_count() or 1), workers=[worker])
-            opened = DaskWorkers(client)
+            opened = DaskWorkers(lambda: client, client.get_executor)
             # Libraries and the scene are loaded before the clock starts.
             engines.make(campaign(2, {"chunk_links": 1}, seed=9), workers=opened)
             before, here = client.run(time.process_time), time.process_time()

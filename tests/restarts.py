@@ -32,12 +32,12 @@ from calibray.errors import EngineError, InputError
 from calibray.study import Study
 
 def run(workers, folder):
-    answer = Retrace._one
+    answer = Retrace._trace
     def noted(engine, part, candidate):
         with open(folder + "/calls.log", "a") as log:
             log.write(json.dumps(candidate.tolist()) + "\\n")
         return answer(engine, part, candidate)
-    Retrace._one = noted
+    Retrace._trace = noted
     try:
         with open_workers(int(workers) or None) as executor:
             calibrate(Study.load(folder + "/study.toml"), out=folder + "/out", executor=executor)

@@ -91,7 +91,7 @@ def test_run_writes_its_files_and_says_so_on_stderr(folder, ran):
         [*FILES, "report.html", SIGNATURES]
     )
     warning, *rest = ran.stderr.splitlines(keepends=True)
-    assert "1 of 12 receivers stand inside buildings" in warning
+    assert "1 of 12 receivers are inside buildings" in warning
     assert "".join(rest) == f"Written to {folder / 'out'}: {', '.join(FILES)}, report.html\n"
     assert Result.load(folder / "out").parameters == pytest.approx(planted.TRUTH, abs=1e-3)
 

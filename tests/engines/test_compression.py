@@ -9,7 +9,7 @@ import pytest
 
 import synthetic
 from calibray.engines import Replay
-from calibray.engines.compression import FEW, compress, sparse_weights
+from calibray.engines.compression import MIN_PATHS, compress, sparse_weights
 from calibray.errors import InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take
@@ -26,7 +26,7 @@ def paths() -> Paths:
         (Kind.DIFFUSE, Kind.SPECULAR),
     ]
     many = synthetic.program(sequences * 500, seed=1, links=3)
-    lonely = np.flatnonzero(many.link == 2)[FEW // 2 :]  # the last link keeps few paths
+    lonely = np.flatnonzero(many.link == 2)[MIN_PATHS // 2 :]  # the last link keeps few paths
     return take(many, np.setdiff1d(np.arange(many.num_paths), lonely))
 
 

@@ -21,7 +21,7 @@ from calibray import engines
 from calibray.calibration import calibrate
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.ledger import claims, database
-from calibray.engines.ledger.answers import LedgerEntry, RescuedAnswer, key
+from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
@@ -200,13 +200,13 @@ def test_an_answer_that_was_paid_for_is_kept_beside_the_ledger_and_taken_up(path
             Summing(lambda index: faults[fault]() if index == 1 else None), ledger, "r", "command"
         )
         with pytest.raises(
-            EngineError, match=r"\. 1 answer is kept in .*ledger-rescue-\w+.jsonl, and used when"
+            EngineError, match=r"\. 1 answer is kept in .*ledger-rescue-\w+.sqlite, and used when"
         ):
             engine.path_loss(CANDIDATES)
         assert engine.calls == 2
         if fault == "lock":
             other.execute("ROLLBACK")
-    assert len(list(path.parent.glob("ledger-rescue-*.jsonl"))) == 1
+    assert len(list(path.parent.glob("ledger-rescue-*.sqlite"))) == 1
     with closing(Ledger(path)) as ledger:
         again = Recorded(Summing(), ledger, "r", "command")
         assert again.path_loss(CANDIDATES).tolist() == LOSSES
@@ -265,17 +265,23 @@ def test_a_folder_that_is_removed_in_mid_run_is_noticed_and_nothing_is_lost(path
     assert not state.exists() or list(state.iterdir()) == []
 
 
-def test_rescued_lines_that_were_changed_are_told_and_kept_aside(path, caplog):
-    entry = LedgerEntry(np.array([81.0, np.inf]), 0.5)
-    good = RescuedAnswer("p", "command", json.dumps(PARAMETERS.names), key(CANDIDATES[2]), entry).line()
-    bad = good.replace("81.0", "82.0")
-    for lines in (bad, "[" * 100_000, "{}", "null", good):
-        (path.parent / f"ledger-rescue-{len(lines)}-{lines[:1] == '{'}.jsonl").write_text(lines)
-    (path.parent / "ledger-rescue-bad.jsonl").write_text(bad)
-    assert resumed(path) == 0
-    assert caplog.text.count("1 of 1 lines are damaged") == 4
-    assert len(list(path.parent.glob("*.jsonl.damaged"))) == 4
-    assert list(path.parent.glob("*.jsonl")) == []
+def test_a_damaged_rescue_file_is_renamed_with_a_warning(path, caplog):
+    file = path.parent / "ledger-rescue-1.sqlite"
+    file.write_text("not a database, but long enough to be taken for one" * 50)
+    assert resumed(path) == 1
+    assert f"{file}: is damaged (file is not a database)" in caplog.text
+    assert [entry.name for entry in path.parent.glob("*rescue*")] == ["ledger-rescue-1.sqlite.damaged"]
+
+
+def test_a_damaged_answer_of_a_rescue_file_is_run_again(path, caplog):
+    with closing(Ledger(path)) as ledger:
+        entries = [(key(CANDIDATES[2]), LedgerEntry(np.array([81.0, np.inf]), 0.5))]
+        ledger.rescue("p", "command", PARAMETERS.names, entries)
+    (file,) = path.parent.glob("ledger-rescue-*")
+    with closing(sqlite3.connect(file)) as connection, connection:
+        connection.execute("UPDATE answers SET path_loss_db = ?", (doubles(82.0, np.inf),))
+    assert resumed(path) == 1
+    assert "is damaged (another checksum); deleted, and run again" in caplog.text
 
 
 def test_a_ledger_that_cannot_be_written_is_read(path, monkeypatch):

@@ -143,7 +143,7 @@ def test_a_track_and_a_hill(tmp_path):
     assert found.study.files()[2:4] == (tmp_path / "sites.csv", tmp_path / "walk.gpx")
     assert assumed(found)["links.heights"] == "ground"
     assert assumed(found)["links.track"] == "walk.gpx by time"
-    with pytest.raises(InputError, match="joined by"):
+    with pytest.raises(InputError, match="no column of times"):
         draft(scene, table(tmp_path, rsrp_dbm=[-80.0]), tmp_path / "study.toml", sites, 3.5e9,
               track=tmp_path / "walk.gpx")  # fmt: skip
     # Beyond the scene there is no ground to count from.
@@ -172,7 +172,7 @@ def test_quantities_are_told_by_name_and_sign(column, values, kind):
     ("columns", "message"),
     [
         ({"x": [1.0], "y": [2.0], "temperature": [20.0]}, "no column looks like path loss"),
-        ({"a": [1.0], "pl_db": [90.0]}, "no columns look like the receivers' positions"),
+        ({"a": [1.0], "pl_db": [90.0]}, "no columns of receiver positions"),
         ({"x": [1.0], "y": [2.0], "pl_db": [90.0]}, "--tx X,Y,Z"),
         ({"lon": [9.99], "lat": [50.01], "tx_x": [0.0], "tx_y": [0.0], "pl_db": [90.0]}, "in other units"),
     ],

@@ -218,7 +218,7 @@ TRACE = "max_depth = 4"
         ("version = 1", "", "study.toml: version: is required"),
         # Values
         ("version = 1", "version = 2", "study.toml: version = 2: this Calibray reads version 1"),
-        ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must lie in 1e+06 to 1e+12 Hz"),
+        ("frequency = 4e9", "frequency = 4", "scene.frequency = 4: must be in 1e+06 to 1e+12 Hz"),
         ("frequency = 4e9", "frequency = '4e9'", "scene.frequency = '4e9': must be a number"),
         ("frequency = 4e9", "frequency = inf", "scene.frequency = inf: must be a finite number"),
         ("bandwidth = 2e8", "bandwidth = 0", "scene.bandwidth = 0: must be greater than 0"),

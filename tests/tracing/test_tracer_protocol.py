@@ -228,7 +228,7 @@ def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"frequency": 2e9}, r"frequency is given, and said by the study .*study\.toml as well"),
+        ({"frequency": 2e9}, r"the study .*study\.toml states frequency; change it there"),
         ({"max_depth": 2}, "max_depth is given"),
         ({"rx_antenna": "dipole"}, "rx_antenna is given"),
         ({"measurements": LINKS}, "must be Measurements"),
@@ -242,7 +242,7 @@ def test_a_study_is_not_contradicted(tmp_path: Path, arguments: dict, message: s
 
 
 def test_a_scene_alone_is_not_enough() -> None:
-    with pytest.raises(InputError, match="needs measurements, the links"):
+    with pytest.raises(InputError, match="give measurements, the links"):
         cb.trace("sionna:box", frequency=1e9)
     with pytest.raises(InputError, match="needs frequency, the carrier in Hz"):
         cb.trace("sionna:box", LINKS)

@@ -1,12 +1,13 @@
-"""Compressed programs: few weighted paths in place of tens of thousands, within a stated error of path loss.
+"""Compression: few weighted paths replace tens of thousands, within a stated error of path loss.
 
 The power of a link is a sum over its paths, P(x) = sum_p p_p(x), of functions of the candidate x. Within the bounds of
-a few parameters these functions span a space of few dimensions, so that a few of them with weights w >= 0 suffice:
-sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added greedily as
-long as the fit is not good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
-Weights are non-negative and paths are physical ones, so a compressed link behaves as a link between the training
-candidates too. That is not taken on trust: the error is measured at fresh candidates, many on the faces of the bounds,
-and a link that misses half the tolerance is fitted again to more candidates, or keeps all its paths.
+a few parameters these functions span a space of few dimensions, so few of them with weights w >= 0 suffice:
+sum_p w_p p_p(x) is fitted to P(x) at training candidates by non-negative least squares. Paths are added greedily until
+the fit is good enough (C. Farhat, T. Chapman, P. Avery, Int. J. Numer. Methods Eng. 102 (2015) 1077).
+
+Weights are non-negative and the paths are physical, so a compressed link behaves as a link between the training
+candidates as well. Still, the error is measured at new candidates, many of them on the faces of the bounds. A link that
+exceeds half the tolerance there is fitted again to more candidates, or keeps all its paths.
 """
 
 from __future__ import annotations
@@ -28,41 +29,41 @@ from calibray.paths import Paths, take
 from calibray.support.progress import Progress
 
 TOLERANCE_DB: Final = 0.01
-"""Largest error of a link's path loss [dB] unless told otherwise."""
+"""Default of the largest error of a link's path loss [dB]."""
 
-FEW: Final = 64
-"""Paths of a link that are not worth compressing."""
+MIN_PATHS: Final = 64
+"""Paths of a link below which it is not compressed: there is little to gain."""
 
-FITTED: Final = 0.1
-"""Share of the tolerance that the fit itself may use up."""
+FIT_SHARE: Final = 0.1
+"""Share of the tolerance that the fit may use; the rest is for candidates between the training candidates."""
+
+CHECK_SHARE: Final = 0.5
+"""Share of the tolerance that the error at new candidates must stay within; the rest is for candidates not checked."""
 
 TRAINING: Final = 16
-"""Candidates per parameter, and as many more, beside the corners, on which the first fit rests."""
+"""Random training candidates of the first fit per parameter, plus as many once; corners of the bounds come on top."""
 
-CORNERS: Final = 5
-"""Parameters of which all corners are fitted to; further ones lie in the middle."""
+CORNER_PARAMETERS: Final = 5
+"""Number of parameters whose corners are all fitted; further parameters stay in the middle there."""
 
 CHECKED: Final = 48
-"""Fresh candidates of every check."""
-
-PASSED: Final = 0.5
-"""Share of the tolerance that a check must stay within."""
+"""New candidates of every check."""
 
 ROUNDS: Final = 6
 """Fits of a link before it keeps all its paths."""
 
-STRENGTH: Final = 16
-"""Candidates by which the strongest paths are told."""
+RANKING: Final = 16
+"""Candidates that rank the paths by power."""
 
 POOL: Final = 2000
-"""Strongest paths of a link that are candidates to be kept, and as many others."""
+"""Strongest paths of a link that may be kept, and as many random others."""
 
-BLOCK: Final = 400_000_000
-"""Powers, paths times candidates, held at once."""
+BATCH_POWERS: Final = 400_000_000
+"""Largest number of powers, paths times candidates, in memory at once."""
 
 FIRST_INTERVALS: Final = 512
 LAST_INTERVALS: Final = 65536
-"""Intervals of a table of coefficients, at first and at most."""
+"""First and largest number of intervals of a table of coefficients."""
 
 TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
@@ -73,10 +74,10 @@ class Compressed:
     """A compressed program.
 
     Attributes:
-        paths: The program, over the same links. The weights are in the spreading of its paths, so that it is good for
-            the sum of powers only, not for delays or sums of fields.
-        error_db: Largest difference of path loss from the full program at the candidates checked [L], [dB].
-        candidates: Candidates that every compressed link was checked at, none of which its weights were fitted to.
+        paths: The program over the same links. The weights are part of its paths' spreading, so it is valid for the sum
+            of powers only, not for delays or sums of fields.
+        error_db: Largest difference of path loss from the full program at the checked candidates [L], [dB].
+        candidates: Number of candidates that every compressed link was checked at, without being fitted to them.
     """
 
     paths: Paths
@@ -91,14 +92,14 @@ def compress(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Compressed:
-    """Compress a program for some parameters within their bounds, for path loss by the sum of powers.
+    """Compress a program for given parameters within their bounds, for path loss by the sum of powers.
 
     Args:
         paths: The path program.
-        parameters: What will vary, and between which bounds.
+        parameters: The parameters that vary, and their bounds.
         tolerance_db: Largest error of a link's path loss [dB].
         seed: Seed of the candidates.
-        progress: Called with "compressing", links done and links in all.
+        progress: Called with "compressing", links done and all links.
 
     Returns:
         The compressed program and its error.
@@ -108,45 +109,45 @@ def compress(
     """
     if not (np.isfinite(tolerance_db) and tolerance_db > 0):
         raise InputError(f"tolerance_db = {tolerance_db}: must be a positive number of dB")
-    candidates = _candidates(parameters, seed)
+    candidates = _candidate_sets(parameters, seed)
     intervals = FIRST_INTERVALS
-    totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
-    while coarse > TABLE_TOLERANCE and intervals < LAST_INTERVALS:
+    totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
+    while table_error > TABLE_TOLERANCE and intervals < LAST_INTERVALS:
         intervals *= 2
-        totals, strength, coarse = _whole(paths, parameters, candidates, intervals)
+        totals, strength, table_error = _evaluate_all(paths, parameters, candidates, intervals)
     pool = _pool(paths, strength, seed)
     weight, error = np.ones(paths.num_paths), np.zeros(paths.num_links)
     links = np.unique(paths.link[pool])
     ends = np.searchsorted(paths.link[pool], np.arange(paths.num_links + 1))
-    for block in _blocks(links, np.diff(ends), sum(len(some) for some in candidates)):
-        start, stop = ends[block[0]], ends[block[-1] + 1]
+    for batch in _batches(links, np.diff(ends), sum(len(values) for values in candidates)):
+        start, stop = ends[batch[0]], ends[batch[-1] + 1]
         powers = _Powers(take(paths, pool[start:stop]), parameters, candidates, intervals)
-        for link in block:
-            where = slice(ends[link] - start, ends[link + 1] - start)
-            fitted = _fit_link(powers, where, [total[:, link] for total in totals], tolerance_db)
-            if fitted is not None:
+        for link in batch:
+            in_batch = slice(ends[link] - start, ends[link + 1] - start)
+            fit = _fit_link(powers, in_batch, [total[:, link] for total in totals], tolerance_db)
+            if fit is not None:
                 weight[slice(*np.searchsorted(paths.link, [link, link + 1]))] = 0.0
-                weight[pool[ends[link] : ends[link + 1]]], error[link] = fitted
+                weight[pool[ends[link] : ends[link + 1]]], error[link] = fit
             if progress is not None:
                 progress("compressing", int(link) + 1, paths.num_links)
     kept = np.flatnonzero(weight > 0)
-    few = take(paths, kept)
-    few = replace(
-        few,
-        spreading=few.spreading * np.sqrt(weight[kept]),
-        settings={**few.settings, "compressed_db": tolerance_db},
+    compressed = take(paths, kept)
+    compressed = replace(
+        compressed,
+        spreading=compressed.spreading * np.sqrt(weight[kept]),
+        settings={**compressed.settings, "compressed_db": tolerance_db},
     )
-    return Compressed(few, error, CHECKED)
+    return Compressed(compressed, error, CHECKED)
 
 
-def _candidates(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
-    """Candidates to fit to, corners of the bounds among them, then those of every check [n, d], in the fields' units.
+def _candidate_sets(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
+    """Training candidates with corners of the bounds, and then the candidates of every check [n, d].
 
-    What is fitted fails first where it extrapolates, so half of the candidates to check at lie on faces of the bounds.
+    A fit fails first where it extrapolates, so half of the candidates of a check lie on faces of the bounds.
     """
     d, random = len(parameters), np.random.default_rng(seed)
-    corners = np.full((2 ** min(d, CORNERS), d), 0.5)
-    corners[:, :CORNERS] = list(product([0.0, 1.0], repeat=min(d, CORNERS)))
+    corners = np.full((2 ** min(d, CORNER_PARAMETERS), d), 0.5)
+    corners[:, :CORNER_PARAMETERS] = list(product([0.0, 1.0], repeat=min(d, CORNER_PARAMETERS)))
     sets = [np.vstack([corners, qmc.LatinHypercube(d, rng=random).random(TRAINING * (d + 1))])]
     for _ in range(ROUNDS):
         unit = qmc.LatinHypercube(d, rng=random).random(CHECKED)
@@ -156,85 +157,87 @@ def _candidates(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
     return [parameters.from_unit(unit) for unit in sets]
 
 
-def _whole(
+def _evaluate_all(
     paths: Paths, parameters: Parameters, candidates: list[NDArray[np.float64]], intervals: int
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
-    """What only the whole program tells.
+    """Evaluate the whole program.
 
     Returns:
-        Power of every link at all candidates, by set [n, L]; every path's share of it, summed over the first ones [P];
-        the largest error of a tabulated coefficient.
+        Power of every link at each set of candidates [n, L]; share of every path in its link's power, summed over the
+        ranking candidates [P]; largest error of a tabulated coefficient.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
-    for some in candidates:
-        tables = parameters.constants_of(some, paths.materials).astype(np.float32)
+    for values in candidates:
+        tables = parameters.constants_of(values, paths.materials).astype(np.float32)
         loss, error = path_losses(plan.program, jnp.asarray(tables))
         totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
         errors.append(error)
     strength = np.zeros(paths.num_paths)
-    for some, total in zip(candidates[0][:STRENGTH], totals[0], strict=False):
-        table = parameters.constants_of(some[None], paths.materials)[0].astype(np.float32)
+    for candidate, total in zip(candidates[0][:RANKING], totals[0], strict=False):
+        table = parameters.constants_of(candidate[None], paths.materials)[0].astype(np.float32)
         power = np.asarray(path_powers(plan.program, jnp.asarray(table)))
         strength[plan.order] += power / np.where(total > 0, total, np.inf)[paths.link[plan.order]]
     return totals, strength, max(errors)
 
 
 def _pool(paths: Paths, strength: NDArray[np.float64], seed: int) -> NDArray[np.int64]:
-    """Paths of links with many that may be kept, in their order: the strongest and as many others."""
+    """Paths that may be kept, ascending: of every link with many paths the strongest, and as many random others."""
     random, pool = np.random.default_rng(seed), []
-    for some in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
-        if len(some) > FEW:
-            order = some[np.argsort(-strength[some], kind="stable")]
+    for of_link in np.split(np.arange(paths.num_paths), np.flatnonzero(np.diff(paths.link)) + 1):
+        if len(of_link) > MIN_PATHS:
+            order = of_link[np.argsort(-strength[of_link], kind="stable")]
             pool.append(np.sort(np.concatenate([order[:POOL], random.permutation(order[POOL:])[:POOL]])))
     return np.concatenate(pool) if pool else np.zeros(0, dtype=np.int64)
 
 
-def _blocks(
+def _batches(
     links: NDArray[np.integer], size: NDArray[np.int64], candidates: int
 ) -> list[NDArray[np.integer]]:
     """Links whose pools' powers fit into memory together."""
-    block = np.cumsum(size[links]) * candidates // BLOCK
-    return [some for some in np.split(links, np.flatnonzero(np.diff(block)) + 1) if len(some)]
+    batch = np.cumsum(size[links]) * candidates // BATCH_POWERS
+    return [part for part in np.split(links, np.flatnonzero(np.diff(batch)) + 1) if len(part)]
 
 
 class _Powers:
-    """Powers of some paths at sets of candidates, each computed when it is first asked for."""
+    """Powers of paths at sets of candidates, computed on first use."""
 
     def __init__(
         self, paths: Paths, parameters: Parameters, candidates: list[NDArray[np.float64]], intervals: int
     ) -> None:
         plan = layout(paths, np.float32, intervals, phases=False)
-        self._program, self._place = plan.program, np.argsort(plan.order)
-        self._tables = [parameters.constants_of(some, paths.materials) for some in candidates]
-        self._known: dict[int, NDArray[np.float64]] = {}
+        self._program, self._position = plan.program, np.argsort(plan.order)
+        self._tables = [parameters.constants_of(values, paths.materials) for values in candidates]
+        self._powers: dict[int, NDArray[np.float64]] = {}
 
-    def at(self, which: int, where: slice) -> NDArray[np.float64]:
-        """Powers of some of the paths at one set of candidates [n, paths]."""
-        if which not in self._known:
-            tables = jnp.asarray(self._tables[which].astype(np.float32))
-            self._known[which] = np.stack([np.asarray(path_powers(self._program, table)) for table in tables])
-        return self._known[which][:, self._place[where]].astype(float)
+    def at(self, set_index: int, paths: slice) -> NDArray[np.float64]:
+        """Powers of some paths at one set of candidates [n, paths]."""
+        if set_index not in self._powers:
+            tables = jnp.asarray(self._tables[set_index].astype(np.float32))
+            powers = [np.asarray(path_powers(self._program, table)) for table in tables]
+            self._powers[set_index] = np.stack(powers)
+        return self._powers[set_index][:, self._position[paths]].astype(float)
 
 
 def _fit_link(
-    powers: _Powers, where: slice, totals: list[NDArray[np.float64]], tolerance_db: float
+    powers: _Powers, paths: slice, totals: list[NDArray[np.float64]], tolerance_db: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Weights of the paths in a link's pool, and the largest error at fresh candidates; None if it is too large.
+    """Weights of the paths in a link's pool, and the largest error at new candidates; None if that is too large.
 
-    Candidates that leave the link no power, as where nothing scatters, are left out: no weight can err there.
+    Candidates without power, for instance without scattering, are left out: no weight changes a zero.
     """
-    shares, begin = [], None
-    for turn, total in enumerate(totals):
-        lit = total > 0
-        share = powers.at(turn, where)[lit] / total[lit, None]
-        if turn:
-            bound = FITTED * tolerance_db * np.log(10) / 10
-            weight = sparse_weights(np.vstack(shares), bound, begin)
-            begin = np.flatnonzero(weight)
+    bound = FIT_SHARE * tolerance_db * np.log(10) / 10
+    shares, first = [], None
+    for index, total in enumerate(totals):
+        positive = total > 0
+        share = powers.at(index, paths)[positive] / total[positive, None]
+        if index:
+            weight = sparse_weights(np.vstack(shares), bound, first)
+            first = np.flatnonzero(weight)
             error = float(np.abs(10 * np.log10(share @ weight)).max(initial=0.0))
-            if error <= PASSED * tolerance_db:
+            if error <= CHECK_SHARE * tolerance_db:
                 return weight, error
+        # Candidates that revealed an error join the training candidates.
         shares.append(share)
     return None
 
@@ -245,15 +248,15 @@ def sparse_weights(
     """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
 
     Args:
-        share: A path's share of the link's power at every candidate [n, P].
+        share: Share of every path in the link's power at every candidate [n, P].
         bound: Largest residual of a row.
         first: Paths to begin with; none if None.
 
     Returns:
-        The weights [P], most of them 0; the bound is missed where non-negative weights cannot meet it.
+        The weights [P], most of them 0; the bound is exceeded if non-negative weights cannot meet it.
     """
-    size = np.linalg.norm(share, axis=0)
-    unit = share / np.where(size > 0, size, 1.0)
+    norm = np.linalg.norm(share, axis=0)
+    unit = share / np.where(norm > 0, norm, 1.0)
     chosen: NDArray[np.int64] = np.zeros(0, dtype=np.int64) if first is None else first
     one = np.ones(len(share))
     weight = np.zeros(len(chosen))
@@ -261,14 +264,14 @@ def sparse_weights(
         if len(chosen):
             weight, _ = nnls(unit[:, chosen], one)
         chosen, weight = chosen[weight > 0], weight[weight > 0]
-        rest = one - unit[:, chosen] @ weight
-        gain = rest @ unit
+        residual = one - unit[:, chosen] @ weight
+        gain = residual @ unit
         gain[chosen] = 0.0
         best = np.argmax(gain)
-        if np.abs(rest).max() <= bound or gain[best] <= 0:
+        if np.abs(residual).max() <= bound or gain[best] <= 0:
             break
         chosen = np.append(chosen, best)
     weight = nnls(unit[:, chosen], one)[0] if len(weight) < len(chosen) else weight
-    found = np.zeros(share.shape[1])
-    found[chosen] = weight / size[chosen]
-    return found
+    weights = np.zeros(share.shape[1])
+    weights[chosen] = weight / norm[chosen]
+    return weights

@@ -1,9 +1,10 @@
-"""Replay at carriers: one trace, a program per carrier over the links measured there."""
+"""Replay at several carriers: one trace, and one program per carrier over the links measured there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +22,20 @@ class CarrierPaths:
 
     Attributes:
         paths: The path program of the links measured there, with the constants at that carrier.
-        links: Where these links stand among all [l].
+        links: Indices of these links among all links [l].
     """
 
     paths: Paths
     links: NDArray[np.int64]
 
 
+@final
 class ReplayCarriers:
-    """Stored paths, evaluated at several carriers for any candidate; parameters may be coefficients of laws.
+    """Stored paths, evaluated at several carriers; parameters may be coefficients of laws over frequency.
 
     Args:
         carriers: The carriers; together they hold every link once.
-        parameters: What the candidates' components stand for.
+        parameters: The parameters that a candidate gives values to.
         materials: The scene's materials before calibration, at the carrier of the trace.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
@@ -52,69 +54,46 @@ class ReplayCarriers:
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
         self.num_links = sum(len(carrier.links) for carrier in carriers)
-        self._links = [carrier.links for carrier in carriers]
-        self._frequencies = [carrier.paths.frequency for carrier in carriers]
-        acting = [parameters.at_carrier(frequency) for frequency in self._frequencies]
-        self._places = acting[0][1]  # the same at every carrier
-        self._first = np.unique(self._places, return_index=True)[1]
-        self._replays = [
-            Replay(carrier.paths, constants, combining, bandwidth)
-            for carrier, (constants, _) in zip(carriers, acting, strict=True)
+        # Two coefficients of one law act on the same constant: each carrier replays the distinct constants, and
+        # `_constant` maps every parameter to its constant. The mapping is the same at all carriers.
+        constants = [parameters.at_carrier(carrier.paths.frequency) for carrier in carriers]
+        self._constant = constants[0][1]
+        self._first = np.unique(self._constant, return_index=True)[1]
+        self._carriers = [
+            (Replay(carrier.paths, at_carrier, combining, bandwidth), carrier.paths.frequency, carrier.links)
+            for carrier, (at_carrier, _) in zip(carriers, constants, strict=True)
         ]
 
     @property
     def interactions(self) -> int:
-        """Interactions that a candidate is evaluated at, over all carriers."""
-        return sum(replay.interactions for replay in self._replays)
+        """Number of interactions that are evaluated for a candidate, over all carriers."""
+        return sum(replay.interactions for replay, _, _ in self._carriers)
 
     @property
     def large(self) -> bool:
-        """Whether some carrier has so many interactions that a candidate costs milliseconds."""
-        return any(replay.large for replay in self._replays)
+        """Whether some carrier has so many interactions that a candidate takes milliseconds."""
+        return any(replay.large for replay, _, _ in self._carriers)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
-        given = check_candidates(candidates, len(self.parameters))
-        loss = np.empty((len(given), self.num_links))
-        for replay, frequency, links in self._carriers():
-            values, _ = self.parameters.constants_and_slopes(given, frequency)
+        """Path loss of every link for candidates; see `Engine.path_loss`."""
+        candidates = check_candidates(candidates, len(self.parameters))
+        loss = np.empty((len(candidates), self.num_links))
+        for replay, frequency, links in self._carriers:
+            values, _ = self.parameters.constants_and_slopes(candidates, frequency)
             loss[:, links] = replay.path_loss(values[:, self._first])
-        self.calls += len(given)
+        self.calls += len(candidates)
         return loss
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link, and its derivatives by the parameters.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
-        given = check_candidates(candidates, len(self.parameters))
-        loss = np.empty((len(given), self.num_links))
+        """Path loss of every link and its derivatives; see `Differentiable.path_loss_and_jacobian`."""
+        candidates = check_candidates(candidates, len(self.parameters))
+        loss = np.empty((len(candidates), self.num_links))
         jacobian = np.empty((*loss.shape, len(self.parameters)))
-        for replay, frequency, links in self._carriers():
-            values, slopes = self.parameters.constants_and_slopes(given, frequency)
+        for replay, frequency, links in self._carriers:
+            values, slopes = self.parameters.constants_and_slopes(candidates, frequency)
             loss[:, links], by_constant = replay.path_loss_and_jacobian(values[:, self._first])
-            jacobian[:, links] = by_constant[:, :, self._places] * slopes[:, None, :]
-        self.calls += len(given)
+            jacobian[:, links] = by_constant[:, :, self._constant] * slopes[:, None, :]
+        self.calls += len(candidates)
         return loss, jacobian
-
-    def _carriers(self) -> zip[tuple[Replay, float, NDArray[np.int64]]]:
-        return zip(self._replays, self._frequencies, self._links, strict=True)

@@ -1,4 +1,4 @@
-"""What is measured and modelled: path loss is the first of several quantities that an engine can answer with."""
+"""Observables: the quantities that are measured and modelled; path loss is the first."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Observable:
     Attributes:
         name: Its name in messages.
         unit: Its unit.
-        measured: Its measured values [L] among a campaign's links.
-        modelled: What an engine answers to candidates [n, d]: [n, L], +inf where a link has no path.
+        measured: Its measured values [L] of given links.
+        modelled: An engine's values for candidates [n, d]: [n, L], +inf where a link has no path.
         derivatives: The same with derivatives by the parameters, [n, L] and [n, L, d]; None if there are none.
     """
 
@@ -42,4 +42,4 @@ PATH_LOSS: Final = Observable(
     modelled=lambda engine, candidates: engine.path_loss(candidates),
     derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
 )
-"""Path loss [dB], what the paper calibrates on."""
+"""Path loss [dB], which the paper calibrates on."""

@@ -36,7 +36,17 @@ class Engine(Protocol):
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates [n, d] in the fields' units; [n, L], [dB], +inf without a path."""
+        """Path loss of every link for candidates.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB]; +inf where a link has no path.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite or unphysical.
+        """
         ...
 
 
@@ -57,7 +67,17 @@ class Differentiable(Engine, Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d]."""
+        """Path loss of every link, and its derivatives by the parameters.
+
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+
+        Returns:
+            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
+
+        Raises:
+            InputError: The candidates have another width, or a value is not finite or unphysical.
+        """
         ...
 
 
@@ -120,7 +140,11 @@ class Answer:
 
 @runtime_checkable
 class Answering(Engine, Protocol):
-    """An engine with expensive calls: it gives each answer of a batch as soon as it arrives."""
+    """An engine with expensive calls, which gives each answer of a batch as soon as it arrives.
+
+    Its `path_loss` gives +inf for all links of a candidate that failed. It raises EngineError if every candidate of the
+    first batch fails, too many successive calls fail, or the ledger or a call's files cannot be written.
+    """
 
     @property
     def num_links(self) -> int:
@@ -128,9 +152,20 @@ class Answering(Engine, Protocol):
         ...
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates [n, d] in the fields' units, in any order.
+        """Answer candidates, each as soon as its call ends.
 
-        Once `stop` is set from outside, no further call is begun; answers that have already arrived are still given.
+        Args:
+            candidates: Parameter values [n, d], in the fields' units.
+            stop: Set from outside to begin no further call, and to stop running calls where possible; answers that have
+                already arrived are still given.
+
+        Yields:
+            The answers, in the order in which they arrive.
+
+        Raises:
+            InputError: A value is unphysical.
+            EngineError: Too many successive calls failed, or a call's files cannot be written; all earlier answers were
+                given.
         """
         ...
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Final, final
 
 import jax
 import jax.numpy as jnp
@@ -16,40 +16,41 @@ from calibray.engines.protocol import check_candidates
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 
-ANSWERS: Final = 2_000_000
-"""Derivatives by every material's constants that a call returns, at most."""
+MOST_DERIVATIVES: Final = 2_000_000
+"""Largest number of derivatives by material constants in one call; more would fill the memory."""
 
 LARGE: Final = 50_000
-"""Interactions beyond which a program is large."""
+"""Interactions above which a program is large."""
 
-TABULATED: Final = 30_000
-"""Interactions beyond which coefficients may come from tables."""
+MAY_TABULATE: Final = 30_000
+"""Interactions above which coefficients may come from tables."""
 
-NODES: Final = 0.25
-"""Nodes of tables for each interaction, beyond which filling them would cost more than they spare."""
+MOST_NODES: Final = 0.25
+"""Largest number of table nodes per interaction; filling more nodes takes longer than the tables save."""
 
 TABLE_TOLERANCE: Final = 1e-4
 """Largest error of a tabulated coefficient."""
 
-FORETOLD: Final = 32
-"""Candidates spread over the bounds that tell how fine tables must be, beside the first one."""
+TABLE_CANDIDATES: Final = 32
+"""Candidates spread over the bounds that decide, with the start values, how fine tables must be."""
 
-BLOCK: Final = 32
-"""Candidates a call, at most."""
+BATCH: Final = 32
+"""Largest number of candidates in one call."""
 
 
+@final
 class Replay:
     """Stored paths, evaluated for any candidate.
 
     Args:
         paths: The path program.
-        parameters: What the candidates' components stand for.
+        parameters: The parameters that a candidate gives values to.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
         dtype: Precision, `numpy.float64` or `numpy.float32`; if None, single precision for large programs whose paths
             combine by power.
-        tabulate: Whether coefficients come from tables; if None, where that is quicker.
-        block: Candidates a call, at most; a program is compiled for this number, and fewer cost no more than they are.
+        tabulate: Whether coefficients come from tables; if None, wherever that is faster.
+        batch: Largest number of candidates in one call; the program is compiled for this number.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -63,118 +64,101 @@ class Replay:
         bandwidth: float | None = None,
         dtype: type | None = None,
         tabulate: bool | None = None,
-        block: int = BLOCK,
+        batch: int = BATCH,
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
-        self._dtype, self._block = dtype, block
+        self._dtype, self._batch = dtype, batch
         self._offsets = fields.check_combining(paths, combining, bandwidth)
         self._combining = combining
-        self._rows, columns = parameters.matrix_indices(list(paths.materials))
-        used, self._places = np.unique(columns, return_inverse=True)
-        self._columns = columns
+        # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
+        # the columns that occur, and then picked for each parameter.
+        self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
+        used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
+        self._used_columns = tuple(int(column) for column in used_columns)
         self._base = fields.material_table(paths).astype(dtype)
-        self._fields = tuple(int(column) for column in used)
-        self._intervals = None if tabulate is False else self._needed(force=tabulate is True)
-        self._program = self._laid_out()
+        self._intervals = None if tabulate is False else self._table_intervals(force=tabulate is True)
+        self._program = self._compile()
 
     @property
     def interactions(self) -> int:
-        """Interactions that a candidate is evaluated at."""
+        """Number of interactions that are evaluated for a candidate."""
         return self.paths.num_interactions
 
     @property
     def large(self) -> bool:
-        """Whether there are so many interactions that a candidate costs milliseconds."""
+        """Whether there are so many interactions that a candidate takes milliseconds."""
         return self.interactions > LARGE
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
-        (loss,) = self._run(self._value, candidates)
+        """Path loss of every link for candidates; see `Engine.path_loss`."""
+        (loss,) = self._run(self._path_losses, candidates)
         return loss
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link, and its derivatives by the parameters.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
-        loss, jacobian = self._run(self._jacobian, candidates)
+        """Path loss of every link and its derivatives; see `Differentiable.path_loss_and_jacobian`."""
+        loss, jacobian = self._run(self._path_losses_and_jacobian, candidates)
         return loss, jacobian
 
-    def _value(self, tables: jax.Array, count: int) -> tuple[jax.Array, float]:
+    def _path_losses(self, tables: jax.Array, count: int) -> tuple[jax.Array, float]:
         return fields.path_losses(self._program, tables, self._combining, self._offsets, count)
 
-    def _jacobian(self, tables: jax.Array, count: int) -> tuple[jax.Array, jax.Array, float]:
+    def _path_losses_and_jacobian(self, tables: jax.Array, count: int) -> tuple[jax.Array, jax.Array, float]:
         loss, slope, error = fields.path_losses_and_slopes(
-            self._program, tables, self._fields, self._combining, self._offsets, count
+            self._program, tables, self._used_columns, self._combining, self._offsets, count
         )
-        return loss, _chosen(slope, self._rows, self._places), error
+        return loss, _pick(slope, self._rows, self._used_column), error
 
     def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
-        parts, start = [], 0
+        batches, start = [], 0
         while start < len(values):
-            size = self._size()
-            block = values[start : start + size]
+            size = self._batch_size()
+            batch = values[start : start + size]
+            # The program is compiled for `size` candidates: the rest of the tables keep the base values.
             tables = np.repeat(self._base[None], size, axis=0)
-            tables[: len(block), self._rows, self._columns] = block
-            *found, error = function(jnp.asarray(tables), len(block))
-            if error > TABLE_TOLERANCE:
-                self._refine()
+            tables[: len(batch), self._rows, self._columns] = batch
+            *answers, table_error = function(jnp.asarray(tables), len(batch))
+            if table_error > TABLE_TOLERANCE:
+                self._refine_tables()
                 continue
-            parts.append([np.asarray(part, dtype=float)[: len(block)] for part in found])
-            start += len(block)
+            batches.append([np.asarray(answer, dtype=float)[: len(batch)] for answer in answers])
+            start += len(batch)
         self.calls += len(values)
-        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+        return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
 
-    def _needed(self, force: bool) -> NDArray[np.int64] | None:
-        """Intervals of the tables by material and mode; None where evaluating every coefficient is quicker."""
-        if not force and self.interactions <= TABULATED:
+    def _table_intervals(self, force: bool) -> NDArray[np.int64] | None:
+        """Intervals of the tables by material and mode; None if evaluating every coefficient is faster."""
+        if not force and self.interactions <= MAY_TABULATE:
             return None
-        unit = qmc.Sobol(len(self.parameters), rng=0).random(FORETOLD)
-        few = np.concatenate([self.parameters.start[None], self.parameters.from_unit(unit)])
-        tables = self.parameters.constants_of(few, self.paths.materials, self.paths.frequency)
-        found = fields.table_intervals(self.paths, tables, TABLE_TOLERANCE)
-        return found if force or found.sum() <= NODES * self.interactions else None
+        unit = qmc.Sobol(len(self.parameters), rng=0).random(TABLE_CANDIDATES)
+        candidates = np.concatenate([self.parameters.start[None], self.parameters.from_unit(unit)])
+        tables = self.parameters.constants_of(candidates, self.paths.materials, self.paths.frequency)
+        intervals = fields.table_intervals(self.paths, tables, TABLE_TOLERANCE)
+        return intervals if force or intervals.sum() <= MOST_NODES * self.interactions else None
 
-    def _refine(self) -> None:
-        """Make the tables of coefficients finer, for these candidates and all that follow."""
+    def _refine_tables(self) -> None:
+        """Make the tables finer for these and all following candidates, or give them up at the finest."""
         if self._intervals is not None:
             finer = 2 * self._intervals
             self._intervals = finer if finer.max() <= fields.FINEST else None
-        self._program = self._laid_out()
+        self._program = self._compile()
 
-    def _laid_out(self) -> fields.GroupedProgram:
+    def _compile(self) -> fields.GroupedProgram:
         return fields.layout(self.paths, self._dtype, self._intervals, self._combining != "power").program
 
-    def _size(self) -> int:
-        """Candidates that a call takes: one where tables are filled for each."""
+    def _batch_size(self) -> int:
+        """Candidates in one call: a power of two within the limits, or one if tables are filled for each candidate."""
         if self._intervals is not None:
             return 1
-        room = ANSWERS // max(self.paths.num_links * len(self.materials) * len(self._fields), 1)
-        return min(self._block, 1 << max(room, 1).bit_length() - 1)
+        per_candidate = self.paths.num_links * len(self.materials) * len(self._used_columns)
+        most = max(MOST_DERIVATIVES // max(per_candidate, 1), 1)
+        return min(self._batch, 1 << most.bit_length() - 1)
 
 
 @jax.jit
-def _chosen(slope: jax.Array, rows: NDArray[np.int64], places: NDArray[np.int64]) -> jax.Array:
-    return slope[:, :, rows, places]
+def _pick(slope: jax.Array, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> jax.Array:
+    return slope[:, :, rows, columns]

@@ -1,4 +1,4 @@
-"""Re-trace: the ray tracer, run anew for every candidate."""
+"""Re-trace: the ray tracer runs again for every candidate."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from threading import Event
+from typing import final
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,7 @@ class CarrierTracer:
     Attributes:
         tracer: The scene in the ray tracer, with the constants at that carrier before calibration.
         links: The links measured there.
-        index: Where they stand among all [l].
+        index: Indices of these links among all links [l].
     """
 
     tracer: Tracer
@@ -35,21 +36,22 @@ class CarrierTracer:
     index: NDArray[np.intp]
 
 
+@final
 class Retrace:
-    """The ray tracer, run anew for every candidate.
+    """The ray tracer, run again for every candidate.
 
     Args:
-        parts: The ray tracer at each carrier; together they hold every link once.
+        tracers: The ray tracer at each carrier; together they hold every link once.
         materials: The scene's materials before calibration, at the study's carrier.
-        parameters: What the candidates' components stand for.
+        parameters: The parameters that a candidate gives values to.
         combining: How a link's paths combine: "power", "coherent" or "band".
         bandwidth: Bandwidth [Hz], for "band".
-        progress: Called with the stage "running" after every candidate of a batch.
+        progress: Called with "running" after every candidate of a batch.
     """
 
     def __init__(
         self,
-        parts: Sequence[CarrierTracer],
+        tracers: Sequence[CarrierTracer],
         materials: Mapping[str, Material],
         parameters: Parameters,
         combining: str = "power",
@@ -57,58 +59,39 @@ class Retrace:
         progress: Progress | None = None,
     ) -> None:
         self.parameters, self.materials, self.calls = parameters, dict(materials), 0
-        self.num_links = sum(len(part.index) for part in parts)
-        self._parts, self._progress = tuple(parts), progress
+        self.num_links = sum(len(carrier.index) for carrier in tracers)
+        self._tracers, self._progress = tuple(tracers), progress
         self._combining, self._bandwidth = combining, bandwidth
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, each with a trace of its own.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path.
-
-        Raises:
-            InputError: The candidates have another width, or a value is outside physics.
-        """
+        """Path loss of every link for candidates, each traced separately; see `Engine.path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         return np.stack([answer.path_loss_db for answer in self.answers(values)])
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """The answers to candidates, each as soon as it is there.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-            stop: Set from outside to begin no further call.
-
-        Yields:
-            The answers, in the order of the candidates.
-
-        Raises:
-            InputError: A value is outside physics.
-        """
+        """Answer candidates in their order; see `Answering.answers`."""
         for index, candidate in enumerate(candidates):
             if stop is not None and stop.is_set():
                 return
             started = time.perf_counter()
             loss = np.empty(self.num_links)
-            for part in self._parts:
-                loss[part.index] = self._one(part, candidate)
+            for carrier in self._tracers:
+                loss[carrier.index] = self._trace(carrier, candidate)
             self.calls += 1
             if self._progress is not None:
                 self._progress("running", index + 1, len(candidates))
             yield Answer(index, loss, time.perf_counter() - started)
 
-    def _one(self, part: CarrierTracer, candidate: NDArray[np.float64]) -> NDArray[np.float64]:
-        tracer = part.tracer
+    def _trace(self, carrier: CarrierTracer, candidate: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss of a carrier's links for one candidate [l], [dB]."""
+        tracer = carrier.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
-        solution = tracer.solve(part.links, materials)
+        solution = tracer.solve(carrier.links, materials)
         gain, link, delay = solution.gain, solution.link, solution.delay
         offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
-        real, imaginary = (jnp.asarray(np.moveaxis(side, 0, -1)) for side in (gain.real, gain.imag))
+        # Sionna's arrays are [paths, receive, transmit]; the field functions expect paths last.
+        real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
         power = fields.link_power(
-            (real, imaginary), link, delay, len(part.links), tracer.frequency, self._combining, offsets
+            (real, imaginary), link, delay, len(carrier.links), tracer.frequency, self._combining, offsets
         )
         return np.asarray(fields.decibel(power))

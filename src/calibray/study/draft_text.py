@@ -1,4 +1,4 @@
-"""A study's content as TOML, with the reasons of what was assumed as comments."""
+"""A drafted study as TOML, with the reasons of its assumptions as comments."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def toml(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
 
     Args:
         content: Sections by name.
-        reasons: Why a section or a key is as it is, by its dotted name.
+        reasons: Reasons of assumptions by the dotted name of the section or key.
 
     Returns:
         The file's text.
     """
     lines = [
         f"#:schema {SCHEMA_FILE}",
-        "# Drafted by `calibray init`: what was assumed stands beside. Check it, above all antennas and heights.",
+        "# Drafted by `calibray init`. Comments give the reason of each assumption: check antennas and heights first.",
     ]
     tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
     lines += [f"{key} = {_value(value)}" for key, value in content.items() if key not in tables]
@@ -45,12 +45,13 @@ def _key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """A value as TOML has it; JSON's texts and numbers are TOML's."""
+    """A value in TOML; texts and numbers are written as in JSON."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_key(key)} = {_value(part)}" for key, part in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, float):
+        # Frequencies are easier to read as 3.5e9.
         giga = f"{value / 1e9:.10g}e9"
         return giga if abs(value) >= 1e6 and float(giga) == value else repr(value)
     return json.dumps(value, ensure_ascii=False)

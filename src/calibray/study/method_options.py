@@ -1,4 +1,4 @@
-"""The settings of a method as a study file gives them: known, of the type that the method takes, and of a size."""
+"""Check of a method's settings in a study file: the names, the types and the sizes of values."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from calibray.errors import InputError
 from calibray.support.messages import did_you_mean, shortened
 
 LARGEST: Final = 10**6
-"""The whole number beyond which a setting is refused: no method keeps more candidates than that."""
+"""Largest whole number of a setting: no method can keep more candidates in memory."""
 
 LONGEST: Final = 10**4
-"""The number of entries beyond which a list is refused."""
+"""Largest number of entries of a list, and of characters of a text."""
 
-_GIVEN: Final = ("lower", "upper", "seed", "objective", "model")
+_NOT_SETTINGS: Final = ("lower", "upper", "seed", "objective", "model")
 _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
     "bool": ((bool,), "true or false"),
     "int": ((int,), "a whole number"),
@@ -26,10 +26,10 @@ _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:
-    """Refuse settings that a method does not take; whether their values suit it, it says itself.
+    """Refuse settings that a method does not have; the method itself checks whether their values suit it.
 
     Args:
-        name: The method; of one that is unknown or chosen later, only the values' size is checked.
+        name: The method. If it is unknown or chosen later, only the size of values is checked.
         options: The settings.
 
     Raises:
@@ -37,52 +37,55 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     """
     if not options:
         return
-    # Optimizers take SciPy along; a study without options is read without them.
+    # Optimizers import SciPy; a study without options is read without them.
     from calibray.optimizers import METHODS
 
-    known = (
-        {key: entry for key, entry in signature(METHODS[name]).parameters.items() if key not in _GIVEN}
-        if name in METHODS
-        else None
-    )
+    settings = None
+    if name in METHODS:
+        arguments = signature(METHODS[name]).parameters
+        settings = {key: argument for key, argument in arguments.items() if key not in _NOT_SETTINGS}
     for key, value in options.items():
-        place = f"method.options.{shortened(key)}"
-        if known is not None and key not in known:
-            raise InputError(f"{place}: the method {name!r} has no such setting; {did_you_mean(key, known)}")
-        _check_size(f"{place} = {shortened(repr(value))}", value)
-        if known is not None:
-            _check_type(f"{place} = {shortened(repr(value))}", known[key], value)
+        prefix = f"method.options.{shortened(key)}"
+        if settings is not None and key not in settings:
+            raise InputError(
+                f"{prefix}: the method {name!r} has no such setting; {did_you_mean(key, settings)}"
+            )
+        prefix += f" = {shortened(repr(value))}"
+        _check_size(prefix, value)
+        if settings is not None:
+            _check_type(prefix, settings[key], value)
 
 
-def _check_type(place: str, entry: Parameter, value: Any) -> None:
-    """By the annotation of the constructor's argument; an array may be a number or a list of them."""
-    types = [part.strip() for part in str(entry.annotation).split("|")]
+def _check_type(prefix: str, argument: Parameter, value: Any) -> None:
+    """Check the annotation of the constructor's argument; other types, such as arrays, are not checked."""
+    types = [part.strip() for part in str(argument.annotation).split("|")]
     if not set(types) - {"None"} <= set(_TYPES):
         return
-    for each in types:
-        allowed, _ = _TYPES.get(each, ((), ""))
-        if isinstance(value, allowed) and (isinstance(value, bool) == (each == "bool")):
+    for name in types:
+        allowed, _ = _TYPES.get(name, ((), ""))
+        # In Python, True and False are integers as well.
+        if isinstance(value, allowed) and (isinstance(value, bool) == (name == "bool")):
             return
-    wanted = " or ".join(_TYPES[each][1] for each in types if each in _TYPES)
-    raise InputError(f"{place}: must be {wanted}")
+    wanted = " or ".join(_TYPES[name][1] for name in types if name in _TYPES)
+    raise InputError(f"{prefix}: must be {wanted}")
 
 
-def _check_size(place: str, value: Any, depth: int = 2) -> None:
+def _check_size(prefix: str, value: Any, depth: int = 2) -> None:
     match value:
         case bool():
             pass
         case int() if abs(value) > LARGEST:
-            raise InputError(f"{place}: must be at most {LARGEST:,}")
+            raise InputError(f"{prefix}: must be at most {LARGEST:,}")
         case float() if not isfinite(value):
-            raise InputError(f"{place}: must be a finite number")
+            raise InputError(f"{prefix}: must be a finite number")
         case str() if len(value) > LONGEST:
-            raise InputError(f"{place}: must have at most {LONGEST:,} characters")
+            raise InputError(f"{prefix}: must have at most {LONGEST:,} characters")
         case list() | tuple() if depth and len(value) <= LONGEST:
-            for each in value:
-                _check_size(place, each, depth - 1)
+            for entry in value:
+                _check_size(prefix, entry, depth - 1)
         case list() | tuple():
-            raise InputError(f"{place}: must be a list of at most {LONGEST:,} entries, or of such lists")
+            raise InputError(f"{prefix}: must be a list of at most {LONGEST:,} entries, or of such lists")
         case int() | float() | str():
             pass
         case _:
-            raise InputError(f"{place}: must be a number, a text, true, false, or a list of them")
+            raise InputError(f"{prefix}: must be a number, a text, true, false, or a list of them")

@@ -9,11 +9,7 @@ from calibray.study.study import Study
 
 
 def schema_text() -> str:
-    """The schema as JSON.
-
-    Returns:
-        The text, a line break at its end.
-    """
+    """The schema as JSON text with a line break at its end."""
     return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -31,7 +27,7 @@ def schema() -> dict[str, Any]:
 
 
 def _shorten(node: Any) -> None:
-    """Keep the first line of descriptions: what follows tells of attributes, and the reference tells more."""
+    """Keep the first line of descriptions; the rest describes the attributes of Python classes."""
     if isinstance(node, dict):
         if isinstance(node.get("description"), str):
             node["description"] = node["description"].split("\n\n")[0].replace("\n", " ").replace("``", "")

@@ -1,4 +1,4 @@
-"""The sections of a study file, each a closed model: what has no meaning is refused, not ignored."""
+"""The sections of a study file, each a closed model: an unknown key is an error."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class SceneSection(Section):
         file: Mitsuba XML file, relative to the study file's folder, or "sionna:NAME" for a bundled scene.
         frequency: Carrier frequency [Hz].
         bandwidth: Bandwidth [Hz], for combining over the band.
-        origin: Longitude and latitude [deg] of the scene's origin, for positions on the globe.
-        crs: Projection of the scene's x and y, for instance "EPSG:32632"; local about the origin if absent.
+        origin: Longitude and latitude [deg] of the scene's origin, for geographic positions.
+        crs: Projection of the scene's x and y, for instance "EPSG:32632"; a local projection at the origin if absent.
     """
 
     file: Text
@@ -46,7 +46,7 @@ class SceneSection(Section):
     def _in_hertz(cls, value: float) -> float:
         lowest, highest = FREQUENCIES
         if not lowest <= value <= highest:
-            raise InputError(f"must lie in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9")
+            raise InputError(f"must be in {lowest:g} to {highest:g} Hz; 28.5 GHz is written 28.5e9")
         return value
 
 
@@ -85,19 +85,19 @@ class MaterialSection(Section):
             raise InputError(
                 f"revision = {self.revision!r} without itu; name the ITU-R material, or leave it out"
             )
-        given = self.model_dump(exclude_none=True, exclude={"itu", "revision"})
-        Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **given})
+        stated = self.model_dump(exclude_none=True, exclude={"itu", "revision"})
+        Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **stated})
         return self
 
 
 class AverageSection(Section):
-    """``[links.average]``: many samples about one place to one link, in linear power.
+    """``[links.average]``: samples close together are averaged to one link, in linear power.
 
     Attributes:
-        by: "cell" of a square grid, stretch of "distance" along the rows' order, or window of "time".
-        size: Its width or length [m], or duration [s].
+        by: "cell" of a square grid, "distance" travelled in the order of the rows, or window of "time".
+        size: Width or length [m], or duration [s].
         time: Column of times, for "time" only.
-        unbiased: Whether to add what the logarithm of a mean of few samples lies too low by.
+        unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
     """
 
     by: Literal["cell", "distance", "time"]
@@ -114,12 +114,12 @@ class AverageSection(Section):
 
 
 class TrackSection(Section):
-    """``[links.track]``: a GPX track that tells where each row was measured, by the time.
+    """``[links.track]``: a GPX track that gives the position of each row by its time.
 
     Attributes:
         file: GPX file, relative to the study file's folder.
         time: Column of the rows' times: ISO 8601, or seconds since 1970.
-        longest_gap: Rows between two points of the track further apart than this are left out [s].
+        longest_gap: Longest time between two points of the track [s]; rows in a longer gap are left out.
         clock: How much the table's clock is ahead of the track's [s].
     """
 
@@ -135,26 +135,26 @@ class LinksSection(Section):
     Attributes:
         file: CSV, Parquet or Excel file, relative to the study file's folder.
         tx: Transmitter position (x, y, z) [m], each a number or a column; longitude, latitude [deg] and height [m]
-            where positions are "geographic".
+            if positions are "geographic".
         rx: Receiver position, likewise.
         value: Column of the measured values.
-        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power whose
-            transmitted power is not known.
+        quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power with
+            unknown transmitted power.
         position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
-        wide: Name of the transmitter by column, of a table with one column a transmitter.
+        wide: Name of the transmitter by column, for a table with one column per transmitter.
         track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
-        heights: "ground" for heights above the scene's ground at each place; above the scene's zero if absent.
-        transmitters: Table with a row for every transmitter, relative to the study file's folder.
-        transmitter: Column, of both tables, that says which transmitter it is.
+        heights: "ground" for heights above the scene's ground; above z = 0 of the scene if absent.
+        transmitters: Table with one row per transmitter, relative to the study file's folder.
+        transmitter: Column of both tables with the name of the transmitter.
         noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
         below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, "censor" keeps them as
             upper bounds of the received power, which the intervals take into account.
-        inside: What becomes of receivers on what buildings cover: "keep", "drop", or "move" to the nearest street.
+        inside: How receivers inside buildings are treated: "keep", "drop", or "move" to the nearest street.
         average: How samples are averaged.
     """
 
@@ -183,8 +183,8 @@ class LinksSection(Section):
     def _power_above_its_floor(self) -> Self:
         if self.noise_floor_dbm is not None and self.quantity not in ("received_power", "rsrp"):
             raise InputError(
-                f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: is a received "
-                "power; filter losses by links.where"
+                f"links.noise_floor_dbm = {self.noise_floor_dbm:g} with quantity = {self.quantity!r}: the noise floor "
+                "is a received power; filter losses by links.where"
             )
         if self.below_floor == "censor" and self.noise_floor_dbm is None:
             raise InputError(
@@ -211,14 +211,14 @@ class AntennasSection(Section):
 
 
 class ObjectiveSection(Section):
-    """``[objective]``: how paths become a path loss, and what a link without a path counts.
+    """``[objective]``: how paths combine to a path loss, and how a link without a path counts.
 
     Attributes:
         combining: "power" (sum of path powers), "coherent" (sum of fields) or "band" (coherent power averaged
             over the bandwidth).
-        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it as lost at
+        no_path: "exclude" leaves a link without a path out of the objective; "censor" counts it with
             `ceiling_db`.
-        ceiling_db: Path loss [dB] beyond which a link counts as lost, with "censor" only.
+        ceiling_db: Largest path loss that can be measured [dB], with "censor" only.
     """
 
     combining: Literal["power", "coherent", "band"] = "power"
@@ -226,25 +226,25 @@ class ObjectiveSection(Section):
     ceiling_db: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
-    def _ceiling_where_censored(self) -> Self:
+    def _ceiling_only_with_censor(self) -> Self:
         if self.no_path == "censor" and self.ceiling_db is None:
             raise InputError(
                 "no_path = 'censor' needs ceiling_db [dB], the largest loss that could be measured"
             )
         if self.no_path == "exclude" and self.ceiling_db is not None:
             raise InputError(
-                f"ceiling_db = {self.ceiling_db:g} has no effect; say no_path = 'censor' or leave it out"
+                f"ceiling_db = {self.ceiling_db:g} has no effect; set no_path = 'censor' or leave it out"
             )
         return self
 
 
 class PriorSection(Section):
-    """What is known of a parameter beforehand: log-normal around a value.
+    """The prior of a parameter: log-normal around a value.
 
     Attributes:
-        itu: ITU-R P.2040 material, with "@" and the revision or without, whose value it lies around.
-        value: That value itself, in the field's unit, in place of `itu`.
-        spread: Standard deviation of its logarithm: 0.3 stands for about 30 %.
+        itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
+        value: The value itself, in the field's unit, in place of `itu`.
+        spread: Standard deviation of the logarithm: 0.3 is about 30 %.
     """
 
     itu: Text | None = None
@@ -254,7 +254,7 @@ class PriorSection(Section):
     @model_validator(mode="after")
     def _one_centre(self) -> Self:
         if (self.itu is None) == (self.value is None):
-            raise InputError("a prior lies around an ITU material or a value: give one of itu and value")
+            raise InputError("a prior is centred on an ITU material or a value: give one of itu and value")
         return self
 
 
@@ -265,7 +265,7 @@ class ParameterSection(Section):
         bounds: Lower and upper bound, in the field's unit.
         start: Value before calibration, a number, "itu:NAME" or "itu:NAME@REVISION"; if absent, the scene's.
         scale: "linear" or "log".
-        prior: What is known of it beforehand; nothing but the bounds if absent.
+        prior: Its prior; uniform within the bounds if absent.
     """
 
     bounds: tuple[float, float]
@@ -274,14 +274,11 @@ class ParameterSection(Section):
     prior: PriorSection | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The value that the prior lies around.
+        """The value that the prior is centred on, in the field's unit.
 
         Args:
             name: The parameter.
             frequency: The carrier [Hz].
-
-        Returns:
-            The value, in the field's unit.
 
         Raises:
             InputError: There is no prior, ITU-R P.2040 gives no such value, or a bound or the value is not positive.
@@ -293,14 +290,13 @@ class ParameterSection(Section):
             value = itu_start(name, f"itu:{self.prior.itu}", frequency)
         if not min(value, self.bounds[0]) > 0:
             raise InputError(
-                f"{name}: a prior is of the logarithm: its value, {value:g}, and the lower bound, {self.bounds[0]:g}, "
-                "must be greater than 0"
+                f"{name}: a log-normal prior needs a positive value and lower bound, but they are {value:g} and "
+                f"{self.bounds[0]:g}"
             )
         return value
 
 
 def _ordered(value: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Refuse bounds of which the lower is not the lesser."""
     if value is not None and value[0] >= value[1]:
         raise InputError("the lower bound must be less than the upper")
     return value
@@ -327,7 +323,7 @@ class OffsetSection(Section):
     """``[offset]``: the nuisance term "offset", one [dB] for all links or one per group.
 
     Attributes:
-        per: Column of group labels, or several whose labels are joined; one offset for all links if absent.
+        per: Column of group labels, or several columns whose labels are joined; one offset for all links if absent.
         bounds: Lower and upper bound [dB]; unbounded if absent.
         prior_db: Standard deviation of a Gaussian prior around zero [dB]; flat if absent.
     """
@@ -370,10 +366,10 @@ class NoiseSection(Section):
     """``[noise]``: the errors of measured links.
 
     Attributes:
-        std_db: Standard deviation of a link's error [dB], against which priors are weighed; estimated if absent.
-        kind: "gaussian" or "student-t", or "auto" where intervals are to allow for either.
-        range_m: Distance over which neighbouring links' errors are alike [m], 0 where they are not, or "auto".
-        heterogeneity: Spread of one material's constants between objects, 0 for none, or "auto".
+        std_db: Standard deviation of a link's error [dB], which weighs the priors; estimated if absent.
+        kind: "gaussian", "student-t", or "auto" for intervals that cover both.
+        range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
+        heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
@@ -383,15 +379,13 @@ class NoiseSection(Section):
 
     @model_validator(mode="after")
     def _one_departure(self) -> Self:
-        stated = [
-            name
-            for name, said in (
-                ("kind = 'student-t'", self.kind == "student-t"),
-                (f"range_m = {self.range_m}", self.range_m not in ("auto", 0)),
-                (f"heterogeneity = {self.heterogeneity}", self.heterogeneity not in ("auto", 0)),
-            )
-            if said
-        ]
+        stated = []
+        if self.kind == "student-t":
+            stated.append("kind = 'student-t'")
+        if self.range_m not in ("auto", 0):
+            stated.append(f"range_m = {self.range_m}")
+        if self.heterogeneity not in ("auto", 0):
+            stated.append(f"heterogeneity = {self.heterogeneity}")
         if len(stated) > 1:
             raise InputError(
                 f"noise: {' and '.join(stated)}: only one of them can be stated; leave the others at 'auto'"
@@ -400,10 +394,10 @@ class NoiseSection(Section):
 
 
 class HoldoutSection(Section):
-    """``[holdout]``: the links kept from calibration to judge it by; one of three ways to choose them.
+    """``[holdout]``: links that are not calibrated on, for validation; chosen in one of three ways.
 
     Attributes:
-        where: Row filter; the links that pass are held out.
+        where: Row filter; links that pass it are held out.
         blocks: Number of spatial blocks, each held out in turn.
         by: Column of labels; the links of each label are held out in turn.
     """
@@ -420,11 +414,11 @@ class HoldoutSection(Section):
 
 
 class FidelitySection(Section):
-    """``[fidelity]``: tracing again with the materials found, where the paths depend on them.
+    """``[fidelity]``: tracing again with the calibrated materials, because paths may depend on them.
 
     Attributes:
-        tolerance_db: Largest change of a link's path loss [dB] that is let stand.
-        rounds: How often to trace again at most, 0 for never.
+        tolerance_db: Largest change of a link's path loss [dB] that is accepted.
+        rounds: Largest number of traces, 0 for none.
     """
 
     tolerance_db: Annotated[float, Field(gt=0)] = 0.5
@@ -437,7 +431,7 @@ class MethodSection(Section):
     Attributes:
         name: "auto", "sgwo-im", "gwo" or another registered method.
         seed: Seed of its random numbers.
-        model: The cheap model of an engine that can only be called: "replay" of the study's own scene, or "none".
+        model: The cheap model of an expensive engine: "replay" of the study's scene, or "none".
         options: Settings of the named method.
     """
 

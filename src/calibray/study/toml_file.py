@@ -1,4 +1,4 @@
-"""The text of a study file: its TOML, the names in it, and the variables in its file names."""
+"""The text of a study file: its TOML, and environment variables in the names of files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calibray.support.output_files import exists
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """Read the content of a study file.
+    """Read a study file.
 
     Args:
         path: The TOML file.
@@ -24,7 +24,7 @@ def read_content(path: Path) -> dict[str, Any]:
         Sections by name.
 
     Raises:
-        InputError: The file does not exist, cannot be read, or is no TOML.
+        InputError: The file does not exist, cannot be read, or is not TOML.
     """
     if not exists(path):
         raise InputError(f"{shortened(str(path), 300)}: no such study file")
@@ -35,23 +35,22 @@ def read_content(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8 text; save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        # A number of thousands of digits, or lists thousands deep, beside what TOML itself refuses.
+        # Besides malformed TOML: a number with thousands of digits, or lists nested thousands deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
 
 
 def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
-    """Refuse ``walls.thickness = ...``, which TOML reads as a table "walls" with a key "thickness"."""
+    """Refuse ``walls.thickness = ...``: TOML reads it as a table "walls" with a key "thickness"."""
     for name, entry in parameters.items() if isinstance(parameters, Mapping) else ():
-        fields = entry if isinstance(entry, Mapping) else {}
-        tables = (key for key, value in fields.items() if isinstance(value, Mapping))
-        if field := next((key for key in tables if key not in ParameterSection.model_fields), None):
-            raise InputError(
-                f'{path}: parameters.{name}.{field}: quote the name, "{name}.{field}" = {{ ... }}'
-            )
+        for key, value in entry.items() if isinstance(entry, Mapping) else ():
+            if isinstance(value, Mapping) and key not in ParameterSection.model_fields:
+                raise InputError(
+                    f'{path}: parameters.{name}.{key}: quote the name, "{name}.{key}" = {{ ... }}'
+                )
 
 
 def expand(text: str, environment: Mapping[str, str]) -> str:
-    """Put in environment variables: ``${NAME}``, or ``${NAME:-default}`` where one may be unset or empty.
+    """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` if one may be unset or empty.
 
     Args:
         text: The text.
@@ -70,8 +69,8 @@ def expand(text: str, environment: Mapping[str, str]) -> str:
 
     def value(match: re.Match[str]) -> str:
         name, default = match.groups()
-        if found := environment.get(name):
-            return found
+        if environment.get(name):
+            return environment[name]
         if default is None:
             raise InputError(f"environment variable {name} is not set; set it, or write ${{{name}:-DEFAULT}}")
         return default

@@ -1,4 +1,4 @@
-"""Tracing what the user has: a study, or a scene and links."""
+"""`calibray.trace`: paths of a study, or of a scene and links."""
 
 from __future__ import annotations
 
@@ -54,45 +54,35 @@ def trace(
     """Find the paths of every link and compile them.
 
     Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Or a study, which says
-            itself what its links, carrier, antennas and settings are; its trace is kept between runs.
-        measurements: The links; their values and carriers are not looked at (for another carrier, `Paths.at`). With a
-            study: links in place of its own.
+        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read. Or a study, which states
+            its links, carrier, antennas and settings; its trace is cached.
+        measurements: The links; their values and carriers do not matter (use `Paths.at` for another carrier). With a
+            study, links in place of the study's.
         frequency: Carrier frequency [Hz].
         tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
         rx_antenna: Receive antenna.
         materials: Constants in place of the scene's, by material name; with a study, each a `Material`, in place of
-            those that its calibration starts from.
+            the start values.
         progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
         **settings: The attributes of `TraceSettings`.
 
     Returns:
-        The path program; `links_without_path` tells which links it cannot say anything about.
+        The path program; `links_without_path` lists the links that no path reaches.
 
     Raises:
-        InputError: The study, the scene, an antenna, a setting or a position cannot be used, or an argument is missing
-            or given although the study says it.
-        EngineError: There are more paths than fit into memory.
+        InputError: The study, the scene, an antenna, a setting or a position cannot be used; or an argument is missing,
+            or given although the study states it.
+        EngineError: The paths do not fit into memory.
     """
-    said = {"frequency": frequency, "tx_antenna": tx_antenna, "rx_antenna": rx_antenna, **settings}
     if isinstance(scene, Study):
-        if given := [name for name, value in said.items() if value is not None]:
-            raise InputError(
-                f"trace: {given[0]} is given, and said by the study {scene.path} as well; change the study"
-            )
-        if not isinstance(measurements, Measurements | None):
-            raise InputError(
-                "trace: measurements of a study must be Measurements; read them, or make them of a table"
-            )
-        whole = {name: each for name, each in (materials or {}).items() if isinstance(each, Material)}
-        if partial := sorted(set(materials or {}) - set(whole)):
-            raise InputError(
-                f"trace: materials of a study: {partial[0]!r} is no Material; give all its constants as a Material"
-            )
-        return Setup.open(scene, links=measurements).trace(whole, progress)
+        arguments = {"frequency": frequency, "tx_antenna": tx_antenna, "rx_antenna": rx_antenna, **settings}
+        for name, value in arguments.items():
+            if value is not None:
+                raise InputError(f"trace: the study {scene.path} states {name}; change it there")
+        return _trace_study(scene, measurements, materials or {}, progress)
     if measurements is None or frequency is None:
         missing = "measurements, the links" if measurements is None else "frequency, the carrier in Hz"
-        raise InputError(f"trace: without a study needs {missing}; give it")
+        raise InputError(f"trace: without a study, give {missing}")
     return default_tracer.trace(
         scene,
         measurements,
@@ -103,3 +93,18 @@ def trace(
         progress=progress,
         **settings,
     )
+
+
+def _trace_study(study: Study, links: Links | None, materials: Constants, progress: Progress | None) -> Paths:
+    if not isinstance(links, Measurements | None):
+        raise InputError(
+            "trace: the links of a study must be Measurements; use read_measurements, which takes a table"
+        )
+    complete: dict[str, Material] = {}
+    for name, constants in materials.items():
+        if not isinstance(constants, Material):
+            raise InputError(
+                f"trace: materials of a study: {name!r} is not a Material; give all its constants as a Material"
+            )
+        complete[name] = constants
+    return Setup.open(study, links=links).trace(complete, progress)

@@ -1,4 +1,4 @@
-"""Faults that Pydantic finds, in the words of the file they stand in."""
+"""Errors that Pydantic finds in a study file, with the keys and values of the file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pydantic import BaseModel, ValidationError
 from calibray.errors import InputError
 from calibray.support.messages import did_you_mean, shortened
 
-MOST_FAULTS: Final = 20
-"""The number of faults beyond which the others are only counted."""
+MOST_ERRORS: Final = 20
+"""Number of errors that are listed; further ones are only counted."""
 
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -47,14 +47,14 @@ def explain(
     source: str,
     tagged: Sequence[str] = (),
 ) -> InputError:
-    """One message for all faults, a line each: file, dotted key, value, bound.
+    """One message for all errors, a line each: file, dotted key, value, bound.
 
     Args:
-        error: What Pydantic found.
-        model: The model that the content was validated against; its keys are offered for misspelled ones.
+        error: Pydantic's errors.
+        model: The model of the content; its keys are suggested for misspelled ones.
         content: The content.
         source: Name of the file, for the message.
-        tagged: Tables of which there are several kinds, told apart by their `name`.
+        tagged: Tables of which there are several kinds, distinguished by their `name`.
 
     Returns:
         The error to raise.
@@ -63,7 +63,7 @@ def explain(
     for fault in error.errors():
         location = fault["loc"]
         if location[:1] and location[0] in tagged:
-            # The kind stands behind the table's name, which is no key.
+            # Pydantic puts the kind after the table's name, but it is not a key of the file.
             location = (location[0], "name") if "tag" in fault["type"] else (location[0], *location[2:])
         path = _path(location, content, fault["type"] == "missing")
         key = dotted(path)
@@ -75,23 +75,16 @@ def explain(
             text = describe_fault(fault)
             # A message about a whole table names the key itself.
             line = text if text.startswith(key) else f"{key}{_shown(path, content)}: {text}"
-        # A value that fits none of several types has one fault per type; the first says enough.
+        # A value that matches none of several types has one error per type; the first is enough.
         lines.setdefault(key, line)
-    told = list(lines.values())[:MOST_FAULTS]
-    if more := len(lines) - len(told):
-        told.append(f"and {more} more like these; correct them first")
-    return InputError("\n".join(f"{source}: {line}" for line in told))
+    listed = list(lines.values())[:MOST_ERRORS]
+    if len(lines) > len(listed):
+        listed.append(f"and {len(lines) - len(listed)} more like these; correct them first")
+    return InputError("\n".join(f"{source}: {line}" for line in listed))
 
 
 def describe_fault(fault: Mapping[str, Any]) -> str:
-    """What is wrong with a value, without the value.
-
-    Args:
-        fault: One of the errors that Pydantic lists.
-
-    Returns:
-        The message.
-    """
+    """The message of one of Pydantic's errors, without the value."""
     context = fault.get("ctx") or {}
     if isinstance(cause := context.get("error"), InputError):
         return str(cause)
@@ -100,7 +93,7 @@ def describe_fault(fault: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[str | int]) -> str:
-    """A key as it is written in TOML, for instance ``parameters."walls.thickness".bounds[1]``."""
+    """A key as TOML writes it, for instance ``parameters."walls.thickness".bounds[1]``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -112,7 +105,7 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def _path(location: Sequence[str | int], content: Any, missing: bool) -> tuple[str | int, ...]:
-    """Pydantic's location without the parts that name a type instead of a key; only a missing key is in no table."""
+    """Pydantic's location without the parts that name a type; only the last key may be missing from the content."""
     path: list[str | int] = []
     for index, part in enumerate(location):
         last = index == len(location) - 1
@@ -136,17 +129,17 @@ def _shown(path: Sequence[str | int], content: Any) -> str:
 
 
 def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
-    """The keys that a model knows at a path, of whichever kind it may be there."""
+    """The keys of a model at a path, of all kinds of tables that it may have there."""
     models = [model]
     for part in path:
         models = [
             table
-            for each in models
+            for known in models
             for table in _tables(
-                _annotations(each).get(str(part)) if _annotations(each) else get_args(each)[1]
+                _annotations(known).get(str(part)) if _annotations(known) else get_args(known)[1]
             )
         ]
-    return list(dict.fromkeys(key for each in models for key in _annotations(each)))
+    return list(dict.fromkeys(key for known in models for key in _annotations(known)))
 
 
 def _annotations(model: Any) -> dict[str, Any]:
@@ -156,6 +149,6 @@ def _annotations(model: Any) -> dict[str, Any]:
 
 
 def _tables(annotation: Any) -> list[Any]:
-    """The tables among the types that a key may have."""
+    """The types that a key may have, except None."""
     options = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
     return [option for option in options if option is not type(None)]

@@ -355,7 +355,7 @@ def _apart(engine: Replay, scene: Scene, combining: str, bandwidth: float | None
     }
     own = replace(paths, material=material.reshape(-1), materials=dict(table))
     again = Replay(
-        own, Parameters(items, parameters.frequency), combining, bandwidth, tabulate=False, block=POPULATION
+        own, Parameters(items, parameters.frequency), combining, bandwidth, tabulate=False, batch=POPULATION
     )
     return Buildings(engine, again, owner, building)
 

@@ -103,17 +103,7 @@ class ChunkedReplay:
         self.large = any(large for _, large in sizes)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
+        """Path loss of every link for candidates; see `Engine.path_loss`."""
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
         for chunk, chunk_loss in self._answers(_path_loss, values):
@@ -123,17 +113,7 @@ class ChunkedReplay:
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link and its derivatives by the parameters, all sent to this process.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
-
-        Raises:
-            InputError: The candidates have another width, or a value is not finite.
-        """
+        """Path loss of every link and its derivatives, all sent to this process; see `Differentiable`."""
         values = check_candidates(candidates, len(self.parameters))
         loss = np.empty((len(values), len(self._study.links)))
         jacobian = np.empty((*loss.shape, len(self.parameters)))

@@ -120,12 +120,7 @@ def identity(value: Content) -> Content:
 
 
 def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) -> Callable[[int], None]:
-    """A function of a finished chunk's number that reports the links done so far as "tracing".
-
-    Args:
-        chunks: Indices of every chunk's links.
-        progress: The function to report to.
-    """
+    """A function of a finished chunk's number that reports the links done so far as "tracing"."""
     done, total = 0, sum(len(chunk) for chunk in chunks)
 
     def answered(index: int) -> None:
@@ -138,21 +133,12 @@ def count_links(chunks: Sequence[NDArray[np.int64]], progress: Progress | None) 
 
 
 def chunk_size(stated: int | None, count: int) -> int:
-    """Largest number of links of a chunk.
-
-    Args:
-        stated: The number that the study states, or None.
-        count: Number of all links.
-    """
+    """Largest number of links of a chunk, from the number that the study states and the number of all links."""
     return stated or max(CHUNK_LINKS, -(-count // MOST_CHUNKS))
 
 
 def stated_chunk_size(study: OpenedStudy) -> int | None:
-    """The number of links of a chunk that the study states; None if it states none.
-
-    Args:
-        study: The opened study.
-    """
+    """The number of links of a chunk that a study states; None if it states none."""
     return getattr(study.engine, "chunk_links", None)
 
 
@@ -179,30 +165,14 @@ def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
 
 
 def select_links(links: Measurements, chunk: NDArray[np.int64]) -> Measurements:
-    """The links of a chunk.
-
-    Args:
-        links: All links.
-        chunk: Indices of the chunk's links, ascending.
-    """
+    """The links of a chunk, given by their indices."""
     mask = np.zeros(len(links), dtype=bool)
     mask[chunk] = True
     return links.select(mask)
 
 
 def seconds_to_trace(study: OpenedStudy, chunks: Sequence[NDArray[np.int64]]) -> float:
-    """Estimated time to trace chunks in this process, one after the other.
-
-    Args:
-        study: The opened study.
-        chunks: Indices of every chunk's links.
-
-    Returns:
-        Time on two processor cores [s].
-
-    Raises:
-        InputError: The links cannot be traced.
-    """
+    """Estimated time to trace chunks one after the other on two processor cores [s]."""
     return sum(study.tracer.plan(select_links(study.links, chunk)).seconds for chunk in chunks)
 
 

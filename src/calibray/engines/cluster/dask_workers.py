@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib.util import find_spec
 from socket import create_connection, gaierror
 from typing import TYPE_CHECKING, Any, Final, NoReturn, cast, final
@@ -64,24 +65,29 @@ class _KeptRemotely:
 
 @final
 class DaskWorkers:
-    """The workers of a Dask cluster.
+    """The workers of a Dask cluster, opened on first use.
 
     A chunk stays on one worker, its home. If that worker dies, its replacement takes the chunk, or another worker if no
     replacement comes, and makes the chunk's objects again. Paths then come from the cache, if workers share its folder.
 
     Args:
-        client: Dask's client, connected.
+        connect: Returns Dask's client.
+        open_executor: Returns what runs the calls of an external program.
     """
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
+    def __init__(self, connect: Callable[[], Client], open_executor: Callable[[], Executor]) -> None:
+        self._connect, self._open_executor = connect, open_executor
         self._homes: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
         self._most_workers = 0
 
     def executor(self) -> Executor:
-        """Dask's executor: the scheduler gives the calls of a worker that dies to other workers."""
-        return self._client.get_executor(pure=False)
+        """What runs the calls of an external program; see `Workers.executor`."""
+        return self._open_executor()
+
+    @cached_property
+    def _client(self) -> Client:
+        return self._connect()
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
         """Make and keep an object for every chunk; see `Workers.keep`."""

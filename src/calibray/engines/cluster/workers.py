@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Protocol, final
 
 from calibray.engines.cluster.dask_workers import Answered, DaskWorkers, local_cluster, scheduler_client
@@ -126,41 +125,6 @@ class _KeptHere:
         return kept
 
 
-@final
-class LocalWorkers:
-    """Workers on this machine: processes keep chunks, threads run external programs; both start on first use.
-
-    Args:
-        count: Number of workers.
-        opened: Closes the processes and threads at its end.
-    """
-
-    def __init__(self, count: int, opened: ExitStack) -> None:
-        self._count, self._opened = count, opened
-
-    def executor(self) -> Executor:
-        """Threads: each starts one program after the other and waits for it."""
-        return self._opened.enter_context(ThreadPoolExecutor(self._count))
-
-    def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
-        """Make and keep an object for every chunk; see `Workers.keep`."""
-        return self._processes.keep(make, sources)
-
-    def ask(
-        self,
-        function: Callable[..., Any],
-        kept: Sequence[Sized],
-        *arguments: Any,
-        answered: Answered | None = None,
-    ) -> list[Any]:
-        """Call a function on the objects of every chunk; see `Workers.ask`."""
-        return self._processes.ask(function, kept, *arguments, answered=answered)
-
-    @cached_property
-    def _processes(self) -> DaskWorkers:
-        return DaskWorkers(self._opened.enter_context(local_cluster(self._count)))
-
-
 @contextmanager
 def open_workers(workers: int | None = None, scheduler: str | None = None) -> Iterator[Workers | None]:
     """Open workers for `engines.make`, `calibrate`, `validate` and predictions, and close them at the end.
@@ -183,8 +147,14 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
         raise InputError(f"--workers {workers}: must be at least 1")
     with ExitStack() as opened:
         if scheduler is not None:
-            yield DaskWorkers(opened.enter_context(scheduler_client(scheduler)))
+            client = opened.enter_context(scheduler_client(scheduler))
+            yield DaskWorkers(lambda: client, lambda: client.get_executor(pure=False))
         elif workers is not None:
-            yield LocalWorkers(workers, opened)
+            # Processes and threads start on first use: an engine needs one of them. Each thread starts one external
+            # program after the other and waits for it.
+            yield DaskWorkers(
+                lambda: opened.enter_context(local_cluster(workers)),
+                lambda: opened.enter_context(ThreadPoolExecutor(workers)),
+            )
         else:
             yield None

@@ -53,38 +53,13 @@ class Command:
         self._successive_failures, self._give_up_after = 0, give_up_after
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, as the program answers.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
-
-        Raises:
-            InputError: The candidates have another width, or a value is unphysical.
-            EngineError: Every candidate of the first batch failed, or too many successive calls did.
-        """
+        """Path loss of every link for candidates, as the program answers; see `Answering`."""
         first = not self.calls
         values = check_candidates(candidates, len(self.parameters))
         return gather(self.answers(values), (len(values), self.num_links), first)
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates, each as soon as its call ends.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-            stop: Set from outside to begin no further call and to kill the running ones; answers that have already
-                arrived are still given.
-
-        Yields:
-            The answers, in the order in which they arrive.
-
-        Raises:
-            InputError: A value is unphysical.
-            EngineError: Too many successive calls failed, or the files of a call cannot be written. All answers were
-                given before.
-        """
+        """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
         stop = stop or Event()
         requests = [self._request(candidate) for candidate in candidates]
         executor = self._executor

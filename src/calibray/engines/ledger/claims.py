@@ -67,12 +67,7 @@ def _is_valid(run: object, owner: object, expires: object, now: float) -> bool:
 
 
 def release(connection: sqlite3.Connection, run: str) -> None:
-    """Give up all claims of a run; if the ledger cannot be written, they end with the process.
-
-    Args:
-        connection: The ledger.
-        run: The run.
-    """
+    """Give up all claims of a run; if the ledger cannot be written, they end with the process."""
     _active_runs.discard(run)
     with suppress(sqlite3.Error):
         (timeout,) = connection.execute("PRAGMA busy_timeout").fetchone()
@@ -85,12 +80,7 @@ def release(connection: sqlite3.Connection, run: str) -> None:
 
 @contextmanager
 def renewing(file: Path, run: str) -> Iterator[None]:
-    """Renew a run's claims while its engine works.
-
-    Args:
-        file: The ledger.
-        run: The run.
-    """
+    """Renew a run's claims while its engine works."""
     ended = Event()
     thread = Thread(target=_renew, args=(file, run, ended), daemon=True)
     thread.start()

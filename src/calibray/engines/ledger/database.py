@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from calibray.engines.ledger import claims
+from calibray.engines.ledger.answers import LedgerEntry
 from calibray.errors import InputError
 
 VERSION: Final = 2
@@ -83,13 +86,28 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
             run(f"PRAGMA user_version = {VERSION}")
 
 
+def insert_problem(
+    connection: sqlite3.Connection, problem: str, engine: str, parameters: Sequence[str]
+) -> None:
+    """Write the names that a problem's candidates are listed with, unless they are there."""
+    connection.execute(
+        "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)", (problem, engine, json.dumps(list(parameters)))
+    )
+
+
+def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
+    """Write an answer, unless there is one."""
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    digest = entry.digest(problem, candidate)
+    connection.execute(
+        "INSERT OR IGNORE INTO answers VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)",
+        (problem, candidate, entry.blob, entry.seconds, entry.failure, now, digest),
+    )
+
+
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    """Several statements that are committed together, or not at all.
-
-    Args:
-        connection: The file.
-    """
+    """Several statements that are committed together, or not at all."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -102,14 +120,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
 
 
 def explain(error: sqlite3.Error | OSError) -> str:
-    """An error of a ledger and its remedy.
-
-    Args:
-        error: The error.
-
-    Returns:
-        The text.
-    """
+    """An error of a ledger as a text with its remedy."""
     # The lower byte is the kind of error; the upper ones are details.
     code = (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
     damaged = "move it away and start again, or recover its contents with `sqlite3 FILE .recover`"

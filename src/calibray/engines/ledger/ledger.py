@@ -2,7 +2,7 @@
 
 An answer is committed before the optimizer sees it, so a run that was killed finds its answers when it is started
 again. Several runs may write to one ledger at once. It must be on a local disk, because SQLite's write-ahead log needs
-one. If the ledger cannot take an answer, a rescue file does (see `answers`).
+one. If the ledger cannot take an answer, a rescue file does (see `rescue`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, final
 
@@ -24,14 +23,9 @@ import numpy as np
 import pandas as pd
 
 from calibray.engines.ledger import claims, database
-from calibray.engines.ledger.answers import (
-    LedgerEntry,
-    RescuedAnswer,
-    read_entry,
-    read_rescue_files,
-    write_rescue_file,
-)
-from calibray.engines.ledger.database import explain, set_up, transaction
+from calibray.engines.ledger.answers import LedgerEntry, read_entry
+from calibray.engines.ledger.database import explain, insert_answer, insert_problem, set_up, transaction
+from calibray.engines.ledger.rescue import rescue_files, write_rescue_file
 from calibray.errors import EngineError, InputError
 
 LEDGER_FILE: Final = "ledger.sqlite"
@@ -87,17 +81,22 @@ class Ledger:
         return sqlite3.connect(file, timeout=database.LOCK_WAIT, isolation_level=None)
 
     def _insert_rescued(self) -> None:
-        for file, answers in read_rescue_files(self.path):
+        columns = "problem, candidate, path_loss_db, seconds, failure, time, digest"
+        for file in rescue_files(self.path):
+            run = self._connection.execute
             with self._errors():
-                for answer in answers:
-                    self._connection.execute(
-                        "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)",
-                        (answer.problem, answer.engine, answer.parameters),
-                    )
-                    self._insert(answer.problem, answer.candidate, answer.entry)
+                run("ATTACH ? AS rescue", (str(file),))
+                try:
+                    with transaction(self._connection):
+                        run("INSERT OR IGNORE INTO problems SELECT * FROM rescue.problems")
+                        answers = run(
+                            f"INSERT OR IGNORE INTO answers ({columns}) SELECT {columns} FROM rescue.answers"
+                        ).rowcount
+                finally:
+                    run("DETACH rescue")
             with suppress(OSError):
                 file.unlink()
-            _LOG.warning("%s: %d answers read from the rescue file %s", self.path, len(answers), file)
+            _LOG.warning("%s: %d answers read from the rescue file %s", self.path, answers, file)
 
     def close(self) -> None:
         """Close the file."""
@@ -117,10 +116,7 @@ class Ledger:
             EngineError: The ledger cannot be written.
         """
         with self._errors():
-            self._connection.execute(
-                "INSERT OR IGNORE INTO problems VALUES (?, ?, ?)",
-                (problem, engine, json.dumps(list(parameters))),
-            )
+            insert_problem(self._connection, problem, engine, parameters)
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> LedgerEntry | None:
         """The entry of a candidate; a damaged entry is deleted with a warning.
@@ -202,35 +198,40 @@ class Ledger:
         with self._errors(), transaction(self._connection):
             earlier = self.find(problem, candidate, len(entry.path_loss_db))
             if earlier is None:
-                self._insert(problem, candidate, entry)
+                insert_answer(self._connection, problem, candidate, entry)
             self._connection.execute(
                 "DELETE FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
             )
         self._check_identity()
         return earlier or entry
 
-    def _insert(self, problem: str, candidate: bytes, entry: LedgerEntry) -> None:
-        now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        digest = entry.digest(problem, candidate)
-        self._connection.execute(
-            "INSERT OR IGNORE INTO answers VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)",
-            (problem, candidate, entry.blob, entry.seconds, entry.failure, now, digest),
-        )
-
-    def rescue(self, answers: Sequence[RescuedAnswer]) -> str:
+    def rescue(
+        self,
+        problem: str,
+        engine: str,
+        parameters: Sequence[str],
+        answers: Sequence[tuple[bytes, LedgerEntry]],
+    ) -> str:
         """Keep answers that the ledger could not take in a rescue file.
 
         Args:
-            answers: The answers.
+            problem: Fingerprint of the problem.
+            engine: Name of the engine.
+            parameters: Names of the parameters.
+            answers: Candidates, by `key`, and their entries.
 
         Returns:
             A sentence that names the file.
         """
-        answers_are = "1 answer is" if len(answers) == 1 else f"{len(answers)} answers are"
-        file = write_rescue_file(self.path, answers)
-        if file is None:
-            return f"{answers_are} lost, because no other folder could be written either"
-        return f"{answers_are} kept in {file}, and used when the run is started again"
+
+        def fill(connection: sqlite3.Connection) -> None:
+            set_up(connection, self.path)
+            with transaction(connection):
+                insert_problem(connection, problem, engine, parameters)
+                for candidate, entry in answers:
+                    insert_answer(connection, problem, candidate, entry)
+
+        return _describe_rescue(write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
         """Delete failed calls, so that they are run again.
@@ -301,17 +302,10 @@ class Ledger:
         """Rescue all answers and end the run if the file was removed or replaced."""
         if self.read_only or _identity(self.path) == self._file:
             return
-        # A removed file can still be read while it is open.
         with self._errors():
-            rows = self._connection.execute(
-                f"SELECT problem, engine, parameters, candidate, {ENTRY} FROM answers JOIN problems USING (problem)"
-            ).fetchall()
-            answers = []
-            for problem, engine, parameters, candidate, *columns in rows:
-                entry = read_entry(problem, candidate, tuple(columns))
-                if isinstance(entry, LedgerEntry):
-                    answers.append(RescuedAnswer(problem, engine, parameters, candidate, entry))
-            rescued = self.rescue(answers)
+            # A removed file can still be read while it is open.
+            (count,) = self._connection.execute("SELECT COUNT(*) FROM answers").fetchone()
+            rescued = _describe_rescue(write_rescue_file(self.path, self._connection.backup), count)
         raise EngineError(f"{self.path}: was removed or replaced during the run; {rescued}")
 
 
@@ -342,3 +336,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_dev, status.st_ino
+
+
+def _describe_rescue(file: Path | None, count: int) -> str:
+    answers_are = "1 answer is" if count == 1 else f"{count} answers are"
+    if file is None:
+        return f"{answers_are} lost, because no other folder could be written either"
+    return f"{answers_are} kept in {file}, and used when the run is started again"

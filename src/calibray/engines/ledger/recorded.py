@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -12,7 +11,7 @@ from typing import Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.ledger.answers import LedgerEntry, RescuedAnswer, key
+from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.engines.ledger.ledger import Ledger
 from calibray.engines.protocol import Answer, Answering, check_candidates, gather
 from calibray.errors import EngineError
@@ -63,19 +62,7 @@ class Recorded:
         return self._engine.materials
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates, from the ledger or else from the engine.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path, and for all links of a candidate that failed.
-
-        Raises:
-            InputError: The candidates have another width, a value is unphysical, or a read-only ledger lacks an answer.
-            EngineError: Every candidate of the first batch failed; these failures are deleted from the ledger. Or the
-                ledger cannot be used; answers are kept in a rescue file.
-        """
+        """Path loss of every link for candidates, from the ledger or else the engine; see `Answering`."""
         values = check_candidates(candidates, len(self.parameters))
         first = self.calls + self.hits == 0
         answers = list(self._answers(values))
@@ -139,18 +126,10 @@ class Recorded:
                         for paid in unsaved:
                             self._ledger.commit(self._problem, *paid)
                         raise
-                    raise EngineError(f"{error}. {self._rescue(unsaved)}") from None
+                    rescued = self._ledger.rescue(self._problem, self._name, self.parameters.names, unsaved)
+                    raise EngineError(f"{error}. {rescued}") from None
                 self.hits += len(indices[candidate]) - 1
                 yield from (_answer(index, entry) for index in indices[candidate])
-
-    def _rescue(self, unsaved: list[tuple[bytes, LedgerEntry]]) -> str:
-        names = json.dumps(list(self.parameters.names))
-        return self._ledger.rescue(
-            [
-                RescuedAnswer(self._problem, self._name, names, candidate, entry)
-                for candidate, entry in unsaved
-            ]
-        )
 
 
 def _entry(answer: Answer) -> LedgerEntry:

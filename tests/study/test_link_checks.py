@@ -77,11 +77,11 @@ def test_sound_links_raise_no_suspicion(town):
     [
         (lambda t: t.assign(x=t.y, y=t.x), "if x and y are swapped"),
         (lambda t: t.assign(x=-t.y, y=t.x), "if they are turned by 90 degrees"),
-        (lambda t: t.assign(x=t.x + 200), "lie beyond the scene; their middle is"),
-        (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers lie under the ground"),
+        (lambda t: t.assign(x=t.x + 200), "are beyond the scene; their centre is"),
+        (lambda t: t.assign(z=t.z - 4), "60 of 60 receivers are below the ground"),
         (lambda t: t.assign(y=np.where(t.index < 5, 20.0, t.y), x=np.where(t.index < 5, 10.0 + t.index, t.x)),
-         "5 of 60 receivers stand inside buildings"),
-        (lambda t: t.assign(loss=t.loss - 30), "path losses lie below free space, by"),
+         "5 of 60 receivers are inside buildings"),
+        (lambda t: t.assign(loss=t.loss - 30), "path losses are below free space, by"),
     ],
     ids=["swapped", "turned", "origin", "underground", "indoors", "watts"],
 )  # fmt: skip
@@ -92,10 +92,13 @@ def test_a_planted_mistake_of_links_is_named(town, mistake, named):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"links": {"tx": [10.0, 20.0, 5.0]}}, "1 of 1 transmitters stand inside buildings"),
-        ({"links": {"tx": [*MAST[:2].tolist(), -3.0]}}, "1 of 1 transmitters lie under the ground"),
-        ({"antenna": {"orientation": [float(BEARING), 0, 0]}}, "fit antennas.tx better turned to 1.05 rad"),
-        ({"antenna": {"orientation": [60.0, 0, 0]}}, "is more than a whole turn"),
+        ({"links": {"tx": [10.0, 20.0, 5.0]}}, "1 of 1 transmitters are inside buildings"),
+        ({"links": {"tx": [*MAST[:2].tolist(), -3.0]}}, "1 of 1 transmitters are below the ground"),
+        (
+            {"antenna": {"orientation": [float(BEARING), 0, 0]}},
+            "fit antennas.tx better with a yaw of 1.05 rad",
+        ),
+        ({"antenna": {"orientation": [60.0, 0, 0]}}, "is more than a full turn"),
     ],
     ids=["walls", "underground", "compass", "degrees"],
 )
@@ -106,8 +109,8 @@ def test_a_planted_mistake_of_the_study_is_named(town, changes, named):
 @pytest.mark.parametrize(
     ("column", "quantity", "named"),
     [
-        ("rsrp_dbm", "path_gain", "is called like a received power"),
-        ("path_gain_db", "rsrp", "is called like a loss or gain"),
+        ("rsrp_dbm", "path_gain", "is named like a received power"),
+        ("path_gain_db", "rsrp", "is named like a loss or gain"),
     ],
 )
 def test_decibels_taken_for_others(town, column, quantity, named):
@@ -117,7 +120,7 @@ def test_decibels_taken_for_others(town, column, quantity, named):
 
 
 def test_links_of_another_town_are_refused(town):
-    with pytest.raises(InputError, match="all receivers lie more than"):
+    with pytest.raises(InputError, match="all receivers are more than"):
         suspicions(town, links().assign(x=links().x + 690_000))
 
 
@@ -130,5 +133,5 @@ def test_run_warns_before_it_traces(town):
     )
     result = CliRunner().invoke(app, ["run", str(town / "sunk.toml"), "--out", str(town / "out")])
     assert "Warning: " in result.stderr
-    assert "60 of 60 receivers lie under the ground; check heights and their datum" in result.stderr
+    assert "60 of 60 receivers are below the ground; check heights and their datum" in result.stderr
     assert result.exit_code == 2  # and no path leads there

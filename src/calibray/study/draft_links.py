@@ -1,0 +1,351 @@
+"""Draft of a study's ``[links]`` from a table of links, with every assumption and its reason."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from scipy.constants import speed_of_light
+
+from calibray.errors import InputError
+from calibray.measurements import (
+    TRACK_COLUMNS,
+    Measurements,
+    Preparation,
+    Track,
+    column_names,
+    read_table,
+    select_rows,
+)
+from calibray.measurements.column_names import PositionColumns, ValueColumn
+from calibray.scenes import read_frame
+from calibray.scenes.checks import SceneSurfaces
+from calibray.study.model import BUNDLED, VERSION
+from calibray.study.study import Study
+
+RECEIVER_HEIGHT: Final = 1.5
+"""Height of a receiver without a column of heights [m]: a phone in the hand."""
+
+TRANSMITTER_HEIGHT: Final = 10.0
+"""Height of a transmitter without a column of heights [m]: a small cell on a mast."""
+
+AVERAGING_WAVELENGTHS: Final = 40
+"""Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.averaging`)."""
+
+LEVEL_GROUND: Final = 0.5
+"""Largest height of the ground that counts as z = 0 [m]."""
+
+DISTANCE_TOLERANCE: Final = 0.05
+"""Largest median difference between a table's distances and its positions [m]."""
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One assumption of a draft.
+
+    Attributes:
+        what: Key of the study that it concerns.
+        value: The assumed value.
+        reason: The reason.
+    """
+
+    what: str
+    value: str
+    reason: str
+
+
+@dataclass
+class LinksDraft:
+    """The draft of ``[links]``: its inputs as in `draft`, and its results.
+
+    Each method adds the keys of its subject to the section and records its assumptions.
+
+    Attributes:
+        section: The keys of ``[links]``.
+        assumptions: The assumptions.
+        frequency: The study's carrier [Hz].
+        groups: The columns that group the offset.
+    """
+
+    scene: str
+    links: Path
+    target: Path
+    transmitters: Path | None
+    track: Path | None
+    stated_frequency: float | None
+    stated_tx: Sequence[float] | None
+    section: dict[str, Any] = field(default_factory=dict)
+    assumptions: list[Assumption] = field(default_factory=list)
+    frequency: float = 0.0
+    groups: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._transmitter_key = ""
+        self._table = read_table(self.links)
+        self._sites = None if self.transmitters is None else read_table(self.transmitters)
+        self.section["file"] = self._relative(self.links)
+        self._add_track()
+        self._add_transmitters()
+        self.frequency = self._frequency()
+        rx, tx = self._position_columns()
+        value = self._value()
+        self._add_positions(tx, rx)
+        self.section |= {"value": value.column, "quantity": value.quantity}
+        if value.quantity == "received_power":
+            self.section["tx_power_dbm"] = column_names.find_transmit_power(self._table.frame)
+        self.groups = self._offset_groups(value)
+        self._add_noise_floor(value)
+        self._add_averaging(rx)
+        self._add_heights(tx, rx)
+
+    @cached_property
+    def overhead(self) -> SceneSurfaces:
+        """The ground below and the roofs above positions of the scene."""
+        return SceneSurfaces.read(self.scene)
+
+    @property
+    def scene_file(self) -> str:
+        """The scene, relative to the study file's folder."""
+        return self.scene if self.scene.startswith(BUNDLED) else self._relative(Path(self.scene))
+
+    def assume(self, what: str, value: object, reason: str) -> None:
+        """Record an assumption."""
+        self.assumptions.append(Assumption(what, str(value), reason))
+
+    def measurements(self) -> Measurements:
+        """The links by the keys drafted so far."""
+        content = {
+            "version": VERSION,
+            "scene": {"file": self.scene_file, "frequency": 1e9},
+            "links": self.section,
+            "parameters": {"any.relative_permittivity": {"bounds": [1.5, 12.0]}},
+            "offset": {},
+        }
+        return Study.from_content(content, self.target).measurements()
+
+    def _relative(self, file: Path) -> str:
+        return Path(os.path.relpath(file, self.target.absolute().parent)).as_posix()
+
+    def _columns(self) -> str:
+        return ", ".join(map(str, self._table.frame))
+
+    def _add_track(self) -> None:
+        """Positions from a track, by the time of each row."""
+        if self.track is None:
+            return
+        name = column_names.find_time(self._table.frame)
+        if name is None:
+            raise InputError(
+                f"{self.links}: no column of times, which {self.track} needs ({self._columns()}); name it time"
+            )
+        self.section["track"] = {"file": self._relative(self.track), "time": name}
+        rows = len(self._table)
+        self._table = select_rows(self._table, Preparation(track=Track(str(self.track), name)))
+        reason = f"given; it covers {len(self._table)} of {rows} rows"
+        self.assume("links.track", f"{self.track.name} by {name}", reason)
+
+    def _add_transmitters(self) -> None:
+        """Transmitters from their table, by a common column or by one column of values per transmitter."""
+        if self._sites is None or self.transmitters is None:
+            return
+        self.section["transmitters"] = self._relative(self.transmitters)
+        name = column_names.find_shared_key(self._table.frame, self._sites.frame)
+        if name is not None:
+            self.section["transmitter"] = self._transmitter_key = name
+            self.assume("links.transmitter", name, "a column of both tables with common values")
+            return
+        name = column_names.find_transmitter_names(self._sites.frame)
+        columns = column_names.find_wide_columns(self._table.frame, self._sites.labels(name).tolist())
+        if not columns:
+            raise InputError(
+                f"{self.links}: no column names the transmitter of a row, and no columns are named like the "
+                f"transmitters of {self.transmitters}; give both tables one column of the same name"
+            )
+        self.section |= {"wide": columns, "transmitter": name}
+        self._transmitter_key = name
+        self.assume("links.wide", ", ".join(columns), f"named as in {self.transmitters.name}")
+        steps = Preparation(wide=columns, transmitter=name)
+        self._table = select_rows(self._table, steps, column_names.name_melted_values(columns))
+
+    def _frequency(self) -> float:
+        if self.stated_frequency is not None:
+            self.assume("scene.frequency", f"{self.stated_frequency:g} Hz", "given")
+            return float(self.stated_frequency)
+        column = column_names.find_frequency(self._table.frame)
+        if column is None:
+            raise InputError(
+                f"{self.links}: no column of carrier frequencies; give --frequency, for instance --frequency 3.5e9"
+            )
+        name, carriers = column
+        median = float(np.median(carriers))
+        if np.ptp(carriers) < 0.01 * median:
+            self.assume("scene.frequency", f"{median:g} Hz", f"median of column {name}")
+            return median
+        if np.array_equal(carriers, self._table.frame[name]):
+            self.section["frequency"] = name
+            self.assume("links.frequency", name, f"{len(np.unique(carriers))} carriers in Hz")
+            return median
+        raise InputError(
+            f"{self.links}: column {name!r} has several carriers, not in Hz; give it in Hz, or --frequency and a table "
+            "of one carrier"
+        )
+
+    def _position_columns(self) -> tuple[PositionColumns, PositionColumns | None]:
+        """Columns of the receivers' and the transmitters' positions; None if the transmitter has no columns."""
+        if self.track is None:
+            rx = column_names.find_position(self._table.frame, "rx", unnamed=True)
+        else:
+            rx = PositionColumns("geographic", *TRACK_COLUMNS, height=None)
+        if rx is None:
+            raise InputError(
+                f"{self.links}: no columns of receiver positions ({self._columns()}); name them rx_x, rx_y, rx_z [m], "
+                "or longitude and latitude"
+            )
+        if self.stated_tx is not None:
+            return rx, None
+        if self._sites is None:
+            return rx, column_names.find_position(self._table.frame, "tx", unnamed=False)
+        tx = column_names.find_position(self._sites.frame, "tx", unnamed=True)
+        if tx is None:
+            columns = ", ".join(map(str, self._sites.frame))
+            raise InputError(f"{self.transmitters}: no columns of positions ({columns})")
+        # A column of transmitters gets another name if the links have one of that name.
+        x, y, height = (
+            f"{self._transmitter_key}_{name}" if name in self._table.frame else name
+            for name in (tx.x, tx.y, tx.height)
+        )
+        return rx, PositionColumns(tx.position, str(x), str(y), height)
+
+    def _add_positions(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
+        self.section["tx"] = self._transmitter(tx, rx)
+        self.section["rx"] = [rx.x, rx.y, RECEIVER_HEIGHT if rx.height is None else rx.height]
+        unit = "degrees" if rx.position == "geographic" else "metres"
+        reason = f"columns named as {unit}" + ("" if rx.height else f"; no height: {RECEIVER_HEIGHT} m")
+        self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
+        if rx.position != "geographic":
+            return
+        self.section["position"] = "geographic"
+        if read_frame(self.scene) is None:
+            raise InputError(
+                f"{self.links}: positions are in degrees, but {self.scene} has no place on the globe; make the scene "
+                "with `calibray scene`, or write a study yourself with scene.origin"
+            )
+        reason = f"degrees; {Path(self.scene).name} has the scene's place on the globe"
+        self.assume("links.position", "geographic", reason)
+
+    def _transmitter(self, tx: PositionColumns | None, rx: PositionColumns) -> list[float | str]:
+        if tx is not None:
+            if tx.position != rx.position:
+                raise InputError(
+                    f"{self.links}: the transmitter's position ({tx.x}, {tx.y}) is in other units than the receiver's "
+                    f"({rx.x}, {rx.y}); give both in degrees, or both in metres"
+                )
+            position = [tx.x, tx.y, TRANSMITTER_HEIGHT if tx.height is None else tx.height]
+            reason = "columns of these names" if self.transmitters is None else f"of {self.transmitters.name}"
+            reason += "" if tx.height else f"; no height: {TRANSMITTER_HEIGHT:g} m"
+            self.assume("links.tx", ", ".join(map(str, position)), reason)
+            return position
+        if self.stated_tx is None:
+            return self._transmitter_at_origin(rx)
+        if rx.position == "geographic":
+            raise InputError("--tx: is in metres, but receivers are in degrees; give --transmitters, a table")
+        self.assume("links.tx", ", ".join(f"{part:g}" for part in self.stated_tx), "given")
+        return [float(part) for part in self.stated_tx]
+
+    def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
+        """A transmitter at the scene's origin, if the table's distances are distances from there."""
+        frame, name = self._table.frame, column_names.find_distance(self._table.frame)
+        height = column_names.find_transmitter_height(frame)
+        if (
+            rx.position == "scene"
+            and name is not None
+            and height is not None
+            and frame[height].nunique() == 1
+        ):
+            z = frame[rx.height] if rx.height else pd.Series(np.full(len(frame), RECEIVER_HEIGHT))
+            distance = np.sqrt(frame[rx.x] ** 2 + frame[rx.y] ** 2 + (z - frame[height]) ** 2)
+            if float(np.median(np.abs(distance - frame[name]))) < DISTANCE_TOLERANCE:
+                up = float(frame[height].iloc[0])
+                self.assume("links.tx", f"0, 0, {up:g}", f"column {name} is the distance from there")
+                return [0.0, 0.0, up]
+        raise InputError(
+            f"{self.links}: no position of the transmitter; give --tx X,Y,Z in the scene's metres, or "
+            "--transmitters FILE"
+        )
+
+    def _value(self) -> ValueColumn:
+        value = column_names.find_value(self._table)
+        power = column_names.find_transmit_power(self._table.frame)
+        if value.quantity == "rsrp" and power is not None:
+            reason = f"{value.reason}; {power} is the transmitted power"
+            value = ValueColumn(value.column, "received_power", reason)
+        self.assume("links.value", value.column, value.reason)
+        reason = "by name and sign"
+        if value.quantity == "rsrp":
+            reason = "the transmitted power is unknown, and is part of [offset]"
+        self.assume("links.quantity", value.quantity, reason)
+        return value
+
+    def _offset_groups(self, value: ValueColumn) -> list[str]:
+        """The columns that group the offset."""
+        if value.quantity != "rsrp":
+            self.assume("offset", "one for all links", "the values include cables and unknown antenna gains")
+            return []
+        name = self.section.get("transmitter")
+        groups = [*([name] if name else []), *column_names.find_devices(self._table.frame)]
+        groups = list(dict.fromkeys(groups))
+        reason = "each transmitter and each receiver has its own gain"
+        self.assume("offset.per", ", ".join(groups) or "one", reason)
+        return groups
+
+    def _add_noise_floor(self, value: ValueColumn) -> None:
+        column = self._table.frame[value.column]
+        if "wide" in self.section or not column.isna().any():
+            return
+        missing = f"{int(column.isna().sum())} values are missing"
+        if value.quantity in ("rsrp", "received_power"):
+            floor = float(np.floor(column.min()))
+            self.section["noise_floor_dbm"] = floor
+            self.assume("links.noise_floor_dbm", f"{floor:g} dBm", f"{missing}, and none is lower")
+        else:
+            self.section["where"] = f"`{value.column}`.notna()"
+            self.assume("links.where", self.section["where"], missing)
+
+    def _add_averaging(self, rx: PositionColumns) -> None:
+        """Average along tracks, and if most positions or some values repeat."""
+        frame, name = self._table.frame, self.section.get("transmitter")
+        keys = [rx.x, rx.y, *self.groups, *([name] if name and name not in self.groups else [])]
+        keys += [part for part in self.section["tx"] if isinstance(part, str) and part in frame]
+        positions = len(frame[keys].drop_duplicates())
+        repeated = frame.duplicated([*keys, self.section["value"]]).any()
+        if self.track is None and positions >= len(frame) / 2 and not repeated:
+            return
+        size = float(np.clip(round(AVERAGING_WAVELENGTHS * speed_of_light / self.frequency, 1), 1.0, 10.0))
+        self.section["average"] = {"by": "cell", "size": size, "unbiased": True}
+        rows = f"{len(frame)} rows " + ("along a track" if self.track else f"at {positions} positions")
+        reason = f"{rows}; {AVERAGING_WAVELENGTHS} wavelengths average out fading"
+        self.assume("links.average", f"cells of {size:g} m", reason)
+
+    def _add_heights(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
+        """Heights above the ground, if the ground is not at z = 0 and no height is in the scene's frame."""
+        in_scene_frame = any(
+            columns is not None and columns.position == "scene" and columns.height is not None
+            for columns in (tx, rx)
+        )
+        if in_scene_frame or self.stated_tx is not None:
+            return
+        links = self.measurements()
+        try:
+            ground = self.overhead.ground_height(*np.concatenate([links.tx, links.rx])[:, :2].T)
+        except InputError:
+            return  # a link is beyond the scene, or there is no ground
+        if np.abs(ground).max() > LEVEL_GROUND:
+            self.section["heights"] = "ground"
+            reason = f"the ground is at {ground.min():.0f} to {ground.max():.0f} m; heights count from there"
+            self.assume("links.heights", "ground", reason)
