@@ -1,9 +1,10 @@
-"""Rays added in rounds: all that many rays find, each path once and with the same gain, for all receivers at once."""
+"""Rays added in rounds: they find every path that many rays find, once and with the same gain, for all receivers."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,24 +19,19 @@ from calibray.tracing import convergence
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from calibray.tracing.sionna.image_method import Edges, Surfaces, unfold
-from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
-AFIELD = np.array(
+RECEIVERS = np.array(
     [[-15.0, 4, 1.5], [12, 1, 2], [14, 9, 1.5], [-9, -9, 6], [0, 0, 2]]
 )  # the last one in the house
-LINKS = SimpleNamespace(tx=np.tile([-20.0, 2, 12], (len(AFIELD), 1)), rx=AFIELD)
-TURNED = SimpleNamespace(tx=LINKS.rx, rx=LINKS.tx)
+LINKS = SimpleNamespace(tx=np.tile([-20.0, 2, 12], (len(RECEIVERS), 1)), rx=RECEIVERS)
+REVERSED = SimpleNamespace(tx=LINKS.rx, rx=LINKS.tx)
 AUTO = TraceSettings(max_depth=2, samples="auto", refraction=True, diffraction=True)
 
 
 @pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Tracer:
-    """A ground with a house in the middle and another beside it."""
-    ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
-    houses = {"house": block((-5, -5, 0), (5, 5, 8)), "other": block((-5, 15, 0), (25, 20, 9))}
-    file = write_scene(tmp_path_factory.mktemp("yard"), {"ground": ground, **houses})
-    return Tracer(read_scene(file, FREQUENCY), FREQUENCY, AUTO, Antenna("dipole"), Antenna("iso", "VH"))
+def yard(yard_file: Path) -> Tracer:
+    return Tracer(read_scene(yard_file, FREQUENCY), FREQUENCY, AUTO, Antenna("dipole"), Antenna("iso", "VH"))
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +51,8 @@ def by_key(paths: Paths) -> dict[tuple, int]:
     }
 
 
-def test_all_that_many_rays_find_is_found_once_with_the_same_gains(yard: Tracer, rounds: Paths) -> None:
-    many = yard.with_settings(replace(AUTO, samples=400_000)).trace(LINKS)
+def test_all_paths_of_many_rays_are_found_once_with_the_same_gains(yard: Tracer, rounds: Paths) -> None:
+    many = yard.with_settings(replace(AUTO, samples=200_000)).trace(LINKS)
     ours, theirs = by_key(rounds), by_key(many)
     common = sorted(ours.keys() & theirs.keys())
     assert len(common) > 0.9 * many.num_paths > 40
@@ -64,7 +60,7 @@ def test_all_that_many_rays_find_is_found_once_with_the_same_gains(yard: Tracer,
     one, other = gain[0][[ours[key] for key in common]], gain[1][[theirs[key] for key in common]]
     assert np.abs(one - other).max() < 1e-5 * np.abs(other).max()
     assert {Kind.SPECULAR, Kind.REFRACTION, Kind.DIFFRACTION} == set(rounds.kind.tolist())
-    # A path more is a path that the many rays missed; a path twice would be 3 dB.
+    # More power is a path that the many rays missed; a path found twice would change 3 dB.
     change = path_loss(rounds) - path_loss(many)
     assert change.max() < 0.01
     assert change.min() > -0.1
@@ -77,8 +73,8 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
     assert rounds.settings["samples"] == "auto"
     assert rounds.settings["rays"] >= 4 * 250_000
     assert 0 <= rounds.settings["last_round_db"] <= 0.05
-    told = report.rounds(rounds.settings, 0.5)
-    assert told.startswith("Converged: 1,000,000 rays a position") or rounds.settings["rays"] > 1_000_000
+    text = report.rounds(rounds.settings, 0.5)
+    assert text.startswith("Converged: 1,000,000 rays a position") or rounds.settings["rays"] > 1_000_000
     assert report.rounds({"rays": 8, "last_round_db": 0.7}, 0.5) == (
         "Not converged: 8 rays a position were sent out; the later half of them changed a link by 0.70 dB "
         "(fidelity.tolerance_db = 0.5)."
@@ -87,11 +83,9 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
         convergence.check(yard, LINKS, rounds, path_loss)
 
 
-def test_rays_are_sent_out_once_for_all_links_of_a_position(
-    yard: Tracer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rays_are_sent_once_for_all_links_of_a_source(yard: Tracer, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = (
-        SimpleNamespace(tx=LINKS.tx[some], rx=LINKS.rx[some]) for some in (slice(3), slice(3, None))
+        SimpleNamespace(tx=LINKS.tx[part], rx=LINKS.rx[part]) for part in (slice(3), slice(3, None))
     )
     settings = replace(AUTO, seed=7)
     alone = yard.with_settings(settings).trace(second)
@@ -108,27 +102,27 @@ def test_rays_are_sent_out_once_for_all_links_of_a_position(
     rays = sum(sent)
     assert rays >= 1_000_000
     after = tracer.trace(second)
-    assert sum(sent) - rays < rays / 2  # what the first links did not ask for, if anything
+    assert sum(sent) - rays < rays / 2  # only launches that the first links did not need
     assert by_key(after).keys() == by_key(alone).keys()
     np.testing.assert_array_equal(path_loss(after), path_loss(alone))
-    # Rays are reflected or pass by what a wall is made of: with other walls, they are sent out anew.
+    # Whether a ray is reflected or transmitted depends on the material: other walls need new rays.
     name, wall = next(iter(yard.scene.materials.items()))
     tracer.trace(second, materials={name: replace(wall, relative_permittivity=30.0)})
     assert sum(sent) >= 2 * rays
     assert len(tracer.sequence_cache) == 2
 
 
-def test_links_turned_around_have_the_same_loss(yard: Tracer, rounds: Paths) -> None:
+def test_reversed_links_have_the_same_path_loss(yard: Tracer, rounds: Paths) -> None:
     plain = yard.with_settings(replace(AUTO, diffraction=False))
-    assert len(plain.plan(LINKS).launches) == len(plain.plan(TURNED).launches) == 1
+    assert len(plain.plan(LINKS).launches) == len(plain.plan(REVERSED).launches) == 1
     there, back = (
-        plain.with_settings(replace(plain.settings, samples=samples)).trace(TURNED)
+        plain.with_settings(replace(plain.settings, samples=samples)).trace(REVERSED)
         for samples in ("auto", 100_000)
     )
     np.testing.assert_allclose(path_loss(there), path_loss(back), atol=1e-5)
 
 
-def test_a_search_without_interactions_sends_no_ray(yard: Tracer) -> None:
+def test_a_trace_without_interactions_sends_no_rays(yard: Tracer) -> None:
     direct = yard.with_settings(replace(AUTO, max_depth=0)).trace(LINKS)
     assert direct.num_interactions == direct.settings["rays"] == 0
     assert direct.link.tolist() == [0, 2, 3]
@@ -142,7 +136,7 @@ def test_diffuse_reflection_needs_a_number() -> None:
         TraceSettings(samples="some")
 
 
-def test_a_path_in_a_corner_of_mirrors_unfolds_to_a_line() -> None:
+def test_a_path_in_a_corner_of_two_mirrors_unfolds_to_a_line() -> None:
     """Ground and wall: the image of the image is the point mirrored in the corner's axis."""
     ground = [[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]]
     wall = [[5.0, -9, 0], [5, 9, 0], [5, 0, 9]]
@@ -150,12 +144,12 @@ def test_a_path_in_a_corner_of_mirrors_unfolds_to_a_line() -> None:
     assert surfaces.plane[1] == surfaces.plane[2] != surfaces.plane[0]
     none = Edges(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
     kind, triangle = np.array([[Kind.SPECULAR, Kind.REFRACTION, Kind.SPECULAR]]), np.array([[0, 0, 1]])
-    found = unfold(np.array([1.0, 2, 3]), kind, triangle, surfaces, none)
-    np.testing.assert_allclose(found.aim[0], [[1, 2, -3], [1, 2, -3], [9, 2, -3]])
-    np.testing.assert_allclose(found.image, [[9, 2, -3]])
-    np.testing.assert_allclose(found.low[0, 2], [4.9, -9.1, -0.1])
+    unfolded = unfold(np.array([1.0, 2, 3]), kind, triangle, surfaces, none)
+    np.testing.assert_allclose(unfolded.aim[0], [[1, 2, -3], [1, 2, -3], [9, 2, -3]])
+    np.testing.assert_allclose(unfolded.image, [[9, 2, -3]])
+    np.testing.assert_allclose(unfolded.low[0, 2], [4.9, -9.1, -0.1])
     edge = Edges(np.array([[0.0, 0, 4]]), np.array([[0.0, 0.6, 0.8]]), np.array([2.0]))
-    found = unfold(np.array([1.0, 2, 3]), np.array([[Kind.DIFFRACTION, Kind.SPECULAR]]), triangle[:, :2] + [[0, 1]],
+    unfolded = unfold(np.array([1.0, 2, 3]), np.array([[Kind.DIFFRACTION, Kind.SPECULAR]]), triangle[:, :2] + [[0, 1]],
                    surfaces, edge)  # fmt: skip
-    np.testing.assert_allclose(found.aim[0], [[0, 0, 4], [10, 0, 4]])
-    np.testing.assert_allclose(found.slide[0], [[0, 0.6, 0.8], [0, 0.6, 0.8]])
+    np.testing.assert_allclose(unfolded.aim[0], [[0, 0, 4], [10, 0, 4]])
+    np.testing.assert_allclose(unfolded.slide[0], [[0, 0.6, 0.8], [0, 0.6, 0.8]])

@@ -1,4 +1,4 @@
-"""Checking a trace with more samples: enough rays change nothing, too few are told."""
+"""Checking a trace with more rays: enough rays change nothing, too few are reported."""
 
 from __future__ import annotations
 
@@ -17,18 +17,9 @@ from calibray.tables.text import render
 from calibray.tracing.convergence import Convergence, check, compare
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
-from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
 ROUGH = {"stone": {"scattering_coefficient": 0.6}}
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory):
-    """A ground with a house in the middle and another beside it."""
-    ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
-    houses = {"house": block((-5, -5, 0), (5, 5, 8)), "other": block((-5, 15, 0), (25, 20, 9))}
-    return write_scene(tmp_path_factory.mktemp("yard"), {"ground": ground, **houses})
 
 
 @pytest.fixture(scope="module")
@@ -42,60 +33,60 @@ def tracer(file, materials=None, **settings) -> Tracer:
     return Tracer(scene, FREQUENCY, TraceSettings(max_depth=2, **settings), Antenna(), Antenna())
 
 
-def test_enough_rays_change_nothing(yard, links):
-    enough = tracer(yard, samples=100_000)
+def test_enough_rays_change_nothing(yard_file, links):
+    enough = tracer(yard_file, samples=100_000)
     before = enough.trace(links)
-    found = check(enough, links, before, path_loss)
-    np.testing.assert_allclose(found.change_db, 0, atol=1e-6)
-    np.testing.assert_array_equal(found.paths_before, found.paths_after)
-    assert found.paths_before.sum() == before.num_paths > 5
-    assert (found.samples, found.gained.size, found.lost.size) == (100_000, 0, 0)
-    assert found.converged(1e-3)
+    change = check(enough, links, before, path_loss)
+    np.testing.assert_allclose(change.change_db, 0, atol=1e-6)
+    np.testing.assert_array_equal(change.paths_before, change.paths_after)
+    assert change.paths_before.sum() == before.num_paths > 5
+    assert (change.samples, change.gained.size, change.lost.size) == (100_000, 0, 0)
+    assert change.converged(1e-3)
 
 
-def test_too_few_rays_of_a_diffuse_trace_are_told(yard, links):
-    coarse = tracer(yard, ROUGH, samples=60, diffuse_reflection=True, line_of_sight=False)
-    found = check(coarse, links, coarse.trace(links), path_loss)
-    assert found.quantile(1) > 2
-    assert not found.converged(0.5)
-    assert len(found.gained)
+def test_too_few_rays_of_a_diffuse_trace_change_its_path_loss(yard_file, links):
+    coarse = tracer(yard_file, ROUGH, samples=60, diffuse_reflection=True, line_of_sight=False)
+    change = check(coarse, links, coarse.trace(links), path_loss)
+    assert change.quantile(1) > 2
+    assert not change.converged(0.5)
+    assert len(change.gained)
 
 
-def test_the_change_is_that_of_a_trace_with_twice_the_rays(yard, links):
-    coarse = tracer(yard, ROUGH, samples=500, diffuse_reflection=True)
+def test_the_change_is_the_difference_to_a_trace_with_twice_the_rays(yard_file, links):
+    coarse = tracer(yard_file, ROUGH, samples=500, diffuse_reflection=True)
     before = coarse.trace(links)
-    finer = tracer(yard, ROUGH, samples=1000, seed=2, diffuse_reflection=True).trace(links)
+    finer = tracer(yard_file, ROUGH, samples=1000, seed=2, diffuse_reflection=True).trace(links)
     loss = [path_loss(paths, None, "band", 50e6)[:3] for paths in (before, finer)]
-    found = check(coarse, links, before, partial(path_loss, combining="band", bandwidth=50e6))
-    np.testing.assert_allclose(found.change_db, [*(loss[1] - loss[0]), 0], atol=1e-9)
-    assert np.abs(found.change_db).max() > 0.01
+    change = check(coarse, links, before, partial(path_loss, combining="band", bandwidth=50e6))
+    np.testing.assert_allclose(change.change_db, [*(loss[1] - loss[0]), 0], atol=1e-9)
+    assert np.abs(change.change_db).max() > 0.01
     assert coarse.settings == TraceSettings(max_depth=2, samples=500, diffuse_reflection=True)
 
 
-def test_links_reached_in_one_trace_alone_are_infinite_changes(yard, links):
-    few, many = (tracer(yard, samples=n, line_of_sight=False).trace(links) for n in (3, 20_000))
+def test_links_reached_in_one_trace_only_change_infinitely(yard_file, links):
+    few, many = (tracer(yard_file, samples=n, line_of_sight=False).trace(links) for n in (3, 20_000))
     gained, lost = compare(few, many, 3, path_loss), compare(many, few, 3, path_loss)
     reached = np.bincount(many.link, minlength=4) > 0
     assert reached.tolist() == [True, False, True, False]
-    alone = reached & (gained.paths_before == 0)
-    assert alone.any()
-    assert np.isneginf(gained.change_db[alone]).all()
-    assert np.isposinf(lost.change_db[alone]).all()
+    only_many = reached & (gained.paths_before == 0)
+    assert only_many.any()
+    assert np.isneginf(gained.change_db[only_many]).all()
+    assert np.isposinf(lost.change_db[only_many]).all()
     assert gained.change_db[3] == lost.change_db[3] == 0
-    assert set(np.flatnonzero(alone)) <= set(gained.gained.tolist()) == set(lost.lost.tolist())
+    assert set(np.flatnonzero(only_many)) <= set(gained.gained.tolist()) == set(lost.lost.tolist())
     assert np.isinf(gained.quantile(1))
 
 
 def test_quantiles_are_changes_of_links():
-    found = Convergence(10, np.array([0.1, -3.0, 0.0, np.inf, -0.2]), *np.zeros((2, 5), dtype=int))
-    assert [found.quantile(share) for share in (0, 0.5, 0.75, 1)] == [0, 0.2, 3, np.inf]
-    assert found.largest.tolist() == [3, 1, 4, 0, 2]
+    change = Convergence(10, np.array([0.1, -3.0, 0.0, np.inf, -0.2]), *np.zeros((2, 5), dtype=int))
+    assert [change.quantile(share) for share in (0, 0.5, 0.75, 1)] == [0, 0.2, 3, np.inf]
+    assert change.largest.tolist() == [3, 1, 4, 0, 2]
 
 
-def test_the_text_names_rows_and_what_to_do():
-    change = np.array([0.0, -3.25, 0.1, -np.inf])
-    found = Convergence(500, change, np.array([2, 3, 4, 0]), np.array([2, 5, 3, 1]))
-    text = render(*report.convergence(found, np.arange(2, 6), 0.5))
+def test_the_text_names_rows_and_the_remedy():
+    change_db = np.array([0.0, -3.25, 0.1, -np.inf])
+    convergence = Convergence(500, change_db, np.array([2, 3, 4, 0]), np.array([2, 5, 3, 1]))
+    text = render(*report.convergence(convergence, np.arange(2, 6), 0.5))
     lines = [line.split() for line in text.splitlines()]
     assert lines[0][:6] == ["Change", "from", "500", "to", "1,000", "samples"]
     assert ["links", "that", "gained", "paths", "2", "rows", "3,", "5"] in lines
@@ -111,9 +102,8 @@ def test_the_text_names_rows_and_what_to_do():
     assert text.endswith("Converged: no link changed by more than 0.5 dB (fidelity.tolerance_db).")
 
 
-def test_traces_of_other_links_are_refused(yard, links):
-    some = tracer(yard, samples=10)
-    before = some.trace(links)
+def test_traces_of_other_links_are_refused(yard_file, links):
+    before = tracer(yard_file, samples=10).trace(links)
     moved = replace(before, rx_position=before.rx_position + 1)
     with pytest.raises(InputError, match="compare traces of the same links"):
         compare(before, moved, 10, path_loss)

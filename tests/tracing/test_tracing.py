@@ -1,4 +1,4 @@
-"""Tracing: which links have paths, what chunking and seeds change (nothing), and what is refused."""
+"""Tracing with Sionna RT: launches and seeds do not change the result, links without a path, and refused input."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from calibray.fields import path_gains, path_loss
 from calibray.paths import Paths
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
-from calibray.tracing.sionna import Tracer
+from calibray.tracing.sionna import Trace, Tracer
 from calibray.tracing.trace_plan import lattice_directions
 from small_scenes import block, write_scene
 
 FREQUENCY = 3.5e9
 CANYON = "sionna:simple_street_canyon"
+MAST = [-20.0, 2, 15]
 MIXED = {
     "max_depth": 2, "samples": 10_000, "refraction": True, "diffraction": True, "edge_diffraction": True,
     "diffuse_reflection": True,
@@ -36,7 +37,7 @@ ROUGH = {
 
 
 def links(tx: list, rx: list) -> SimpleNamespace:
-    """Links from every transmitter of a list, or from one, to the receivers."""
+    """Links from one transmitter, or from each of a list, to the receivers."""
     rx = np.array(rx, dtype=float)
     return SimpleNamespace(tx=np.broadcast_to(np.array(tx, dtype=float), rx.shape), rx=rx)
 
@@ -49,170 +50,150 @@ def canyon() -> Tracer:
 
 @pytest.fixture(scope="module")
 def receivers() -> np.ndarray:
-    return np.random.default_rng(6).uniform((-8, -8, 1.5), (8, 8, 2.5), (6, 3))
+    return np.random.default_rng(6).uniform((-8, -8, 1.5), (8, 8, 2.5), (4, 3))
 
 
 @pytest.fixture(scope="module")
-def together(canyon: Tracer, receivers: np.ndarray) -> Paths:
-    return canyon.trace(links([-20, 2, 15], receivers))
+def trace(canyon: Tracer, receivers: np.ndarray) -> Trace:
+    """All receivers traced in one launch."""
+    return canyon.find_paths(links(MAST, receivers))
 
 
-def assert_same(one: Paths, other: Paths) -> None:
-    for entry in fields(one):
-        a, b = getattr(one, entry.name), getattr(other, entry.name)
-        if isinstance(a, np.ndarray):
-            np.testing.assert_array_equal(a, b, err_msg=entry.name)
+@pytest.fixture(scope="module")
+def paths(trace: Trace) -> Paths:
+    return trace.paths()
 
 
-# What does not change the result
+# Results that launches, buffers and the order of links do not change
 
 
-def test_one_receiver_at_a_time_gives_what_all_at_once_give(
-    canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
+def test_one_receiver_at_a_time_gives_the_same_paths(
+    canyon: Tracer, receivers: np.ndarray, paths: Paths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """NVlabs/sionna#1172: a receiver's paths do not depend on which others are traced with it."""
+    """NVlabs/sionna#1172: a receiver's paths do not depend on the other receivers of the launch."""
     monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", MIXED["samples"] * MIXED["max_depth"])
-    trace = canyon.find_paths(links([-20, 2, 15], receivers))
+    reports = []
+    trace = canyon.find_paths(links(MAST, receivers), lambda *report: reports.append(report))
     assert len(trace.buffers) == len(receivers)
-    alone = trace.paths()
-    assert alone.num_paths == together.num_paths > 500
-    order = [np.lexsort((paths.spreading, paths.delay, paths.link)) for paths in (alone, together)]
+    assert reports == [("tracing", done, 4) for done in range(5)]
+    separate = trace.paths()
+    assert separate.num_paths == paths.num_paths > 300
+    order = [np.lexsort((part.spreading, part.delay, part.link)) for part in (separate, paths)]
     for name in ("link", "delay", "spreading", "departure", "arrival"):
-        a, b = (getattr(paths, name)[index] for paths, index in zip((alone, together), order, strict=True))
+        a, b = (getattr(part, name)[index] for part, index in zip((separate, paths), order, strict=True))
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(path_loss(alone), path_loss(together), atol=1e-6)
+    np.testing.assert_allclose(path_loss(separate), path_loss(paths), atol=1e-6)
 
 
-def test_order_of_the_links_is_kept(canyon: Tracer, receivers: np.ndarray, together: Paths) -> None:
-    backwards = canyon.trace(links([-20, 2, 15], receivers[::-1]))
-    np.testing.assert_allclose(path_loss(backwards)[::-1], path_loss(together), atol=1e-6)
-    np.testing.assert_array_equal(backwards.rx_position, receivers[::-1])
-
-
-def test_several_transmitters_in_any_order(canyon: Tracer, receivers: np.ndarray, together: Paths) -> None:
-    masts = np.array([[-20.0, 2, 15], [25.0, -3, 12]])
-    other = canyon.trace(links(masts[1], receivers))
-    mixed = canyon.trace(links(masts[[0, 1] * 6], np.repeat(receivers, 2, axis=0)))
-    assert (np.diff(mixed.link) >= 0).all()
-    np.testing.assert_allclose(path_loss(mixed)[0::2], path_loss(together), atol=1e-6)
-    np.testing.assert_allclose(path_loss(mixed)[1::2], path_loss(other), atol=1e-6)
-
-
-def test_full_buffer_is_traced_again_with_the_same_result(
-    canyon: Tracer, receivers: np.ndarray, together: Paths, monkeypatch: pytest.MonkeyPatch
+def test_the_order_of_transmitters_and_links_is_kept(
+    canyon: Tracer, receivers: np.ndarray, paths: Paths
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
-    assert_same(canyon.trace(links([-20, 2, 15], receivers)), together)
+    masts = np.array([MAST, [25.0, -3, 12]])
+    second = canyon.trace(links(masts[1], receivers))
+    mixed = canyon.trace(links(masts[[0, 1] * 4], np.repeat(receivers[::-1], 2, axis=0)))
+    assert (np.diff(mixed.link) >= 0).all()
+    np.testing.assert_array_equal(mixed.rx_position[0::2], receivers[::-1])
+    np.testing.assert_allclose(path_loss(mixed)[0::2], path_loss(paths)[::-1], atol=1e-6)
+    np.testing.assert_allclose(path_loss(mixed)[1::2], path_loss(second)[::-1], atol=1e-6)
 
 
-def test_paths_that_memory_cannot_hold_are_an_error(
+def test_a_full_buffer_is_traced_again_with_the_same_result(
+    canyon: Tracer, receivers: np.ndarray, paths: Paths, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same seed, too, gives the same paths."""
+    monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 200)
+    again = canyon.trace(links(MAST, receivers))
+    for entry in fields(again):
+        value = getattr(again, entry.name)
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(paths, entry.name), err_msg=entry.name)
+
+
+def test_another_seed_gives_other_paths(canyon: Tracer, receivers: np.ndarray, paths: Paths) -> None:
+    other = canyon.with_settings(TraceSettings(**MIXED, seed=2)).trace(links(MAST, receivers))
+    assert not np.array_equal(np.sort(other.delay), np.sort(paths.delay))
+    np.testing.assert_allclose(path_loss(other), path_loss(paths), atol=1.0)
+
+
+def test_more_paths_than_memory_can_hold_are_an_error(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.sionna.tracer.BUFFER", 8)
     monkeypatch.setattr("calibray.tracing.sionna.tracer.available_memory", lambda: 32_000)
     with pytest.raises(
-        EngineError, match=r"more paths than fit into memory, with 6 receivers at once; lower trace\.samples"
+        EngineError, match=r"more paths than fit into memory, with 4 receivers at once; lower trace\.samples"
     ):
-        canyon.trace(links([-20, 2, 15], receivers))
+        canyon.trace(links(MAST, receivers))
 
 
-def test_same_seed_same_paths_and_another_seed_others(
-    canyon: Tracer, receivers: np.ndarray, together: Paths
-) -> None:
-    assert_same(canyon.trace(links([-20, 2, 15], receivers)), together)
-    settings = TraceSettings(**MIXED, seed=2)
-    other = Tracer(canyon.scene, FREQUENCY, settings, canyon.solver.tx_antenna, canyon.solver.rx_antenna)
-    found = other.trace(links([-20, 2, 15], receivers))
-    assert not np.array_equal(np.sort(found.delay), np.sort(together.delay))
-    np.testing.assert_allclose(path_loss(found), path_loss(together), atol=1.0)
+def test_traced_buffers_keep_nothing_else_in_memory(trace: Trace) -> None:
+    """Pending results of Dr.Jit would keep their inputs: all candidates of every launch."""
+    (part,) = trace.buffers
+    buffer = part.buffer
+    arrays = [buffer.vertices_x.array, buffer.k_tx.x, buffer.shapes.array, buffer.probs.array]
+    assert {array.state for array in arrays} == {dr.VarState.Evaluated}
 
 
-def test_progress_counts_receivers(
+def test_the_path_program_records_how_it_was_traced(paths: Paths) -> None:
+    expected = {**TraceSettings(**MIXED).record(), "scene": CANYON, "sionna_rt": sionna.rt.__version__}
+    assert paths.settings == expected
+    assert paths.materials["brick"].scattering_coefficient == 0.4
+
+
+# Rays that are shared by several launches
+
+
+def one_and_shared(
+    canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch, **settings
+) -> tuple[Trace, Trace]:
+    """A trace in one launch, and one whose rays to each receiver are shared by three launches."""
+    traces = []
+    for lanes in (10**9, -(-settings["samples"] * settings["max_depth"] // 3)):
+        monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", lanes)
+        traces.append(canyon.with_settings(TraceSettings(**settings)).find_paths(links(MAST, receivers)))
+    assert [len(trace.buffers) for trace in traces] == [1, 3 * len(receivers)]
+    return traces[0], traces[1]
+
+
+def test_launches_that_share_the_rays_find_the_same_paths(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibray.tracing.sionna.tracer.LANES", 2 * MIXED["samples"] * MIXED["max_depth"])
-    seen = []
-    canyon.trace(links([-20, 2, 15], receivers), lambda *step: seen.append(step))
-    assert seen == [("tracing", done, 6) for done in (0, 2, 4, 6)]
-
-
-def test_stored_paths_hold_on_to_nothing_else(canyon: Tracer, receivers: np.ndarray) -> None:
-    """What Dr.Jit has still to compute keeps its inputs: all rays' candidates, for every launch."""
-    (part,) = canyon.find_paths(links([-20, 2, 15], receivers)).buffers
-    buffer = part.buffer
-    kept = [buffer.vertices_x.array, buffer.k_tx.x, buffer.shapes.array, buffer.probs.array]
-    assert {array.state for array in kept} == {dr.VarState.Evaluated}
-
-
-def test_program_tells_how_it_was_traced(together: Paths) -> None:
-    expected = {**TraceSettings(**MIXED).record(), "scene": CANYON, "sionna_rt": sionna.rt.__version__}
-    assert together.settings == expected
-    assert together.materials["brick"].scattering_coefficient == 0.4
-
-
-# Rays shared out over launches
-
-
-def split(canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch, **settings) -> tuple:
-    """A trace in one launch, and one whose rays are shared out over seven for each receiver."""
-    traces = []
-    for lanes in (10**9, None):
-        tracer = Tracer(
-            canyon.scene,
-            FREQUENCY,
-            TraceSettings(**settings),
-            canyon.solver.tx_antenna,
-            canyon.solver.rx_antenna,
-        )
-        monkeypatch.setattr(
-            "calibray.tracing.sionna.tracer.LANES",
-            lanes or -(-settings["samples"] * settings["max_depth"] // 7),
-        )
-        traces.append(tracer.find_paths(links([-20, 2, 15], receivers)))
-    assert [len(trace.buffers) for trace in traces] == [1, 7 * len(receivers)]
-    return traces
-
-
-@pytest.mark.parametrize("kinds", [{}, {"refraction": True}])
-def test_rays_shared_out_over_launches_find_the_same_paths(
-    canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch, kinds: dict
-) -> None:
-    one, shared = split(canyon, receivers[:3], monkeypatch, max_depth=3, samples=100_003, **kinds)
-    paths, pieces = one.paths(), shared.paths()
-    assert paths.num_paths == pieces.num_paths > 20
-    order = [np.lexsort((part.delay, part.link)) for part in (paths, pieces)]
-    np.testing.assert_allclose(pieces.delay[order[1]], paths.delay[order[0]], rtol=1e-6)
-    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=1e-3)
+    settings = {"max_depth": 3, "samples": 50_003, "refraction": True}
+    one, shared = one_and_shared(canyon, receivers[:2], monkeypatch, **settings)
+    paths, shared_paths = one.paths(), shared.paths()
+    assert paths.num_paths == shared_paths.num_paths > 20
+    order = [np.lexsort((part.delay, part.link)) for part in (paths, shared_paths)]
+    np.testing.assert_allclose(shared_paths.delay[order[1]], paths.delay[order[0]], rtol=1e-6)
+    np.testing.assert_allclose(path_loss(shared_paths), path_loss(paths), atol=1e-3)
     np.testing.assert_allclose(
-        np.abs(shared.path_gains()[:, 0, 0]), np.abs(path_gains(pieces)), rtol=1e-3, atol=1e-9
+        np.abs(shared.path_gains()[:, 0, 0]), np.abs(path_gains(shared_paths)), rtol=1e-3, atol=1e-9
     )
 
 
-def test_rays_shared_out_over_launches_find_the_same_edges(
+def test_launches_that_share_the_rays_find_the_same_edges(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether a ray near an edge is diffracted is drawn at random, so that weak paths may come and go."""
+    """Sionna decides at random whether a ray near an edge is diffracted, so weak paths may differ."""
     edges = {"diffraction": True, "edge_diffraction": True}
-    one, shared = split(canyon, receivers[:2], monkeypatch, max_depth=2, samples=60_000, **edges)
-    paths, pieces = one.paths(), shared.paths()
-    assert pieces.num_paths == pytest.approx(paths.num_paths, rel=0.05)
+    one, shared = one_and_shared(canyon, receivers[:2], monkeypatch, max_depth=2, samples=60_000, **edges)
+    paths, shared_paths = one.paths(), shared.paths()
+    assert shared_paths.num_paths == pytest.approx(paths.num_paths, rel=0.05)
     assert len(paths.diffraction.distance) > 50
-    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=0.01)
+    np.testing.assert_allclose(path_loss(shared_paths), path_loss(paths), atol=0.01)
 
 
-def test_rays_shared_out_over_launches_scatter_as_much(
+def test_launches_that_share_the_rays_scatter_as_much(
     canyon: Tracer, receivers: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each launch's diffuse paths stand for a share of all rays, not of its own."""
+    """The diffuse paths of each launch count as a share of all rays, not of the rays of the launch."""
     scatter = {"diffuse_reflection": True, "specular_reflection": False, "line_of_sight": False}
-    one, shared = split(canyon, receivers[:2], monkeypatch, max_depth=1, samples=100_000, **scatter)
-    paths, pieces = one.paths(), shared.paths()
+    one, shared = one_and_shared(canyon, receivers[:2], monkeypatch, max_depth=1, samples=100_000, **scatter)
+    paths, shared_paths = one.paths(), shared.paths()
     assert paths.num_paths > 10_000
-    assert pieces.num_paths == pytest.approx(paths.num_paths, rel=0.05)
-    np.testing.assert_allclose(path_loss(pieces), path_loss(paths), atol=0.2)
+    assert shared_paths.num_paths == pytest.approx(paths.num_paths, rel=0.05)
+    np.testing.assert_allclose(path_loss(shared_paths), path_loss(paths), atol=0.2)
 
 
-def test_rays_of_the_launches_are_those_of_one(canyon: Tracer) -> None:
+def test_launches_that_share_the_rays_send_sionnas_lattice() -> None:
     for samples in (3, 1000):
         lattice = np.array(fibonacci_lattice(samples)).reshape(2, -1)
         ends = [0, samples // 3, samples]
@@ -233,14 +214,14 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Tracer:
     return Tracer(read_scene(file, FREQUENCY), FREQUENCY, settings, Antenna(), Antenna())
 
 
-def test_points_inside_buildings_are_told_from_those_outside(house: Tracer) -> None:
+def test_points_inside_buildings_are_enclosed(house: Tracer) -> None:
     inside = [[0, 0, 1.5], [4.5, -4.5, 7], [16, 0, 2], [12.5, 3.5, 0.5]]
     outside = [[8, 0, 1.5], [0, 5.2, 1.5], [0, 0, 9], [30, 30, 20], [11.8, 0, 3], [0, -39, 1]]
     assert house.enclosed(np.array(inside)).all()
     assert not house.enclosed(np.array(outside)).any()
 
 
-def test_links_without_a_path_are_told_and_infinitely_weak(house: Tracer) -> None:
+def test_links_without_a_path_are_listed_and_have_infinite_loss(house: Tracer) -> None:
     paths = house.trace(links([-20, 0, 3], [[0, 0, 2], [-10, 3, 2], [16, 0, 2]]))
     assert paths.links_without_path.tolist() == [0, 2]
     loss = path_loss(paths)
@@ -248,7 +229,7 @@ def test_links_without_a_path_are_told_and_infinitely_weak(house: Tracer) -> Non
     assert np.isfinite(loss[1])
 
 
-def test_campaign_without_any_path(house: Tracer) -> None:
+def test_links_without_any_path(house: Tracer) -> None:
     trace = house.find_paths(links([-20, 0, 3], [[0, 0, 2], [1, 1, 2]]))
     paths = trace.paths()
     assert paths.num_paths == paths.num_interactions == 0
@@ -259,8 +240,7 @@ def test_campaign_without_any_path(house: Tracer) -> None:
     assert trace.link().shape == trace.delay().shape == (0,)
 
 
-def test_line_of_sight_alone(house: Tracer) -> None:
-    """With no interaction allowed and with the direct path switched off."""
+def test_direct_paths_alone_and_excluded(house: Tracer) -> None:
     ends = links([-20, 0, 3], [[-10, 3, 2], [30, 3, 2]])
     direct = cb.trace(house.scene, ends, frequency=FREQUENCY, max_depth=0, samples=100)
     assert direct.num_interactions == 0
@@ -272,7 +252,7 @@ def test_line_of_sight_alone(house: Tracer) -> None:
     assert indirect.num_paths > 0
 
 
-# What is refused
+# Refused input
 
 
 @pytest.mark.parametrize(
@@ -290,7 +270,7 @@ def test_line_of_sight_alone(house: Tracer) -> None:
         (np.zeros((0, 3)), np.zeros((0, 3)), r"links: .*at least one"),
     ],
 )
-def test_positions_that_cannot_be_used(house: Tracer, tx: list, rx: list, message: str) -> None:
+def test_invalid_positions_are_refused(house: Tracer, tx: list, rx: list, message: str) -> None:
     with pytest.raises(InputError, match=message):
         house.trace(SimpleNamespace(tx=np.array(tx, dtype=float), rx=np.array(rx, dtype=float)))
 
@@ -326,18 +306,18 @@ def test_positions_that_cannot_be_used(house: Tracer, tx: list, rx: list, messag
         ),
     ],
 )
-def test_options_that_cannot_be_used(house: Tracer, options: dict, message: str) -> None:
-    given = {"frequency": FREQUENCY, "samples": 100, "max_depth": 1, **options}
+def test_invalid_options_are_refused(house: Tracer, options: dict, message: str) -> None:
+    arguments = {"frequency": FREQUENCY, "samples": 100, "max_depth": 1, **options}
     with pytest.raises(InputError, match=message):
-        cb.trace(house.scene.path, links([-20, 0, 3], [[-10, 3, 2]]), **given)
+        cb.trace(house.scene.path, links([-20, 0, 3], [[-10, 3, 2]]), **arguments)
 
 
-def test_tracer_refuses_a_material_that_its_scene_lacks(house: Tracer) -> None:
+def test_a_material_that_the_scene_lacks_is_refused(house: Tracer) -> None:
     with pytest.raises(InputError, match="the scene has no material 'glass'; there are: stone"):
         house.trace(links([-20, 0, 3], [[-10, 3, 2]]), materials={"glass": cb.Material(6.0, 0.0, 0.01)})
 
 
-def test_nothing_is_written(house: Tracer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_trace_writes_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError):
         cb.trace("absent.xml", links([0, 0, 9], [[1, 0, 1]]), frequency=FREQUENCY)
