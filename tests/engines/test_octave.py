@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.errors import EngineError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import rounds

@@ -11,7 +11,7 @@ import pytest
 
 import planted
 import programs
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, aid, with_constants
@@ -23,7 +23,7 @@ from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters
 from calibray.paths.program import take
-from calibray.result.tables import costs
+from calibray.reporting.result_tables import costs
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 
@@ -141,7 +141,7 @@ def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, 
     study = Study.from_content(content, tmp_path / "study.toml")
     monkeypatch.setattr(Setup, "trace", missing)
     result = calibrate(study)
-    assert result.cheap_calls == 0
+    assert result.cost.cheap_replays == 0
     assert result.remarks[0] == "No cheap model, as the scene cannot be traced here (no libLLVM was found)."
     named = calibrate(study.replace(method="vector-surrogate"), seed=0)
     assert not any("cheap model" in remark for remark in named.remarks)

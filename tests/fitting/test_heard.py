@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.fitting.noise_floor import MARGIN, heard
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.report.position_plot import draw_positions
+from calibray.reporting.position_plot import draw_positions
 from calibray.scenes.authoring.extrusion import Windows
 from calibray.scenes.authoring.scene_folder import make_scene
 from calibray.scenes.checks.mesh_check import health

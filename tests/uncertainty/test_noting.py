@@ -10,7 +10,7 @@ import planted
 from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
 from calibray.study import Setup, Study
-from calibray.uncertainty.intervals import Interval
+from calibray.uncertainty.linear_theory import Interval
 from calibray.uncertainty.noise_models import CORRELATED
 from calibray.uncertainty.remarks import contradicted
 

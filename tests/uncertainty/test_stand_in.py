@@ -10,14 +10,15 @@ import pytest
 
 import planted
 import programs
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, VectorSurrogate
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.discrepancy import Seen
 from calibray.optimizers.multifidelity.sampled_functions import drawn, surprise
-from calibray.result import Result, tables
+from calibray.reporting import result_tables as tables
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty

@@ -215,7 +215,9 @@ class StudyModel(Section, ABC):
                 make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
                 for name, entry in self.parameters.items()
             )
-            all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(laws or {})
+            all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(
+                laws or {}
+            )
             # A parameter that is a coefficient of a law, not a constant, needs its material's law.
             needed = {item.material: all_laws[item.material] for item in items if item.field != item.constant}
             parameters = Parameters(items, frequency, needed)
