@@ -142,7 +142,10 @@ def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, 
     monkeypatch.setattr(Setup, "trace", missing)
     result = calibrate(study)
     assert result.cost.cheap_replays == 0
-    assert result.remarks[0] == "No cheap model, as the scene cannot be traced here (no libLLVM was found)."
+    assert (
+        result.remarks[0]
+        == "There is no cheap model: the scene cannot be traced here (no libLLVM was found)."
+    )
     named = calibrate(study.replace(method="vector-surrogate"), seed=0)
     assert not any("cheap model" in remark for remark in named.remarks)
 
@@ -152,7 +155,7 @@ def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch,
     asked = problem(tmp_path, method=method)
     monkeypatch.setattr(Setup, "trace", lambda *_, **__: pytest.fail("traced"))
     assert aid(asked).model is None
-    assert aid(asked).remark == ""
+    assert aid(asked).remark is None
 
 
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):

@@ -11,7 +11,6 @@ import pytest
 import planted
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
-from calibray.calibration.outcome import UNJUDGED
 from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.fitting.minima import BASINS
@@ -22,6 +21,7 @@ from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
 from calibray.reporting import result_tables as tables
 from calibray.result.held_out import Model
+from calibray.result.wording import NOT_JUDGED
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import PLACE, certainty
@@ -107,11 +107,11 @@ def test_an_offset_that_is_not_declared_is_said_aloud(tmp_path, noisy, result):
     offset = 8.0  # 4 dB can be put on the materials: 0.66 instead of 0.58 dB is no evidence of an offset
     shifted = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset))
     assert shifted.free_offset_db == pytest.approx(offset, abs=4 * shifted.free_offset_error_db)
-    assert any("A free offset would be +" in remark for remark in shifted.remarks)
+    assert any("undeclared offset of +" in remark for remark in shifted.remarks)
     assert "A free offset" in render(*tables.tables(shifted))
     # Negative controls: none planted, or one declared.
     assert abs(result.uncertainty.undeclared_offset_db) < 3 * result.uncertainty.undeclared_offset_error_db
-    assert not any("free offset" in remark for remark in result.remarks)
+    assert not any("undeclared offset" in remark for remark in result.remarks)
     declared = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset), offset={})
     assert declared.free_offset_db is None
 
@@ -228,8 +228,8 @@ def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
 
 
 def test_a_run_that_nothing_judges_says_how_to_have_it_judged(result, tmp_path, noisy):
-    assert UNJUDGED in result.remarks
-    assert UNJUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
+    assert NOT_JUDGED in result.remarks
+    assert NOT_JUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
 
 
 def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noisy):
@@ -240,7 +240,7 @@ def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noi
     law = run(tmp_path, table, holdout={"blocks": 3})
     assert law.chosen.name == Model.LOG_DISTANCE
     assert law.chosen.parameters is None
-    assert any("Predictions go by the model 'log-distance'" in remark for remark in law.remarks)
+    assert any("Predictions use the model 'log-distance'" in remark for remark in law.remarks)
     told = law.predict_interval(planted.links())
     assert told.path_loss_db.to_numpy() == pytest.approx(30 + 35 * np.log10(distance), abs=1.0)
     assert told.path_loss_db.to_numpy() == pytest.approx(law.predict(planted.links()))
