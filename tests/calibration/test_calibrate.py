@@ -154,7 +154,7 @@ def test_offsets_are_found_beside_the_materials(tmp_path, exact, offset, planted
 
 def test_an_offset_stays_within_its_bounds(tmp_path, exact):
     shifted = exact.assign(path_loss_db=exact.path_loss_db + 40.0)  # more than the materials can take up
-    assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).offsets_db == {"": 1.5}
+    assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).nuisance.offsets_db == {"": 1.5}
 
 
 def test_without_a_section_there_is_no_offset(tmp_path, exact):
@@ -304,7 +304,7 @@ def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(
     assert sorted(result.nuisance.offsets_db) == ["east", "west"]
     assert result.nuisance.groups_without_path == ("cellar",)
     assert re.search(r"^cellar +no link with a path$", render(offsets(result)), re.MULTILINE)
-    assert result.content()["groups_without_path"] == ["cellar"]
+    assert result.content()["nuisance"]["groups_without_path"] == ["cellar"]
 
     held = planted.study(
         tmp_path, table, holdout={"where": f"rx_x in [{table.rx_x[planted.INSIDE]}, {table.rx_x[0]}]"}
@@ -336,4 +336,4 @@ def test_antennas_inside_bodies_are_known_before_the_calibration_and_to_python(t
     study = planted.study(tmp_path, table, method={"name": "auto", "options": {"starts": 4}})
     result = calibrate(study, out=tmp_path / "out")
     assert result.provenance.enclosed.rx == (planted.INSIDE + 2,)
-    assert Result.load(tmp_path / "out").enclosed == result.provenance.enclosed
+    assert Result.load(tmp_path / "out").provenance.enclosed == result.provenance.enclosed

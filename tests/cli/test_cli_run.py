@@ -156,7 +156,7 @@ def test_run_prints_json_on_demand_and_takes_method_and_seed(folder):
     outcome = calibray("run", folder / "study.toml", "--out", folder / "other", *arguments)
     assert outcome.exit_code == 0, outcome.output
     content = json.loads(outcome.stdout)
-    assert content["rt_calls"] == 225
+    assert content["cost"]["rt_calls"] == 225
     assert content["study"]["method"] == {"name": "sgwo-im", "seed": 7, "options": {}}
     assert content["links"] == {
         "calibrated_on": 9,

@@ -350,7 +350,7 @@ def test_result_keeps_the_law_and_writes_the_constants_at_the_scenes_carrier(
     content = json.loads((folder / "out" / "result.json").read_text())
     assert content["laws"]["walls"]["itu_b"] == result.parameters["walls.itu_b"]
     again = Result.load(folder / "out")
-    assert again.laws == result.fit.laws
+    assert again.fit.laws == result.fit.laws
     wall = read_scene(folder / "out" / "result-scene.xml", 10e9).materials["walls"]
     assert wall.relative_permittivity == pytest.approx(6.1 * 10**-0.07, rel=1e-3)
     assert wall.conductivity == pytest.approx(0.03 * 10**0.9, rel=1e-3)

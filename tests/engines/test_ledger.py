@@ -194,7 +194,7 @@ def test_calls_are_shared_by_methods_seeds_bounds_and_measured_values(tmp_path):
     result = calibrate(first, out=tmp_path / "out")
     assert (result.rt_calls, result.cost.ledger_hits) == (6, 0)
     again = calibrate(first, out=tmp_path / "out")
-    assert (again.rt_calls, again.ledger_hits, again.parameters) == (6, 6, result.parameters)
+    assert (again.rt_calls, again.cost.ledger_hits, again.parameters) == (6, 6, result.parameters)
     links = pd.read_csv(tmp_path / "links.csv")
     links.assign(path_loss_db=links.path_loss_db + 1).to_csv(tmp_path / "links.csv", index=False)
     measured_anew = calibrate(first, out=tmp_path / "out")

@@ -164,9 +164,9 @@ def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
     study = Study.from_content(content, tmp_path / "study.toml")
     first = calibrate(study, out=tmp_path / "out")
     again = calibrate(study, out=tmp_path / "out", overwrite=True)
-    assert (first.rt_calls, first.ledger_hits) == (7, 0)
-    assert first.cheap_calls > 100
-    assert f"{first.cheap_calls:,} in" in render(costs(first))
-    assert (again.rt_calls, again.ledger_hits) == (7, 7)
+    assert (first.rt_calls, first.cost.ledger_hits) == (7, 0)
+    assert first.cost.cheap_replays > 100
+    assert f"{first.cost.cheap_replays:,} in" in render(costs(first))
+    assert (again.rt_calls, again.cost.ledger_hits) == (7, 7)
     assert again.history.rmse_db.tolist() == first.history.rmse_db.tolist()
     assert again.parameters == first.parameters

@@ -168,7 +168,7 @@ def test_predictions_lean_towards_measured_links_nearby_with_a_narrower_interval
     assert told.path_loss_db.to_numpy() == pytest.approx(fielded.predict(table), abs=1e-6)
     fielded.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
-    assert loaded.residual_field == field
+    assert loaded.prediction.residual_field == field
     # The table of links is written with ten digits.
     pd.testing.assert_frame_equal(loaded.predict_interval(table), told, rtol=1e-6)
 

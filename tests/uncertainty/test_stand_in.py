@@ -19,6 +19,7 @@ from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.discrepancy import Seen
 from calibray.optimizers.multifidelity.sampled_functions import drawn, surprise
 from calibray.reporting import result_tables as tables
+from calibray.result.wording import reason_text
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
@@ -137,4 +138,4 @@ def test_calls_too_few_to_tell_anything_leave_the_whole_range(asked):
         assert [found.lower, found.upper] == planted.BOUNDS
         assert found.verdict == "not identifiable"
         assert found.approximate, name
-        assert found.reason.startswith("3 calls of the engine are too few")
+        assert reason_text(found.reason).startswith("3 calls of the engine are too few")

@@ -145,4 +145,4 @@ def _mapped(setup: Setup, seed: int, progress: Progress | None) -> Result:
             {"trace": content["trace"] | {"max_depth": CHEAP_DEPTH}},
         )
     )
-    return calibrate(dear, cheap=cheap, progress=progress)
+    return calibrate(dear, cheap_model=cheap, progress=progress)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, stated_chunk_size
+from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.position_checks import remarks

@@ -265,7 +265,7 @@ def _residual(result: Record) -> tuple[float, str, NDArray[np.float64]]:
             "without a level"
         )
     size = result.rmse_db * float(np.sqrt(count / freedom))
-    return size, f"errors of {count} links calibrated on", np.zeros(0)
+    return size, f"errors of {count} calibration links", np.zeros(0)
 
 
 class Shift(NamedTuple):

@@ -151,7 +151,7 @@ def _approximate(
         {
             "engine": name,
             "calls": stands.calls,
-            "error_db": stands.error_db,
+            "error_db": float(stands.error_db),
             "replay": stands.replayed is not None,
         },
     )

@@ -102,9 +102,9 @@ def outside_interval(
     holdout = problem.setup.study.holdout
     values: dict[str, Value] = {
         "names": outside,
-        "values": [optimum[name] for name in outside],
-        "pieces": [[end for piece in intervals[name].pieces for end in piece] for name in outside],
-        "most_probable": [most_probable[name] for name in outside],
+        "values": [float(optimum[name]) for name in outside],
+        "pieces": [[float(end) for piece in intervals[name].pieces for end in piece] for name in outside],
+        "most_probable": [float(most_probable[name]) for name in outside],
         "cause": max(CAUSES, key=lambda kind: noise.get(kind, 0.0)),
         "odds": float(np.exp(np.clip(log_odds, 0.0, np.log(MOST_ODDS)))),
         "blocks": holdout is not None and holdout.where is None,

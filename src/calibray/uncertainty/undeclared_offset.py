@@ -78,5 +78,7 @@ def forgotten_offset(
     remarks: tuple[Remark, ...] = ()
     if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= NOTED_DB:
         rmse = {"rmse_db": float(np.sqrt(left)), "rmse_without_db": float(np.sqrt(square))}
-        remarks = (Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": error, **rmse}),)
+        remarks = (
+            Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": float(error), **rmse}),
+        )
     return ForgottenOffset(shifted, offset, error, remarks)

@@ -126,7 +126,7 @@ def verdicts(
         ends = ends or _touched(lean, lower[index], upper[index])
         if share > WEAKLY >= own and len(lean) == 1 and not ends:
             name = VerdictName.WEAKLY_IDENTIFIED
-            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": own})
+            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(own)})
         elif share > WEAKLY and own > WEAKLY:
             name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, lower, upper)
             if change < SILENT_DB:
@@ -139,12 +139,12 @@ def verdicts(
             name, reason = VerdictName.AMBIGUOUS, _separate(index, *several, shown)
         elif ends:
             other_end = shown(index, high if ends == ["lower"] else low)
-            reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": other_end})
+            reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = VerdictName.AT_BOUND
         else:
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
             others = _apart(index, pieces, told, draws, shown)
-            reason = Reason(ReasonKind.WIDTH, {"share": share}, others)
+            reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
         found.append(Verdict(told, float(best[index]), name, reason))
     return found
 
@@ -171,7 +171,7 @@ def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws,
     for low, high in pieces:
         inside = (value >= low) & (value <= high)
         middle = value[inside][np.argmax(draws.density[inside])] if inside.any() else 0.5 * (low + high)
-        modes.append((shown(index, float(middle)), float(draws.weight[inside].sum())))
+        modes.append((float(shown(index, float(middle))), float(draws.weight[inside].sum())))
     return Reason(ReasonKind.SEPARATE_RANGES, ranges=tuple(modes))
 
 
@@ -187,7 +187,7 @@ def _apart(
     for low, high in told:
         if not any(start <= high and low <= end for start, end in pieces):
             weight = draws.weight[(value >= low) & (value <= high)].sum()
-            others.append((shown(index, low), shown(index, high), float(weight)))
+            others.append((float(shown(index, low)), float(shown(index, high)), float(weight)))
     return tuple(others)
 
 

@@ -31,5 +31,5 @@ def widened(drawn: Interval, local: Interval, share: Callable[[float], float]) -
     left, verdict, reason = share(upper) - share(lower), drawn.verdict, drawn.reason
     if verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED) and left > IDENTIFIED:
         verdict = Verdict.WEAKLY_IDENTIFIED if left <= WEAKLY else Verdict.NOT_IDENTIFIABLE
-        reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": left})
+        reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": float(left)})
     return replace(drawn, lower=lower, upper=upper, pieces=((lower, upper),), verdict=verdict, reason=reason)
