@@ -124,7 +124,10 @@ def test_an_engine_that_can_only_be_called_gets_intervals_that_hold_the_truth(as
     result.save(tmp_path)
     loaded = Result.load(tmp_path)
     assert loaded.intervals == result.intervals
-    assert json.loads((tmp_path / "result.json").read_text())["intervals"][name]["approximate"] is True
+    assert (
+        json.loads((tmp_path / "result.json").read_text())["uncertainty"]["intervals"][name]["approximate"]
+        is True
+    )
     told = render(*tables.tables(loaded))
     assert ", approximate" in told
     assert "Intervals are approximate: the engine 'command' gives no derivatives, so 31 of its calls" in told
