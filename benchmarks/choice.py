@@ -42,6 +42,7 @@ import districts
 from calibray import engines
 from calibray.fitting.noise_level import weighed
 from calibray.fitting.problem import Problem
+from calibray.result.held_out import FITTED, Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
@@ -49,7 +50,6 @@ from calibray.tables.text import render
 from calibray.validation.blocks import blocks as parted
 from calibray.validation.conformal import reach
 from calibray.validation.validate import models, validated
-from calibray.validation.validation import BEFORE, CALIBRATED, FITTED, LAW
 
 LEVEL = 0.9
 NOISE_DB = 4.0
@@ -89,7 +89,7 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     inner = validated(part)
     found = models(part)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
-    least = inner.table["rmse_db"].reindex([BEFORE, *FITTED, LAW]).idxmin()
+    least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, Model.LOG_DISTANCE]).idxmin()
     errors[LEAST] = errors[str(least)]
     judged = errors[inner.chosen][np.isfinite(errors[inner.chosen])]
     return inner.chosen, errors, (np.abs(judged) <= reach(inner.sizes(inner.chosen), LEVEL)).tolist()
@@ -157,7 +157,7 @@ def rules(names: list[str], count: int) -> Table:
         for name in names:
             for apart, runs in ruled(name, count, Path(folder)).items():
                 every[apart] += runs
-    taken = (CHOSEN, LEAST, BEFORE, CALIBRATED)
+    taken = (CHOSEN, LEAST, Model.INITIAL, Model.CALIBRATED)
     rows = []
     for apart, runs in every.items():
         errors = ([run[name][np.isfinite(run[name])] for run in runs] for name in taken)

@@ -210,7 +210,7 @@ def city(links: int, samples: int | str) -> None:
         started = time.perf_counter()
         result = cb.calibrate(setup)
         taken = time.perf_counter() - started
-    print(f"{taken:.0f} s ({result.trace_seconds:.0f} s tracing), peak memory {resident():.2f} GiB")
+    print(f"{taken:.0f} s ({result.cost.trace_seconds:.0f} s tracing), peak memory {resident():.2f} GiB")
 
 
 def main() -> None:

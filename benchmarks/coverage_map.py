@@ -85,7 +85,7 @@ def _solver(result: cb.Result, coverage: CoverageMap) -> None:
     import mitsuba as mi
     import sionna.rt as rt
 
-    from calibray.report.export import export
+    from calibray.reporting.export import export
 
     with tempfile.TemporaryDirectory() as folder:
         export(result, folder)

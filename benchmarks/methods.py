@@ -29,8 +29,8 @@ from calibray.comparison.comparison import compare
 from calibray.comparison.comparison_files import figure
 from calibray.comparison.problems import Arena, study_arena
 from calibray.comparison.tables import table
-from calibray.report.style import write
 from calibray.scenarios import demo_study_path
+from calibray.support.figure_style import write
 from calibray.support.output_files import write_table, write_text
 from calibray.tables import markdown
 from problem_families.arenas import landscape_arena

@@ -49,7 +49,9 @@ def main() -> None:
           f"{replay.paths.num_interactions} interactions")  # fmt: skip
     turn = iter(np.tile(points, (10, 1)))
     setup = Setup.open(study)
-    stored = Tracer(setup.scene, study.scene.frequency, study.trace, *study.antenna_pair).find_paths(setup.links)
+    stored = Tracer(setup.scene, study.scene.frequency, study.trace, *study.antenna_pair).find_paths(
+        setup.links
+    )
     rows = [
         ("re-trace with Sionna RT", seconds(lambda: retrace.path_loss(next(turn)[None]), 3)),
         ("Sionna's field stage on stored paths", seconds(field_stage(stored, replay, points), 9)),

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from calibray.report import figures
-from calibray.report.page import page
+from calibray.reporting import figures
+from calibray.reporting.page import page
 from made_up_report import made_up
 
 if TYPE_CHECKING:

@@ -47,14 +47,14 @@ def main(file: str) -> None:
         content = study.content() | {"holdout": {"where": where}, "fidelity": {"rounds": 0}}
         result = cb.calibrate(cb.Study.from_content(content, file), engine=engine)
         scores = (
-            result.initial_holdout_rmse_db,
-            result.offset_only_holdout_rmse_db,
+            result.accuracy.initial_holdout_rmse_db,
+            result.accuracy.nuisance_only_holdout_rmse_db,
             result.holdout_rmse_db,
-            result.log_distance_holdout_rmse_db,
+            result.accuracy.log_distance_holdout_rmse_db,
         )
         rows.append((name, str(result.links.held_out.sum()), *(f"{score:.2f}" for score in scores)))
         found = ", ".join(
-            f"{key} {value:.3g}" for key, value in (result.parameters | result.offsets_db).items()
+            f"{key} {value:.3g}" for key, value in (result.parameters | result.nuisance.offsets_db).items()
         )
         sys.stderr.write(f"{name}: {found}\n")
     sys.stdout.write(render(Table("", COLUMNS, tuple(rows))) + "\n")

@@ -204,7 +204,9 @@ def run(case: Case, samples: int = 20_000) -> Campaign:
     settings = TraceSettings(samples=samples, **case.settings)
     tracer = Tracer(scene, case.frequency, settings, case.tx_antenna, case.rx_antenna)
     rx = np.random.default_rng(0).uniform(case.low, case.high, (case.receivers, 3))
-    trace = tracer.find_paths(SimpleNamespace(tx=np.tile(np.array(case.tx, dtype=float), (len(rx), 1)), rx=rx))
+    trace = tracer.find_paths(
+        SimpleNamespace(tx=np.tile(np.array(case.tx, dtype=float), (len(rx), 1)), rx=rx)
+    )
     return Campaign(case, tracer, trace, trace.paths())
 
 

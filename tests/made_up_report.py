@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 
 import shown
+from calibray.calibration.result import Result
 from calibray.paths import Kind, Paths
-from calibray.report.link_survey import survey
-from calibray.report.page import Shown
-from calibray.report.rays import strongest
-from calibray.result import Result
+from calibray.reporting.link_survey import survey
+from calibray.reporting.page import Shown
+from calibray.reporting.rays import strongest
+from changed import changed
 from calibray.scenes import Scene, Triangles
 
 BLOCK = 40.0
@@ -61,7 +62,7 @@ def made_up(
     })  # fmt: skip
     result = replace(shown.result(), links=table)
     materials = dict(zip(names, list(result.materials.values())[:2], strict=True))
-    result = replace(result, materials={**result.materials, **materials})
+    result = changed(result, materials={**result.materials, **materials})
     traced = _paths(tx, rx, paths, {**result.materials}, random)
     result = replace(result, paths=traced)
     scene = Scene("made up", result.study.path, materials, (), "<scene/>")

@@ -26,7 +26,7 @@ from calibray.engines.ledger.ledger import Ledger
 RUNNER = """
 import json, os, signal, sys, traceback
 from pathlib import Path
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.engines import Retrace, open_workers
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
@@ -40,7 +40,7 @@ def run(workers, folder):
     Retrace._trace = noted
     try:
         with open_workers(int(workers) or None) as executor:
-            calibrate(Study.load(folder + "/study.toml"), out=folder + "/out", executor=executor)
+            calibrate(Study.load(folder + "/study.toml"), out=folder + "/out", workers=executor)
         return 0
     except (InputError, EngineError) as error:
         Path(folder, "messages.log").open("a").write(f"{error}\\n")

@@ -9,16 +9,17 @@ import numpy as np
 import pandas as pd
 
 import synthetic
+from calibray.calibration.result import Result
 from calibray.comparison.comparison import Comparison
 from calibray.comparison.contestant import Contender
 from calibray.comparison.experiment import Demo
 from calibray.comparison.run_log import MethodRun
 from calibray.doctor import Check, Diagnosis
 from calibray.paths import Kind, Paths
-from calibray.result import Result
 from calibray.study import Study
 from calibray.tracing.convergence import Convergence
 from calibray.tracing.llvm import Llvm
+from changed import changed
 
 GOLDEN = Path(__file__).parent / "golden"
 ROWS = np.arange(2, 32)
@@ -38,12 +39,12 @@ def bare_result() -> Result:
         | {"objective": {"no_path": "censor", "ceiling_db": 140.0}, "offset": None, "holdout": None},
         "bare.toml",
     )
-    return replace(
+    return changed(
         full,
         study=study,
         intervals={},
-        offsets_db={},
-        offset_only_rmse_db=None,
+        coefficients={},
+        nuisance_only_rmse_db=None,
         holdout_rmse_db=None,
         initial_holdout_rmse_db=None,
         log_distance_holdout_rmse_db=None,
@@ -97,13 +98,13 @@ def demo() -> Demo:
     renamed = {f"{name}.relative_permittivity": key for name, key in zip(names, old, strict=True)}
 
     def found(calls: int, rmse_db: float, shift: float) -> Result:
-        return replace(
+        return changed(
             full,
             rt_calls=calls,
             rmse_db=rmse_db,
             seconds=calls / 100,
             parameters={name: full.parameters[key] + shift for name, key in renamed.items()},
-            initial_parameters={name: full.initial_parameters[key] for name, key in renamed.items()},
+            initial_parameters={name: full.fit.initial_parameters[key] for name, key in renamed.items()},
             intervals={name: full.intervals[key] for name, key in renamed.items()},
         )
 

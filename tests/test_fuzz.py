@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from test_bad_input import run, write
 
 import shown
+from calibray.calibration.result import Result
 from calibray.engines.ledger.answers import LedgerEntry, read_entry
 from calibray.errors import InputError
 from calibray.measurements import read_measurements, read_table
 from calibray.measurements.filters import evaluate
-from calibray.report.export import export
-from calibray.result import Result
+from calibray.reporting.export import export
 from calibray.scenes import export_scene, read_mesh, read_scene
 from calibray.study import Study
 from calibray.study.toml_file import expand
@@ -165,9 +165,11 @@ def test_an_edited_result_is_refused_unless_it_is_meant(tmp_path):
     assert Result.load(tmp_path).rmse_db >= 0
     content = json.loads(file.read_text())
     file.write_text(json.dumps(content | {"rmse_db": 0.001}))
-    with pytest.raises(InputError, match=r"result\.json: changed since Calibray wrote it.*--anyway"):
+    with pytest.raises(
+        InputError, match=r"result\.json: changed since Calibray wrote it.*--allow-changed-inputs"
+    ):
         Result.load(tmp_path)
-    assert Result.load(tmp_path, anyway=True).rmse_db == 0.001
+    assert Result.load(tmp_path, allow_changed_inputs=True).rmse_db == 0.001
 
 
 def test_an_export_takes_no_place_of_the_users_files(found, tmp_path):

@@ -101,9 +101,9 @@ def test_a_ledger_answers_every_call(folder):
         calls = len(ledger.table())
     (folder / "model.py").unlink()  # a call would fail
     again = cb.calibrate(cb.Study.load(folder / "program.toml"), out=folder / "program")
-    assert (again.rt_calls, again.ledger_hits) == (written.rt_calls, written.rt_calls)
+    assert (again.rt_calls, again.cost.ledger_hits) == (written.rt_calls, written.rt_calls)
     assert again.parameters == written.parameters
-    assert again.offsets_db == pytest.approx(written.offsets_db, rel=1e-12)
+    assert again.nuisance.offsets_db == pytest.approx(written.offsets_db, rel=1e-12)
     assert again.holdout_rmse_db == pytest.approx(written.holdout_rmse_db, rel=1e-12)
     with closing(engines.open_ledger(folder / "program")) as ledger:
         assert len(ledger.table()) == calls

@@ -16,12 +16,13 @@ SIGNATURES = {
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
-    "calibrate": "study, method, seed, out, engine, executor, progress, tracer, overwrite, cheap",
+    "calibrate": "study, method, seed, out, engine, workers, progress, tracer, overwrite, cheap_model",
     "report": "result, file, figures, overwrite, progress",
-    "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, crew, anyway",
+    "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
+    "allow_changed_inputs",
     "save_map": "coverage, folder, inputs, overwrite",
-    "validate": "study, blocks, by, crew, progress, tracer",
-    "suggest": "result, candidates, count, progress, anyway",
+    "validate": "study, blocks, by, workers, progress, tracer",
+    "suggest": "result, candidates, count, progress, allow_changed_inputs",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }
@@ -52,10 +53,13 @@ def test_parts_of_the_design_are_there():
     assert callable(cb.Paths.save)
     assert callable(cb.Study.load)
     assert callable(cb.Result.predict)
-    fields = cb.Result.__dataclass_fields__
     assert {"rmse_db", "initial_rmse_db", "holdout_rmse_db", "rt_calls", "materials", "parameters"} <= set(
-        fields
+        dir(cb.Result)
     )
+    assert {"fit", "accuracy", "uncertainty", "nuisance", "prediction", "cost", "provenance"} <= set(
+        cb.Result.__dataclass_fields__
+    )
+    assert all(callable(getattr(cb.Result, verb)) for verb in ("report", "export", "coverage_map", "suggest"))
 
 
 def test_unknown_names_are_refused():

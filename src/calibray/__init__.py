@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from calibray import engines as engines
     from calibray import optimizers as optimizers
     from calibray.calibration.calibrate import calibrate as calibrate
+    from calibray.calibration.result import Result as Result
     from calibray.fields import path_gains as path_gains
     from calibray.fields import path_loss as path_loss
     from calibray.fields.channel import channel_statistics as channel_statistics
@@ -21,10 +22,9 @@ if TYPE_CHECKING:
     from calibray.measurements import read_measurements as read_measurements
     from calibray.paths import Paths as Paths
     from calibray.prediction.coverage_map import coverage_map as coverage_map
+    from calibray.prediction.map_files import save_map as save_map
     from calibray.prediction.suggestion import suggest as suggest
-    from calibray.report.map_files import save_map as save_map
-    from calibray.report.page import report as report
-    from calibray.result import Result as Result
+    from calibray.reporting.page import report as report
     from calibray.study import Setup as Setup
     from calibray.study import Study as Study
     from calibray.study.trace import trace as trace
@@ -43,15 +43,15 @@ _HOMES = {
     "path_loss": "calibray.fields",
     "Study": "calibray.study",
     "Setup": "calibray.study",
-    "Result": "calibray.result",
+    "Result": "calibray.calibration.result",
     "calibrate": "calibray.calibration.calibrate",
     "validate": "calibray.validation.validate",
     "suggest": "calibray.prediction.suggestion",
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
     "coverage_map": "calibray.prediction.coverage_map",
-    "save_map": "calibray.report.map_files",
-    "report": "calibray.report.page",
+    "save_map": "calibray.prediction.map_files",
+    "report": "calibray.reporting.page",
 }
 
 __all__ = sorted(_HOMES)

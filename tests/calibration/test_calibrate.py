@@ -13,13 +13,13 @@ import pytest
 from scipy.optimize import minimize
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
-from calibray.result import Result
-from calibray.result.tables import offsets
+from calibray.reporting.result_tables import offsets
 from calibray.study import Setup
 from calibray.tables.text import render
 
@@ -146,20 +146,24 @@ def test_weights_act(tmp_path, exact):
 def test_offsets_are_found_beside_the_materials(tmp_path, exact, offset, planted_db, found):
     shifted = exact.assign(path_loss_db=exact.path_loss_db + exact.half.map(planted_db))
     result = run(tmp_path, shifted, offset=offset)
-    assert result.offsets_db == pytest.approx(found, abs=1e-4)
+    assert result.nuisance.offsets_db == pytest.approx(found, abs=1e-4)
     assert result.parameters == pytest.approx(planted.TRUTH, abs=1e-3)
     assert result.rmse_db < 1e-4
-    assert result.rmse_db <= result.offset_only_rmse_db <= result.initial_rmse_db
+    assert result.rmse_db <= result.fit.nuisance_only_rmse_db <= result.initial_rmse_db
 
 
 def test_an_offset_stays_within_its_bounds(tmp_path, exact):
     shifted = exact.assign(path_loss_db=exact.path_loss_db + 40.0)  # more than the materials can take up
-    assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).offsets_db == {"": 1.5}
+    assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).nuisance.offsets_db == {"": 1.5}
 
 
 def test_without_a_section_there_is_no_offset(tmp_path, exact):
     result = run(tmp_path, exact.assign(path_loss_db=exact.path_loss_db + 4.0))
-    assert (result.offsets_db, result.offset_only_rmse_db, result.offset_only_holdout_rmse_db) == (
+    assert (
+        result.nuisance.offsets_db,
+        result.fit.nuisance_only_rmse_db,
+        result.accuracy.nuisance_only_holdout_rmse_db,
+    ) == (
         {},
         None,
         None,
@@ -176,8 +180,8 @@ def test_the_log_distance_rival_is_fitted_to_the_calibration_links_alone(tmp_pat
     distance = np.linalg.norm(exact[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
     law = exact.assign(path_loss_db=40 + 23 * np.log10(distance) + 9.0 * (exact.rx_x > 10))
     result = run(tmp_path, law, holdout={"where": "rx_x > 10"})
-    assert result.log_distance_rmse_db == pytest.approx(0, abs=1e-9)
-    assert result.log_distance_holdout_rmse_db == pytest.approx(9.0)
+    assert result.fit.log_distance_rmse_db == pytest.approx(0, abs=1e-9)
+    assert result.accuracy.log_distance_holdout_rmse_db == pytest.approx(9.0)
 
 
 @pytest.fixture(scope="module")
@@ -297,10 +301,10 @@ def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(
     table.loc[planted.INSIDE, "place"] = "cellar"
     study = planted.study(tmp_path, table, offset={"per": "place"})
     result = calibrate(study, engine=planted.engine(blocked=True))
-    assert sorted(result.offsets_db) == ["east", "west"]
-    assert result.groups_without_path == ("cellar",)
+    assert sorted(result.nuisance.offsets_db) == ["east", "west"]
+    assert result.nuisance.groups_without_path == ("cellar",)
     assert re.search(r"^cellar +no link with a path$", render(offsets(result)), re.MULTILINE)
-    assert result.content()["groups_without_path"] == ["cellar"]
+    assert result.content()["nuisance"]["groups_without_path"] == ["cellar"]
 
     held = planted.study(
         tmp_path, table, holdout={"where": f"rx_x in [{table.rx_x[planted.INSIDE]}, {table.rx_x[0]}]"}
@@ -331,5 +335,5 @@ def test_antennas_inside_bodies_are_known_before_the_calibration_and_to_python(t
     monkeypatch.undo()
     study = planted.study(tmp_path, table, method={"name": "auto", "options": {"starts": 4}})
     result = calibrate(study, out=tmp_path / "out")
-    assert result.enclosed.rx == (planted.INSIDE + 2,)
-    assert Result.load(tmp_path / "out").enclosed == result.enclosed
+    assert result.provenance.enclosed.rx == (planted.INSIDE + 2,)
+    assert Result.load(tmp_path / "out").provenance.enclosed == result.provenance.enclosed

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.fields import path_loss
-from calibray.result import Result
 from calibray.study import Setup, Study
 
 REPOSITORY = Path(__file__).parents[2]
@@ -43,12 +43,14 @@ def test_scene_init_run(tmp_path, monkeypatch):
     shown = typed("run", tmp_path / "study.toml", "--out", tmp_path / "result")
     assert "averages too near the noise floor, left out" in shown
     result = Result.load(tmp_path / "result")
-    assert result.prepared["samples averaged"] == int(((stop % 4 == 0) & (log["device"] == "phone-a")).sum())
+    assert result.provenance.rows["samples averaged"] == int(
+        ((stop % 4 == 0) & (log["device"] == "phone-a")).sum()
+    )
     # A level of the path loss less the received power: less what was transmitted.
-    for cell, offset in result.offsets_db.items():
+    for cell, offset in result.nuisance.offsets_db.items():
         assert abs(offset + truth["eirp_dbm"][cell.split()[0]]) < 1.5
     # As large as ten samples of fading leave it, and far below what nothing but distance explains.
-    assert result.rmse_db < 1.6 < result.log_distance_rmse_db
+    assert result.rmse_db < 1.6 < result.fit.log_distance_rmse_db
     walls = result.intervals["walls.relative_permittivity"]
     assert walls.lower < truth["walls"]["relative_permittivity"] < walls.upper
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from calibray import doctor as diagnosis
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
-from calibray.report.doctor_table import table
+from calibray.reporting.doctor_table import table
 from calibray.tables.text import render
 
 HEAVY = (

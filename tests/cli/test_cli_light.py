@@ -12,9 +12,9 @@ import pytest
 from test_cli_run import write_study
 
 import programs
+from calibray.calibration.result import Result
 from calibray.engines import Ledger
 from calibray.engines.ledger.answers import LedgerEntry, key
-from calibray.result import Result
 from calibray.tracing.llvm import PATH_VARIABLE
 
 

@@ -6,7 +6,6 @@ import io
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,16 @@ from typer.testing import CliRunner
 
 import planted
 import programs
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.cli.progress_bars import progress_bars
 from calibray.paths import Paths
-from calibray.result import FILES, Result
-from calibray.result import tables as report
+from calibray.reporting import result_tables
+from calibray.result import FILES
 from calibray.support.output_files import SIGNATURES
 from calibray.tables.text import render
 from calibray.tracing.positions import EnclosedAntennas
+from changed import changed
 from problem_families import optima
 
 LOST_ROW = planted.INSIDE + 2  # the header is row 1
@@ -108,12 +109,12 @@ def test_run_prints_what_it_found(folder, ran):
     for name, value in result.parameters.items():
         assert cells[name][2] == f"{value:.4g}"
         assert cells[name][-1] == "identified"
-    assert cells["east"] == ["east", f"{result.offsets_db['east']:+.2f}"]
+    assert cells["east"] == ["east", f"{result.nuisance.offsets_db['east']:+.2f}"]
     for name, scores in {
-        "before": (result.initial_rmse_db, result.initial_holdout_rmse_db),
-        "offset only": (result.offset_only_rmse_db, result.offset_only_holdout_rmse_db),
+        "before": (result.initial_rmse_db, result.accuracy.initial_holdout_rmse_db),
+        "offset only": (result.fit.nuisance_only_rmse_db, result.accuracy.nuisance_only_holdout_rmse_db),
         "after": (result.rmse_db, result.holdout_rmse_db),
-        "log-distance model": (result.log_distance_rmse_db, result.log_distance_holdout_rmse_db),
+        "log-distance model": (result.fit.log_distance_rmse_db, result.accuracy.log_distance_holdout_rmse_db),
     }.items():
         assert cells[name][-2:] == [f"{score:.2f}" for score in scores]
     assert cells["RT calls"][-1] == f"{result.rt_calls:,}"
@@ -155,7 +156,7 @@ def test_run_prints_json_on_demand_and_takes_method_and_seed(folder):
     outcome = calibray("run", folder / "study.toml", "--out", folder / "other", *arguments)
     assert outcome.exit_code == 0, outcome.output
     content = json.loads(outcome.stdout)
-    assert content["rt_calls"] == 225
+    assert content["cost"]["rt_calls"] == 225
     assert content["study"]["method"] == {"name": "sgwo-im", "seed": 7, "options": {}}
     assert content["links"] == {
         "calibrated_on": 9,
@@ -264,13 +265,13 @@ def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
     result = Result.load(folder / "out")
     row, none = np.arange(2, 14), np.zeros(12, dtype=bool)
     few, most = np.arange(12) < 2, np.arange(12) < 11
-    told = render(*report.tables(replace(result, enclosed=EnclosedAntennas.of(row, none, few))))
+    told = render(*result_tables.tables(changed(result, enclosed=EnclosedAntennas.of(row, none, few))))
     assert re.search(
         r"transmitter inside a building +0\nreceiver inside a building +2 +rows 2, 3: check", told
     )
-    indoors = render(*report.tables(replace(result, enclosed=EnclosedAntennas.of(row, most, most))))
+    indoors = render(*result_tables.tables(changed(result, enclosed=EnclosedAntennas.of(row, most, most))))
     assert re.search(r"receiver inside a building +11 +as most are: taken for an indoor scene\n", indoors)
-    assert replace(result, enclosed=EnclosedAntennas.of(row, none, few)).counts["rows_with_enclosed_rx"] == [
+    assert changed(result, enclosed=EnclosedAntennas.of(row, none, few)).counts["rows_with_enclosed_rx"] == [
         2,
         3,
     ]
@@ -278,8 +279,8 @@ def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
 
 def test_tables_fit_what_there_is(folder, ran):
     result = Result.load(folder / "out")
-    bare = replace(result, offsets_db={}, offset_only_rmse_db=None, holdout_rmse_db=None, intervals={})
-    text = render(*report.tables(bare))
+    bare = changed(result, coefficients={}, nuisance_only_rmse_db=None, holdout_rmse_db=None, intervals={})
+    text = render(*result_tables.tables(bare))
     assert "Offsets" not in text
     assert "offset only" not in text
     assert "not known" in text

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from calibray.cli.app import Commands
 from calibray.cli.app import app as calibray
 from calibray.cli.scene import scene
-from calibray.report import scene_tables as report
+from calibray.reporting import scene_tables as report
 from calibray.scenes import read_frame, read_scene
 from calibray.scenes.checks import check_scene
 from calibray.tables.text import render

@@ -10,7 +10,7 @@ import pytest
 
 from calibray import doctor as diagnosis
 from calibray.doctor import Check, Diagnosis
-from calibray.report.doctor_table import table
+from calibray.reporting.doctor_table import table
 from calibray.tables.text import render
 from calibray.tracing import llvm
 

@@ -91,7 +91,7 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
         [],
         [
             "calibray.study.link_checks.examine", "calibray.calibration.calibrate.search",
-            "calibray.report.page.report",
+            "calibray.reporting.page.report",
         ],
     ],
     ids=["a program's call", "the steps before and after"],

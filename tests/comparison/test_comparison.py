@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.comparison import comparison as module
 from calibray.comparison.comparison import compare

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from calibray.engines.fingerprint import fingerprint
 
 from calibray import engines
-from calibray.calibration import calibrate
-from calibray.engines import ReplayCarriers, fingerprint
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
+from calibray.engines import ReplayCarriers
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.materials import itu_law
 from calibray.paths import Paths, take_links
-from calibray.result import Result
 from calibray.scenes import read_scene
 from calibray.study import Setup, Study
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -327,7 +328,7 @@ def result(folder: Path, truth: np.ndarray) -> Result:
 def test_a_planted_law_is_recovered_from_three_carriers(result: Result) -> None:
     assert result.rmse_db < 1e-5
     assert result.initial_rmse_db > 0.5
-    assert result.retrace_gap_db < 0.01  # traced again at the scene's carrier, compared at all
+    assert result.fit.retrace_gap_db < 0.01  # traced again at the scene's carrier, compared at all
     for name, value in TRUTH.items():
         assert result.parameters[name] == pytest.approx(value, rel=1e-3)
         assert result.intervals[name].verdict == "identified"
@@ -349,7 +350,7 @@ def test_result_keeps_the_law_and_writes_the_constants_at_the_scenes_carrier(
     content = json.loads((folder / "out" / "result.json").read_text())
     assert content["laws"]["walls"]["itu_b"] == result.parameters["walls.itu_b"]
     again = Result.load(folder / "out")
-    assert again.laws == result.laws
+    assert again.fit.laws == result.fit.laws
     wall = read_scene(folder / "out" / "result-scene.xml", 10e9).materials["walls"]
     assert wall.relative_permittivity == pytest.approx(6.1 * 10**-0.07, rel=1e-3)
     assert wall.conductivity == pytest.approx(0.03 * 10**0.9, rel=1e-3)

@@ -15,7 +15,7 @@ import pytest
 import planted
 import programs
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.engines import Engine, Ledger
 from calibray.engines.external.exchange import Unusable, read_answer
 from calibray.errors import EngineError, InputError
@@ -216,7 +216,7 @@ def test_a_program_that_breaks_down_ends_the_run_and_loses_nothing(tmp_path):
         assert ledger.forget_failures() == 4
     programs.content(tmp_path)  # mended
     result = calibrate(study, out=out)
-    assert result.ledger_hits == 8 - 1  # the first was the loop's own
+    assert result.cost.ledger_hits == 8 - 1  # the first was the loop's own
     undisturbed = calibrate(study, out=tmp_path / "other")
     assert result.parameters == undisturbed.parameters
 
@@ -229,7 +229,7 @@ def test_auto_without_a_cheap_model_is_the_vector_surrogate(tmp_path):
         method = {"name": name, "model": "none", "options": {"budget": 18}}
         study = Study.from_content(content | {"method": method}, tmp_path / "study.toml")
         results.append(calibrate(study, out=tmp_path / "out"))
-    assert [(result.rt_calls, result.ledger_hits) for result in results] == [(18, 0), (18, 18)]
+    assert [(result.rt_calls, result.cost.ledger_hits) for result in results] == [(18, 0), (18, 18)]
     assert results[0].parameters == results[1].parameters
     assert results[0].rmse_db < 0.1 * results[0].initial_rmse_db
 

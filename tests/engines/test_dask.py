@@ -74,14 +74,14 @@ def test_blocks_on_workers_give_what_one_process_gives_though_one_is_killed(tmp_
 
     setup = Setup.open(two_ray.study(tmp_path, noise_db=1.0, **parted), two_ray.TwoRay)
     with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
-        found = calibrate(setup, executor=workers, progress=kill_one)
+        found = calibrate(setup, workers=workers, progress=kill_one)
     assert killed
     # No block twice: those of the dead worker came from the cache.
     assert sorted((tmp_path / two_ray.TRACED).read_text().split()) == ["15", "15"]
     whole = calibrate(Setup.open(two_ray.study(tmp_path, noise_db=1.0, **few), two_ray.TwoRay))
     assert found.parameters == pytest.approx(whole.parameters, rel=1e-9)
     assert found.rmse_db == pytest.approx(whole.rmse_db, rel=1e-9)
-    assert found.offsets_db == pytest.approx(whole.offsets_db, rel=1e-9)
+    assert found.nuisance.offsets_db == pytest.approx(whole.nuisance.offsets_db, rel=1e-9)
     assert found.links["after_db"].to_numpy() == pytest.approx(whole.links["after_db"].to_numpy(), rel=1e-9)
 
 

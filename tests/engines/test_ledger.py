@@ -17,7 +17,7 @@ import planted
 import programs
 import restarts
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.engines import Answer, Ledger, Recorded, fingerprint
 from calibray.engines.ledger.answers import LedgerEntry, key
@@ -192,9 +192,9 @@ def test_a_run_that_is_killed_and_started_again_ends_as_an_undisturbed_one(
 def test_calls_are_shared_by_methods_seeds_bounds_and_measured_values(tmp_path):
     first = programs.study_file(tmp_path, method="random", options="{ budget = 6 }")
     result = calibrate(first, out=tmp_path / "out")
-    assert (result.rt_calls, result.ledger_hits) == (6, 0)
+    assert (result.rt_calls, result.cost.ledger_hits) == (6, 0)
     again = calibrate(first, out=tmp_path / "out")
-    assert (again.rt_calls, again.ledger_hits, again.parameters) == (6, 6, result.parameters)
+    assert (again.rt_calls, again.cost.ledger_hits, again.parameters) == (6, 6, result.parameters)
     links = pd.read_csv(tmp_path / "links.csv")
     links.assign(path_loss_db=links.path_loss_db + 1).to_csv(tmp_path / "links.csv", index=False)
     measured_anew = calibrate(first, out=tmp_path / "out")

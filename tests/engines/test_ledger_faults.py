@@ -18,7 +18,7 @@ import pytest
 import planted
 import programs
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.ledger import claims, database
 from calibray.engines.ledger.answers import LedgerEntry, key

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.errors import EngineError
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import rounds
@@ -48,7 +48,7 @@ def test_the_links_are_simulated_with_the_values_that_the_readme_names():
 def test_a_calibration_on_the_program_ends(tmp_path):
     study = example(method={"name": "random", "options": {"budget": 6}})
     with engines.open_workers(2) as workers:
-        result = calibrate(study, out=tmp_path, executor=workers)
+        result = calibrate(study, out=tmp_path, workers=workers)
     assert result.rt_calls == 6
     assert result.rmse_db < result.initial_rmse_db
 

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 import planted
 import two_ray
 from calibray import Paths
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.engines.cluster.chunks import cut, trace_in_chunks
 from calibray.engines.cluster.workers import InProcess
@@ -24,7 +25,6 @@ from calibray.errors import InputError
 from calibray.measurements import Measurements, PiecedTable, links_from_frame
 from calibray.prediction import batches as shared_out
 from calibray.prediction.batches import predicted, predicted_in_pieces
-from calibray.result import Result
 from calibray.study import Setup
 from calibray.support.output_files import growing_table
 from calibray.validation.validate import validate

@@ -11,7 +11,7 @@ import pytest
 
 import planted
 import programs
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, aid, with_constants
@@ -23,7 +23,7 @@ from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters
 from calibray.paths.program import take
-from calibray.result.tables import costs
+from calibray.reporting.result_tables import costs
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 
@@ -141,8 +141,11 @@ def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, 
     study = Study.from_content(content, tmp_path / "study.toml")
     monkeypatch.setattr(Setup, "trace", missing)
     result = calibrate(study)
-    assert result.cheap_calls == 0
-    assert result.remarks[0] == "No cheap model, as the scene cannot be traced here (no libLLVM was found)."
+    assert result.cost.cheap_replays == 0
+    assert (
+        result.remarks[0]
+        == "There is no cheap model: the scene cannot be traced here (no libLLVM was found)."
+    )
     named = calibrate(study.replace(method="vector-surrogate"), seed=0)
     assert not any("cheap model" in remark for remark in named.remarks)
 
@@ -152,7 +155,7 @@ def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch,
     asked = problem(tmp_path, method=method)
     monkeypatch.setattr(Setup, "trace", lambda *_, **__: pytest.fail("traced"))
     assert aid(asked).model is None
-    assert aid(asked).remark == ""
+    assert aid(asked).remark is None
 
 
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
@@ -161,9 +164,9 @@ def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
     study = Study.from_content(content, tmp_path / "study.toml")
     first = calibrate(study, out=tmp_path / "out")
     again = calibrate(study, out=tmp_path / "out", overwrite=True)
-    assert (first.rt_calls, first.ledger_hits) == (7, 0)
-    assert first.cheap_calls > 100
-    assert f"{first.cheap_calls:,} in" in render(costs(first))
-    assert (again.rt_calls, again.ledger_hits) == (7, 7)
+    assert (first.rt_calls, first.cost.ledger_hits) == (7, 0)
+    assert first.cost.cheap_replays > 100
+    assert f"{first.cost.cheap_replays:,} in" in render(costs(first))
+    assert (again.rt_calls, again.cost.ledger_hits) == (7, 7)
     assert again.history.rmse_db.tolist() == first.history.rmse_db.tolist()
     assert again.parameters == first.parameters

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.fitting.noise_floor import MARGIN, heard
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
@@ -144,7 +144,7 @@ def test_links_that_were_not_heard_are_counted_and_judge_nothing(tmp_path):
     missing = table["power"].isna().to_numpy()
     assert found.links["censored"].to_numpy(bool).tolist() == missing.tolist()
     assert found.links["faint"].to_numpy(bool)[missing].all()
-    assert found.prepared["at or below the noise floor, counted as censored"] == missing.sum() == 4
+    assert found.provenance.rows["at or below the noise floor, counted as censored"] == missing.sum() == 4
     assert found.counts["calibrated_on"] <= 8
     held = [
         interval.pieces[0][0] <= planted.TRUTH[name] <= interval.pieces[-1][1]

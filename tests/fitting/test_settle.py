@@ -8,7 +8,7 @@ import pytest
 
 import planted
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
 from calibray.paths import take
 from calibray.tracing.settings import TraceSettings
 from calibray.tracing.trace_plan import plan_trace
@@ -63,12 +63,12 @@ def run(folder, gains, method="auto", tracer=None, **sections):
 def test_paths_that_stay_leave_no_gap_and_are_traced_once(tmp_path):
     result, asked = run(tmp_path, [0.0])
     assert asked == 1
-    assert result.retrace_gap_db == pytest.approx(0, abs=1e-9)
+    assert result.fit.retrace_gap_db == pytest.approx(0, abs=1e-9)
 
 
 def test_the_gap_is_that_of_the_paths(tmp_path):
     result, _ = run(tmp_path, [0.25])
-    assert result.retrace_gap_db == pytest.approx(0.25, abs=1e-9)
+    assert result.fit.retrace_gap_db == pytest.approx(0.25, abs=1e-9)
     np.testing.assert_allclose(result.links["retrace_gap_db"], -0.25, atol=1e-9)
 
 
@@ -76,22 +76,22 @@ def test_auto_calibrates_again_on_the_new_paths_until_they_stay(tmp_path):
     # The paths change once, then stay.
     result, asked = run(tmp_path, [0.8])
     assert asked == 2
-    assert result.retrace_gap_db == pytest.approx(0, abs=1e-9)
+    assert result.fit.retrace_gap_db == pytest.approx(0, abs=1e-9)
 
 
 def test_rounds_bound_the_loop_and_zero_switches_it_off(tmp_path):
     gains = [0.8, 1.6, 2.4, 3.2, 4.0]
     result, asked = run(tmp_path, gains, fidelity={"rounds": 2})
     assert asked == 2
-    assert result.retrace_gap_db > 0.5
+    assert result.fit.retrace_gap_db > 0.5
     result, asked = run(tmp_path, gains, fidelity={"rounds": 0})
-    assert (result.retrace_gap_db, asked) == (None, 0)
+    assert (result.fit.retrace_gap_db, asked) == (None, 0)
 
 
 def test_a_method_with_a_budget_keeps_to_it(tmp_path):
     result, asked = run(tmp_path, [0.8], "sgwo-im")
     assert (result.rt_calls, asked) == (225, 1)
-    assert result.retrace_gap_db == pytest.approx(0.8, abs=1e-9)
+    assert result.fit.retrace_gap_db == pytest.approx(0.8, abs=1e-9)
 
 
 def test_a_link_that_the_new_trace_loses_is_left_out_and_told(tmp_path):
@@ -101,4 +101,4 @@ def test_a_link_that_the_new_trace_loses_is_left_out_and_told(tmp_path):
     assert not result.links["has_path"][3]
     assert result.links["has_path"].sum() == planted.LINKS - 1
     assert np.isfinite(result.rmse_db)
-    assert np.isfinite(result.retrace_gap_db)
+    assert np.isfinite(result.fit.retrace_gap_db)

@@ -67,7 +67,7 @@ def coverage(rng: Random, found: World, folder: Path) -> Case:
             rng.choice(
                 (
                     "--overwrite",
-                    "--anyway",
+                    "--allow-changed-inputs",
                     "--",
                     "--no-such-option",
                     rng.choice(TEXTS[:30]).replace("\0", ""),

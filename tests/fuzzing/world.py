@@ -19,10 +19,10 @@ import pandas as pd
 import typer.main
 
 import small_scenes
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.fields import path_loss
 from calibray.paths import Paths
-from calibray.result import Result
 from calibray.study import Study
 from fuzzing.mutations import toml
 from fuzzing.outcome import Exited

@@ -18,8 +18,9 @@ from calibray.cli.app import app
 from calibray.coordinates import transformer
 from calibray.errors import InputError
 from calibray.prediction import batches as shared_out
-from calibray.report.link_map import footprints
-from calibray.report.map_files import geotiff
+from calibray.prediction.map_files import geotiff
+from calibray.reporting.link_map import footprints
+from changed import changed
 from calibray.scenes import Triangles, ground_heights
 
 LEGACY = Path(__file__).parents[1] / "legacy"
@@ -49,7 +50,7 @@ def result(folder) -> cb.Result:
     content["scene"]["origin"] = list(ORIGIN)
     drawn = {name: [0.9 * value, 1.2 * value] for name, value in loaded.parameters.items()}
     study = cb.Study.from_content(content, loaded.study.path)
-    return replace(loaded, study=study, draws=drawn)
+    return changed(loaded, study=study, draws=drawn)
 
 
 @pytest.fixture(scope="module")

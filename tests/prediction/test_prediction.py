@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,16 +10,17 @@ import pytest
 from typer.testing import CliRunner
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.prediction.position_checks import standing
 from calibray.prediction.residual_field import carried, measured_errors
 from calibray.prediction.suggestion import suggest
-from calibray.result import Result
-from calibray.result.residuals import ResidualField
+from calibray.result.prediction_model import ResidualField
 from calibray.scenes import Triangles
 from calibray.uncertainty.residuals import shared_errors
 from calibray.validation.conformal import FEW, reach
+from changed import changed
 
 FIELD = ResidualField(range_m=20.0, shared_db=3.0, own_db=1.0)
 
@@ -158,7 +158,7 @@ def test_predictions_lean_towards_measured_links_nearby_with_a_narrower_interval
     field = ResidualField(
         range_m=20.0, shared_db=0.9 * received.residual_db, own_db=0.4 * received.residual_db
     )
-    fielded = replace(received, residual_field=field)
+    fielded = changed(received, residual_field=field)
     told = fielded.predict_interval(table)
     _, errors = measured_errors(received.links)
     moved = told.path_loss_db.to_numpy() - plain.path_loss_db.to_numpy()
@@ -168,7 +168,7 @@ def test_predictions_lean_towards_measured_links_nearby_with_a_narrower_interval
     assert told.path_loss_db.to_numpy() == pytest.approx(fielded.predict(table), abs=1e-6)
     fielded.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
-    assert loaded.residual_field == field
+    assert loaded.prediction.residual_field == field
     # The table of links is written with ten digits.
     pd.testing.assert_frame_equal(loaded.predict_interval(table), told, rtol=1e-6)
 

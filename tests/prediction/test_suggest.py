@@ -12,14 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 import calibray as cb
+from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import links_from_frame
-from calibray.result import Result
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.tracing.settings import Antenna, TraceSettings
+from changed import changed
 from small_scenes import write_scene
 from two_ray import TwoRay
 
@@ -102,8 +103,8 @@ def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
 
 def _predicted(result: Result, links: pd.DataFrame, value: float) -> np.ndarray:
     """Path loss of links for another permittivity, with the result's offset."""
-    ground = replace(result.materials["ground"], relative_permittivity=value)
-    return replace(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]])
+    ground = changed(result.materials["ground"], relative_permittivity=value)
+    return changed(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]])
 
 
 def test_intervals_are_expected_to_narrow_with_every_point(result, table):
@@ -158,19 +159,19 @@ def test_what_cannot_be_suggested_is_refused(result, table):
     with pytest.raises(InputError, match="count = 0"):
         cb.suggest(result, table, 0)
     with pytest.raises(InputError, match="kept no draws"):
-        cb.suggest(replace(result, draws={}), table)
+        cb.suggest(changed(result, draws={}), table)
     with pytest.raises(InputError, match="tx_x"):
         cb.suggest(result, table.drop(columns="tx_x"))
     with pytest.raises(InputError, match="changed since the calibration"):
-        cb.suggest(replace(result, files={name: "0" * 64 for name in result.files}), table)
+        cb.suggest(changed(result, files={name: "0" * 64 for name in result.provenance.files}), table)
 
 
 def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
     """Of 128 draws three lie in the second range; to narrow the first, another place would come before."""
     values = np.where(np.arange(128) % 50 == 1, 14.0, np.linspace(3.0, 9.0, 128))
-    interval = replace(result.intervals[NAME], lower=3.0, upper=14.1, pieces=((3.0, 9.0), (13.9, 14.1)))
-    two = replace(result, rmse_db=1.0, draws={NAME: values.tolist()}, intervals={NAME: interval})
-    one = replace(two, intervals={NAME: replace(interval, pieces=((3.0, 14.1),))})
+    interval = changed(result.intervals[NAME], lower=3.0, upper=14.1, pieces=((3.0, 9.0), (13.9, 14.1)))
+    two = changed(result, rmse_db=1.0, draws={NAME: values.tolist()}, intervals={NAME: interval})
+    one = changed(two, intervals={NAME: replace(interval, pieces=((3.0, 14.1),))})
     loss = [
         _predicted(result, links, value)
         for links in (table, result.links.assign(site="a"))
@@ -183,5 +184,5 @@ def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
     assert told[f"{NAME}_sure"][0] < 1
     assert f"{NAME}_sure" not in alone
     even = np.where(np.arange(128) % 2 == 1, 14.0, values)
-    gain = cb.suggest(replace(two, draws={NAME: even.tolist()}), table, 1).gain[0]
+    gain = cb.suggest(changed(two, draws={NAME: even.tolist()}), table, 1).gain[0]
     assert f"{NAME}'s right range known with" in gain

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_report import Cells
 
 import shown
 from calibray.measurements import Measurements
 from calibray.study import Study
 from calibray.tables import display as glance
+from changed import changed
+from html_cells import Cells
 
 LINES, CHARACTERS = 40, 120
 HOSTILE = '<img src=x onerror="alert(1)">'
@@ -38,12 +39,12 @@ def large_records():
     """One of each kind, far larger than a screen and with hostile names."""
     plan, found = study(300), shown.result()
     constants = {f"{name}.thickness": 0.25 for name in [*NAMES, *map(str, range(300))]}
-    result = replace(
+    result = changed(
         found,
         study=plan,
         parameters=constants,
         initial_parameters=constants,
-        offsets_db={name: -1.5 for name in [*NAMES, *map(str, range(500))]},
+        coefficients={"offset": {name: -1.5 for name in [*NAMES, *map(str, range(500))]}},
     )
     comparison = replace(shown.comparison(), name=HOSTILE)
     demo = replace(shown.demo(), engine=HOSTILE)

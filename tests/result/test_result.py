@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 
 import planted
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.errors import InputError
-from calibray.result import FILES, Result
+from calibray.result import FILES
 from calibray.scenes import read_scene
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
@@ -67,7 +68,7 @@ def test_the_file_is_strict_json(folder):
 
     content = json.loads((folder / "result.json").read_text(), parse_constant=refuse)
     assert content["version"] == 1
-    assert content["parameters"].keys() == planted.TRUTH.keys()
+    assert content["fit"]["parameters"].keys() == planted.TRUTH.keys()
 
 
 def test_prediction_at_the_measured_links_is_what_was_fitted(result, folder):
@@ -81,7 +82,9 @@ def test_prediction_at_the_measured_links_is_what_was_fitted(result, folder):
 def test_prediction_adds_the_offset_of_the_group(result):
     links = planted.links().iloc[[2, 2]].assign(half=["west", "east"])
     west, east = result.predict(links)
-    assert east - west == pytest.approx(result.offsets_db["east"] - result.offsets_db["west"])
+    assert east - west == pytest.approx(
+        result.nuisance.offsets_db["east"] - result.nuisance.offsets_db["west"]
+    )
     assert east - west > 5
 
 
@@ -173,22 +176,43 @@ def edited(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"materials": {}}, "materials: 'concrete' is calibrated and missing"),
-        ({"offsets_db": {}}, "offsets_db: are missing"),
-        ({"rmse_db": float("nan")}, r"rmse_db = nan: must be a finite number"),
-        ({"rmse_db": "1.5"}, r"rmse_db = '1.5': must be a number"),
-        ({"rmse_db": -1.0}, r"rmse_db = -1.0: must be at least 0"),
-        ({"rmse_db": ""}, "rmse_db: is required"),
+        ({"fit__materials": {}}, "materials: 'concrete' is calibrated and missing"),
+        ({"nuisance__coefficients": {}}, "nuisance.coefficients: are not those"),
+        ({"fit__rmse_db": float("nan")}, r"rmse_db = nan: must be a finite number"),
+        ({"fit__rmse_db": "1.5"}, r"rmse_db = '1.5': must be a number"),
+        ({"fit__rmse_db": -1.0}, r"rmse_db = -1.0: must be at least 0"),
+        ({"fit__rmse_db": ""}, "rmse_db: is required"),
         ({"surprise": 1}, "surprise: unknown key"),
-        ({"parameters": {}}, "parameters: '.*' is missing"),
-        ({"parameters__marble.relative_permittivity": 99.0}, "materials.marble.relative_permittivity = "),
-        ({"materials__marble__thickness": -1.0}, "thickness"),
-        ({"materials__marble__thickness": float("inf")}, "thickness"),
-        ({"offsets_db__west": 1e9}, "offsets_db.west = 1000000000.0: must be at most 500"),
-        ({"offsets_db__west": None}, "offsets_db.west = None: must be a number"),
+        ({"fit__parameters": {}}, "parameters: '.*' is missing"),
         (
-            {"intervals__iron.thickness": {"standard_error": 1, "lower": 1, "upper": 2, "verdict": "x"}},
+            {"fit__parameters__marble.relative_permittivity": 99.0},
+            "materials.marble.relative_permittivity = ",
+        ),
+        ({"fit__materials__marble__thickness": -1.0}, "thickness"),
+        ({"fit__materials__marble__thickness": float("inf")}, "thickness"),
+        ({"nuisance__coefficients__offset__west": 1e9}, "offset: 1e\\+09 dB is beyond -500 to 500"),
+        ({"nuisance__coefficients__offset__west": None}, "offset.west = None: must be a number"),
+        (
+            {
+                "uncertainty__intervals__iron.thickness": {
+                    "standard_error": 1,
+                    "lower": 1,
+                    "upper": 2,
+                    "verdict": "at bound",
+                }
+            },
             "iron",
+        ),
+        (
+            {
+                "uncertainty__intervals__iron.thickness": {
+                    "standard_error": 1,
+                    "lower": 1,
+                    "upper": 2,
+                    "verdict": "x",
+                }
+            },
+            "verdict = 'x'",
         ),
         ({"version": 2}, "has version 2, need 1"),
         ({"study__version": 7}, "reads version 1"),
@@ -230,9 +254,13 @@ def test_a_scene_that_changed_since_is_noticed_before_anything_is_predicted(tmp_
     assert loaded.predict(links) == pytest.approx(result.predict(links))
     mesh = next(tmp_path.rglob("*.ply"))
     scene.write_text(scene.read_text() + "\n<!-- moved -->\n")
-    with pytest.raises(InputError, match=rf"{scene.name} changed since the calibration.*--anyway"):
+    with pytest.raises(
+        InputError, match=rf"{scene.name} changed since the calibration.*--allow-changed-inputs"
+    ):
         loaded.predict(links)
-    assert loaded.predict(links, anyway=True) == pytest.approx(result.predict(links, anyway=True))
+    assert loaded.predict(links, allow_changed_inputs=True) == pytest.approx(
+        result.predict(links, allow_changed_inputs=True)
+    )
     mesh.write_bytes(mesh.read_bytes().replace(b"comment", b"Comment") + b" ")
     with pytest.raises(InputError, match=mesh.name):
         loaded.predict(links)

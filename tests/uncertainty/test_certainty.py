@@ -10,8 +10,8 @@ import pytest
 
 import planted
 from calibray import engines
-from calibray.calibration import calibrate
-from calibray.calibration.outcome import UNJUDGED
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.fitting.minima import BASINS
 from calibray.fitting.problem import Problem
@@ -19,7 +19,9 @@ from calibray.fitting.search import search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
-from calibray.result import Result, tables
+from calibray.reporting import result_tables as tables
+from calibray.result.held_out import Model
+from calibray.result.wording import NOT_JUDGED, reason_text
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import PLACE, certainty
@@ -27,7 +29,6 @@ from calibray.uncertainty.importance_sampling import sample
 from calibray.uncertainty.likelihood import Explaining
 from calibray.validation import variants as twins
 from calibray.validation.validate import validated
-from calibray.validation.validation import CALIBRATED, LAW
 
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
@@ -63,7 +64,7 @@ def result(tmp_path_factory, noisy) -> Result:
 
 
 def test_intervals_come_from_draws_and_say_why(result):
-    assert result.profile_calls > 100
+    assert result.cost.uncertainty_replays > 100
     for name, found in result.intervals.items():
         assert (
             found.pieces[0][0] == found.lower <= result.parameters[name] <= found.upper == found.pieces[-1][1]
@@ -71,8 +72,8 @@ def test_intervals_come_from_draws_and_say_why(result):
         assert found.reason
     assert result.intervals[MARBLE].lower <= planted.TRUTH[MARBLE] <= result.intervals[MARBLE].upper
     text = render(*tables.tables(result))
-    assert result.intervals[MARBLE].reason in text
-    assert f"{result.profile_calls:,} in" in text
+    assert reason_text(result.intervals[MARBLE].reason) in text
+    assert f"{result.cost.uncertainty_replays:,} in" in text
 
 
 def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp_path, noisy, monkeypatch):
@@ -94,7 +95,7 @@ def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp
 
 def test_draws_explain_the_links_about_as_well(result):
     names = list(result.parameters)
-    points = np.stack([result.draws[name] for name in names], axis=1)
+    points = np.stack([result.uncertainty.draws[name] for name in names], axis=1)
     measured = result.links.measured_db.to_numpy()
     rmse = np.sqrt(np.mean((planted.engine().path_loss(points) - measured) ** 2, axis=1))
     # A search from few points may miss the lowest minimum by a little, which draws then find.
@@ -105,14 +106,16 @@ def test_draws_explain_the_links_about_as_well(result):
 def test_an_offset_that_is_not_declared_is_said_aloud(tmp_path, noisy, result):
     offset = 8.0  # 4 dB can be put on the materials: 0.66 instead of 0.58 dB is no evidence of an offset
     shifted = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset))
-    assert shifted.free_offset_db == pytest.approx(offset, abs=4 * shifted.free_offset_error_db)
-    assert any("A free offset would be +" in remark for remark in shifted.remarks)
-    assert "A free offset" in render(*tables.tables(shifted))
+    assert shifted.uncertainty.undeclared_offset_db == pytest.approx(
+        offset, abs=4 * shifted.uncertainty.undeclared_offset_error_db
+    )
+    assert any("undeclared offset of +" in remark for remark in shifted.remarks)
+    assert "undeclared offset" in render(*tables.tables(shifted))
     # Negative controls: none planted, or one declared.
-    assert abs(result.free_offset_db) < 3 * result.free_offset_error_db
-    assert not any("free offset" in remark for remark in result.remarks)
+    assert abs(result.uncertainty.undeclared_offset_db) < 3 * result.uncertainty.undeclared_offset_error_db
+    assert not any("undeclared offset" in remark for remark in result.remarks)
     declared = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset), offset={})
-    assert declared.free_offset_db is None
+    assert declared.uncertainty.undeclared_offset_db is None
 
 
 def test_a_prior_pulls_and_its_weight_is_that_of_the_noise(tmp_path, noisy, result):
@@ -137,7 +140,7 @@ def test_a_slope_is_found_reported_and_predicted_with(tmp_path, noisy):
     table = noisy.assign(path_loss_db=planted.path_loss() + 9.0 * np.log10(distance), level=np.arange(12.0))
     sections = {"offset": {}, "nuisance": {"clutter": {"by": "log_distance"}}}
     found = run(tmp_path, table, **sections)
-    assert found.nuisances["clutter"][""] == pytest.approx(9.0, abs=0.1)
+    assert found.nuisance.coefficients["clutter"][""] == pytest.approx(9.0, abs=0.1)
     assert found.parameters == pytest.approx(planted.TRUTH, rel=0.05)
     found.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
@@ -185,7 +188,7 @@ def validation(folder, table, **sections):
 
 def test_calibration_helps_where_its_truth_was_planted(tmp_path, noisy):
     found = validation(tmp_path, noisy)
-    assert found.table.loc[CALIBRATED, "rmse_db"] < found.table.loc[LAW, "rmse_db"]
+    assert found.table.loc[Model.CALIBRATED, "rmse_db"] < found.table.loc[Model.LOG_DISTANCE, "rmse_db"]
     assert "did not help" not in found.sentence
     assert found.best.startswith("calibrated")
 
@@ -202,7 +205,7 @@ def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
 def test_beside_known_minima_other_searches_are_soon_given_up(tmp_path, noisy, monkeypatch):
     """The same models, for fewer replays."""
     problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
-    known = {CALIBRATED: twins.minima(problem, np.zeros((0, 3)), 64)}
+    known = {Model.CALIBRATED: twins.minima(problem, np.zeros((0, 3)), 64)}
 
     def judged():
         before = problem.engine.calls
@@ -220,15 +223,15 @@ def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
     found = run(tmp_path, noisy, holdout={"by": "half"})
     assert not found.links.held_out.any()
     assert found.holdout_rmse_db > found.rmse_db
-    assert found.residual_basis == "2 blocks held out in turn"
-    assert found.residual_db == pytest.approx(found.holdout_rmse_db)
+    assert found.accuracy.residual_basis == "2 blocks held out in turn"
+    assert found.accuracy.residual_db == pytest.approx(found.holdout_rmse_db)
     assert any(remark.startswith("Calibration ") for remark in found.remarks)
-    assert found.chosen.name.startswith("calibrated")
+    assert found.prediction.model.name.startswith("calibrated")
 
 
 def test_a_run_that_nothing_judges_says_how_to_have_it_judged(result, tmp_path, noisy):
-    assert UNJUDGED in result.remarks
-    assert UNJUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
+    assert NOT_JUDGED in result.remarks
+    assert NOT_JUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
 
 
 def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noisy):
@@ -237,9 +240,9 @@ def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noi
     noise = 0.5 * np.random.default_rng(5).standard_normal(12)
     table = noisy.assign(path_loss_db=30 + 35 * np.log10(distance) + noise)
     law = run(tmp_path, table, holdout={"blocks": 3})
-    assert law.chosen.name == LAW
-    assert law.chosen.parameters is None
-    assert any("Predictions go by the model 'log-distance'" in remark for remark in law.remarks)
+    assert law.prediction.model.name == Model.LOG_DISTANCE
+    assert law.prediction.model.parameters is None
+    assert any("Predictions use the model 'log-distance'" in remark for remark in law.remarks)
     told = law.predict_interval(planted.links())
     assert told.path_loss_db.to_numpy() == pytest.approx(30 + 35 * np.log10(distance), abs=1.0)
     assert told.path_loss_db.to_numpy() == pytest.approx(law.predict(planted.links()))
@@ -247,7 +250,7 @@ def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noi
     assert "log-distance, errors on 3 blocks" in told.basis[0]
     law.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
-    assert loaded.chosen == law.chosen
+    assert loaded.prediction.model == law.prediction.model
     assert loaded.predict_interval(planted.links()).equals(told)
 
 
@@ -258,7 +261,7 @@ def test_prediction_tells_how_sure_it_is(tmp_path, noisy, result):
     assert ((table.lower_db < truth) & (truth < table.upper_db)).mean() > 0.8
     wider = result.predict_interval(planted.links(), 0.99)
     assert (wider.upper_db > table.upper_db).all()
-    assert set(table.basis) == {"errors of 12 links calibrated on"}
+    assert set(table.basis) == {"errors of 12 calibration links"}
     blocked = result.predict_interval(planted.links(blocked=True))
     assert blocked.basis[planted.INSIDE] == "no path"
     assert np.isnan(blocked.lower_db[planted.INSIDE])

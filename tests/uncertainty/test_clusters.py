@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from calibray.result.wording import reason_text
 from calibray.uncertainty.importance_sampling import Draws
 from calibray.uncertainty.indirect_inference import Leaning, following, means_behind, overstated, spreads
 from calibray.uncertainty.noise_models import DIFFERING, NoiseModel, noise_models
@@ -208,7 +209,7 @@ def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():
         return verdicts(draws, lambda points: points * 50.0, ["walls"], *ends, 3.0, seen=lean)[0]
 
     assert told(means, seen).name == "weakly identified"
-    assert "buildings that were seen" in told(means, seen).reason
+    assert "buildings that were measured" in reason_text(told(means, seen).reason)
     assert told(means, seen).pieces == told(means, None).pieces
     assert told(means, None).name == "not identifiable"
     assert told(means, means).name == "not identifiable"

@@ -10,14 +10,16 @@ import pytest
 
 import planted
 import programs
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, VectorSurrogate
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.discrepancy import Seen
 from calibray.optimizers.multifidelity.sampled_functions import drawn, surprise
-from calibray.result import Result, tables
+from calibray.reporting import result_tables as tables
+from calibray.result.wording import reason_text
 from calibray.study import Setup, Study
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
@@ -122,7 +124,10 @@ def test_an_engine_that_can_only_be_called_gets_intervals_that_hold_the_truth(as
     result.save(tmp_path)
     loaded = Result.load(tmp_path)
     assert loaded.intervals == result.intervals
-    assert json.loads((tmp_path / "result.json").read_text())["intervals"][name]["approximate"] is True
+    assert (
+        json.loads((tmp_path / "result.json").read_text())["uncertainty"]["intervals"][name]["approximate"]
+        is True
+    )
     told = render(*tables.tables(loaded))
     assert ", approximate" in told
     assert "Intervals are approximate: the engine 'command' gives no derivatives, so 31 of its calls" in told
@@ -136,4 +141,4 @@ def test_calls_too_few_to_tell_anything_leave_the_whole_range(asked):
         assert [found.lower, found.upper] == planted.BOUNDS
         assert found.verdict == "not identifiable"
         assert found.approximate, name
-        assert found.reason.startswith("3 calls of the engine are too few")
+        assert reason_text(found.reason).startswith("3 calls of the engine are too few")

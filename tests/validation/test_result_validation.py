@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.report.page import page
-from calibray.report.trust_figures import examined
-from calibray.report.wording import summary
-from calibray.result.validation import FILE, read_validation, write_validation
-from calibray.validation.validation import BEFORE, CALIBRATED, LAW, Validation
+from calibray.reporting.page import page
+from calibray.reporting.trust_figures import examined
+from calibray.reporting.wording import summary
+from calibray.result.files import VALIDATION_FILE, read_validation, write_validation
+from calibray.result.held_out import Model
+from calibray.validation.validation import Validation
 from made_up_report import made_up
 
 LINKS = 60
@@ -25,16 +26,18 @@ def validation() -> Validation:
     random = np.random.default_rng(0)
     block = np.where(np.arange(LINKS) < 5, -1, np.arange(LINKS) % 3)
     errors = {
-        name: size * random.standard_normal(LINKS) for name, size in ((BEFORE, 6), (CALIBRATED, 2), (LAW, 8))
+        name: size * random.standard_normal(LINKS)
+        for name, size in ((Model.INITIAL, 6), (Model.CALIBRATED, 2), (Model.LOG_DISTANCE, 8))
     }
-    errors[LAW][:5] = np.nan
+    errors[Model.LOG_DISTANCE][:5] = np.nan
     return Validation(("west", "<b>", "east"), block, errors, random.uniform(0, 300, (LINKS, 3)))
 
 
 def test_what_is_written_is_read(validation, tmp_path):
-    write_validation(validation, tmp_path)
-    found = read_validation(tmp_path, LINKS)
-    assert found is not None
+    write_validation(validation, tmp_path, validation.content())
+    errors = read_validation(tmp_path, LINKS)
+    assert errors is not None
+    found = Validation.of(errors)
     assert found.table.to_numpy() == pytest.approx(validation.table.to_numpy(), abs=1e-3)
     assert found.sentence == validation.sentence
     assert found.labels == validation.labels
@@ -47,24 +50,24 @@ def test_what_is_written_is_read(validation, tmp_path):
         (lambda content: content.update(version=9), "version 9"),
         (lambda content: content["links"]["block"].pop(), "block is not of the result's 60 links"),
         (lambda content: content["links"].update(block=[7] * LINKS), "blocks or positions"),
-        (lambda content: content["links"]["errors_db"][CALIBRATED].__setitem__(20, None), "is missing"),
+        (lambda content: content["links"]["errors_db"][Model.CALIBRATED].__setitem__(20, None), "is missing"),
         (lambda content: content["links"].update(errors_db={}), "is no validation"),
         (lambda content: content.pop("links"), "is no validation"),
         (lambda content: content.update(links=[]), "is no validation"),
     ],
 )
 def test_a_damaged_one_is_refused(validation, tmp_path, change, words):
-    write_validation(validation, tmp_path)
-    content = json.loads((tmp_path / FILE).read_text())
+    write_validation(validation, tmp_path, validation.content())
+    content = json.loads((tmp_path / VALIDATION_FILE).read_text())
     change(content)
-    (tmp_path / FILE).write_text(json.dumps(content))
+    (tmp_path / VALIDATION_FILE).write_text(json.dumps(content))
     with pytest.raises(InputError, match=words):
         read_validation(tmp_path, LINKS)
 
 
 def test_the_report_shows_it(validation):
     result, shown = made_up(LINKS, 12)
-    result = replace(result, validation=validation)
+    result = replace(result, held_out=validation)
     figures = examined(result)
     assert {"held-out-errors", "held-out-blocks"} <= set(figures)
     text = page(result, shown, figures)
@@ -76,13 +79,13 @@ def test_the_report_shows_it(validation):
     helped = next(part for part in summary(result) if part.heading.startswith("Did it help"))
     assert validation.sentence in helped.text
     assert helped.kind == "good"
-    assert "calibray validate STUDY" in page(replace(result, validation=None), shown, {})
+    assert "calibray validate STUDY" in page(replace(result, held_out=None), shown, {})
 
 
 def test_saving_a_result_leaves_none_of_an_earlier_one(validation, tmp_path: Path):
-    write_validation(validation, tmp_path)
+    write_validation(validation, tmp_path, validation.content())
     result, _ = made_up(LINKS, 12)
-    replace(result, validation=None).save(tmp_path)
-    assert not (tmp_path / FILE).exists()
-    replace(result, validation=validation).save(tmp_path)
-    assert (tmp_path / FILE).exists()
+    replace(result, held_out=None).save(tmp_path)
+    assert not (tmp_path / VALIDATION_FILE).exists()
+    replace(result, held_out=validation).save(tmp_path)
+    assert (tmp_path / VALIDATION_FILE).exists()

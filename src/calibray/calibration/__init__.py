@@ -1,5 +1,1 @@
-"""Calibration: the one loop around an engine, and what it needs and leaves behind."""
-
-from calibray.calibration.calibrate import calibrate
-
-__all__ = ["calibrate"]
+"""Calibration: the story from a study to its result."""

@@ -1,4 +1,4 @@
-"""Calibrate a study: open it, search, trace again, and tell what was found."""
+"""Calibrate a study: open it, search, trace again, assess, validate, and assemble the result."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.outcome import outcome
+from calibray.calibration.outcome import Timing, outcome
+from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
@@ -18,7 +19,8 @@ from calibray.fitting.noise_floor import heard
 from calibray.fitting.noise_level import weighed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
-from calibray.result import FILES, Result
+from calibray.result.files import FILES
+from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.support.interruption import ensure_interruption, unwrap_interruption
 from calibray.support.output_files import check_outputs
@@ -27,14 +29,13 @@ from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.validate import check_engine, validated
-from calibray.validation.validation import CALIBRATED
 from calibray.validation.variants import NOTHING
 
-FEW: Final = 2
-"""Minima of a method that kept its best alone."""
+FEW_MINIMA: Final = 2
+"""Minima that a method without multi-start keeps: not enough to start a validation from."""
 
 
-# Cut short, an import leaves modules half-made, and what fails then knows nothing of Ctrl-C.
+# An interrupted import leaves modules half-made, and errors that follow from that hide the Ctrl-C.
 @ensure_interruption()
 @unwrap_interruption()
 def calibrate(
@@ -44,11 +45,11 @@ def calibrate(
     out: str | Path | None = None,
     *,
     engine: Engine | None = None,
-    executor: Workers | None = None,
+    workers: Workers | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
     overwrite: bool = False,
-    cheap: Study | Setup | None = None,
+    cheap_model: Study | Setup | None = None,
 ) -> Result:
     """Calibrate a scene's materials against measurements.
 
@@ -56,16 +57,16 @@ def calibrate(
         study: The study, opened or not.
         method: Method in place of the study's: "auto", "sgwo-im", "gwo", ...
         seed: Seed in place of the study's.
-        out: Folder to save the result in; checked before anything is computed. The ledger of RT calls lies there,
-            and a run that was killed repeats none of them when it is started again.
+        out: Folder to save the result in; checked before anything is computed. The ledger of RT calls is kept there,
+            so that a run that was killed repeats none of them when it is started again.
         engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
-        executor: Run the calls of a batch on the engine "command", or keep chunks of links on "replay"
-            (`engines.open_workers`).
+        workers: What runs the calls of a batch on the engine "command", or holds chunks of links on the engine
+            "replay"; see `engines`.
         progress: Called as the work goes on.
+        tracer: Opens the scene in a ray tracer; an opened study brings its own.
         overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
-        tracer: What opens the scene in a ray tracer; a study that is open brings its own.
-        cheap: A study of the same links and materials, whose replay is the cheap model of an engine that can only be
-            called; the study itself if None.
+        cheap_model: A study of the same links and materials whose replay is the cheap model of an expensive engine;
+            the study itself if None.
 
     Returns:
         The result.
@@ -74,38 +75,38 @@ def calibrate(
         InputError: Something in the study, the method or the folder cannot be used.
         EngineError: The engine failed.
     """
-    given = study.replace(method=method, seed=seed)
-    plan, setup = (given.study, given) if isinstance(given, Setup) else (given, None)
+    replaced = study.replace(method=method, seed=seed)
+    plan, setup = (replaced.study, replaced) if isinstance(replaced, Setup) else (replaced, None)
     check_method(plan.method.name)
     if out is not None:
         check_outputs(out, FILES, plan.files(), overwrite)
-    in_turn = plan.holdout is not None and plan.holdout.where is None
-    if in_turn:
+    by_blocks = plan.holdout is not None and plan.holdout.where is None
+    if by_blocks:
         check_engine(plan)
     started = time.perf_counter()
-    looked_for = setup is not None
+    can_trace = setup is not None
     setup = setup or Setup.open(plan, tracer)
     if engine is None:
         check_fit(setup)
         ledger = None if out is None else Path(out) / LEDGER_FILE
-        engine = engines.make(setup, None, progress, ledger, executor)
-        looked_for = True
+        engine = engines.make(setup, None, progress, ledger, workers)
+        can_trace = True
     problem = Problem.of(setup, engine)
-    # Before anything is calibrated on them; a ready engine may stand where no ray tracer can be loaded.
-    enclosed = setup.enclosed if looked_for else None
+    # With an engine that is handed in, there may be no ray tracer on this machine to look for enclosed antennas.
+    enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = weighed(heard(problem, progress), progress)
     paused = time.perf_counter()
-    helper = aid(problem, progress, None if cheap is None else cheap.opened())
+    cheap = aid(problem, progress, None if cheap_model is None else cheap_model.opened())
     traced += time.perf_counter() - paused
-    trail = search(problem, choose(problem, helper.model), progress)
+    trail = search(problem, choose(problem, cheap.model), progress)
     problem, trail, gap = settle(problem, trail, progress)
-    seconds = time.perf_counter() - traced
-    told = certainty(problem, trail, progress, helper.model)
-    known = {CALIBRATED: trail.minima} if len(trail.minima) > FEW else NOTHING
-    judged = validated(problem, progress=progress, known=known) if in_turn else None
-    result = outcome(problem, trail, gap, told, judged, enclosed, seconds, traced - started, helper)
+    timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
+    assessment = certainty(problem, trail, progress, cheap.model)
+    minima = {Model.CALIBRATED: trail.minima} if len(trail.minima) > FEW_MINIMA else NOTHING
+    validation = validated(problem, progress=progress, known=minima) if by_blocks else None
+    result = outcome(problem, trail, gap, assessment, validation, enclosed, timing, cheap)
     if out is not None:
-        # Asked before the work: what was computed is not lost to a file that came in the meantime.
+        # The folder was checked before the work: a file that appeared since must not cost the result.
         result.save(out, overwrite=True)
     return result

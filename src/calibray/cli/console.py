@@ -32,10 +32,10 @@ Overwrite = Annotated[
 ]
 """Whether output may take the place of a user's file; an input is never replaced."""
 
-Anyway = Annotated[
+AllowChangedInputs = Annotated[
     bool,
     typer.Option(
-        "--anyway", help="Go on although a file of the result, the scene or an antenna changed since."
+        "--allow-changed-inputs", help="Go on although a file of the result, the scene or an antenna changed."
     ),
 ]
 """Whether a result is used although what it was calibrated with changed."""

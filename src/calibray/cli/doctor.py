@@ -42,7 +42,7 @@ def _machine() -> None:
     """Examine the machine."""
     from calibray.cli.progress_bars import progress_bars
     from calibray.doctor import examine
-    from calibray.report.doctor_table import table
+    from calibray.reporting.doctor_table import table
     from calibray.tables.text import render
 
     with progress_bars(log()) as progress:
@@ -58,7 +58,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.report import scene_tables as report
+        from calibray.reporting import scene_tables as report
         from calibray.scenes.checks import check_scene
         from calibray.study import Study
         from calibray.tables.text import render
@@ -77,7 +77,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
 
 def _draw(study: Study, plot: Path, overwrite: bool) -> None:
     """Draw a study's antennas over its scene."""
-    from calibray.report.scene_tables import save_positions
+    from calibray.reporting.scene_tables import save_positions
 
     links = study.measurements()
     save_positions(plot, study.scene_source, links.tx, links.rx, study.files(), overwrite)

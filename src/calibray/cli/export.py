@@ -24,8 +24,8 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
-    from calibray.report.export import export as write
-    from calibray.result import Result
+    from calibray.calibration.result import Result
+    from calibray.reporting.export import export as write
 
     names = write(Result.load(folder), out, copy, overwrite)
     typer.echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -49,7 +49,7 @@ def init(
     inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
-        from calibray.report.scene_tables import assumed, save_positions
+        from calibray.reporting.scene_tables import assumed, save_positions
         from calibray.study.draft import draft
         from calibray.study.draft_text import SCHEMA_FILE
         from calibray.study.schema import schema_text

@@ -30,7 +30,7 @@ def ledger(
     from contextlib import closing
 
     from calibray.engines import open_ledger
-    from calibray.report.ledger_table import calls
+    from calibray.reporting.ledger_table import calls
     from calibray.support.output_files import check_table, write_table
     from calibray.tables.text import render
 

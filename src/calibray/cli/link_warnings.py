@@ -25,7 +25,7 @@ def warn(study: Study, links: Measurements) -> None:
     """
     from importlib.util import find_spec
 
-    from calibray.report.scene_tables import warned
+    from calibray.reporting.scene_tables import warned
     from calibray.study.link_checks import examine
 
     if missing := [name for name in ("shapely", "trimesh") if find_spec(name) is None]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 
@@ -64,7 +64,7 @@ def map(
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    anyway: Anyway = False,
+    allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""
@@ -74,13 +74,13 @@ def map(
     with progress_bars(log()) as progress:
         import numpy as np
 
+        from calibray.calibration.result import Result
         from calibray.engines import open_workers
         from calibray.prediction.coverage_map import coverage_map
-        from calibray.report.map_files import FILES, save_map
-        from calibray.result import Result
+        from calibray.prediction.map_files import FILES
         from calibray.support.output_files import check_outputs
 
-        result = Result.load(folder, anyway=anyway)
+        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         inputs = result.study.files()
         # Before anything is traced.
         check_outputs(target, FILES, inputs, overwrite)
@@ -96,11 +96,11 @@ def map(
                 samples=None if samples is None else _samples(samples),
                 columns=_columns(column or []),
                 progress=progress,
-                crew=crew,
-                anyway=anyway,
+                workers=crew,
+                allow_changed_inputs=allow_changed_inputs,
             )
         progress("writing", 0, None)
-        names = save_map(coverage, target, inputs, overwrite)
+        names = coverage.save(target, inputs, overwrite)
     reached = np.isfinite(coverage.path_loss_db)
     typer.echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
     if len(names) < len(FILES):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Anyway, Overwrite, Scheduler, Workers, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def predict(
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    anyway: Anyway = False,
+    allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict path loss at links that were never measured, with the calibrated scene."""
@@ -68,15 +68,15 @@ def predict(
         import numpy as np
         import pandas as pd
 
+        from calibray.calibration.result import Result
         from calibray.engines import open_workers
         from calibray.measurements import PiecedTable
         from calibray.prediction.batches import predicted_in_pieces
         from calibray.prediction.predict import as_links
         from calibray.prediction.quantity import as_measured
-        from calibray.result import Result
         from calibray.support.output_files import check_table, growing_table
 
-        result = Result.load(folder, anyway=anyway)
+        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))
         names = PREDICTED[: 1 if level is None else None]
@@ -89,7 +89,9 @@ def predict(
             open_workers(workers, scheduler) as crew,
             _printed() if out is None else growing_table(out) as append,
         ):
-            for links, told in predicted_in_pieces(result, table, level, progress, crew, anyway=anyway):
+            for links, told in predicted_in_pieces(
+                result, table, level, progress, crew, allow_changed_inputs=allow_changed_inputs
+            ):
                 own = as_measured(study, links, told)
                 columns = {
                     name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))

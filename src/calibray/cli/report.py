@@ -27,9 +27,9 @@ def report(
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.report.page import FIGURES, FILE
-        from calibray.report.page import report as write
-        from calibray.result import Result
+        from calibray.calibration.result import Result
+        from calibray.reporting.page import FIGURES, FILE
+        from calibray.reporting.page import report as write
 
         result = Result.load(folder)
         pictures = folder / FIGURES if figures else None

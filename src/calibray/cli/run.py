@@ -11,7 +11,7 @@ import typer
 from calibray.cli.console import Overwrite, StudyFile, log
 
 if TYPE_CHECKING:
-    from calibray.result import Result
+    from calibray.calibration.result import Result
 
 
 def run(
@@ -54,11 +54,12 @@ def run(
     try:
         # Loading libraries, tables and the scene takes seconds too.
         with progress_bars(log()) as progress:
-            from calibray.calibration import calibrate
+            from calibray.calibration.calibrate import calibrate
             from calibray.cli.link_warnings import warn
             from calibray.engines import open_workers
             from calibray.fitting.methods import check_method
-            from calibray.result import FILES, tables
+            from calibray.reporting import result_tables as tables
+            from calibray.result import FILES
             from calibray.study import Study
             from calibray.support.output_files import check_outputs
             from calibray.tables.text import render
@@ -68,8 +69,8 @@ def run(
             check_outputs(out, FILES, study.files(), overwrite)
             setup = study.opened()
             warn(study, setup.links)
-            with open_workers(workers, scheduler) as executor:
-                result = calibrate(setup, out=out, executor=executor, progress=progress, overwrite=overwrite)
+            with open_workers(workers, scheduler) as pool:
+                result = calibrate(setup, out=out, workers=pool, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
         typer.echo(_kept(out), err=True)
         raise
@@ -105,7 +106,7 @@ def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list
     from calibray.cli.progress_bars import progress_bars
 
     try:
-        from calibray.report import page
+        from calibray.reporting import page
 
         folder = out / page.FIGURES if figures else None
         with progress_bars(log()) as progress:

@@ -176,7 +176,7 @@ def plan(
 
 def _tell(made: MadeScene) -> None:
     """Print what was made."""
-    from calibray.report import scene_tables as report
+    from calibray.reporting import scene_tables as report
     from calibray.tables.text import render
 
     typer.echo(render(report.made(made)))

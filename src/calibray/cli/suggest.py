@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Anyway, Overwrite, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, log
 
 
 def suggest(
@@ -28,27 +28,27 @@ def suggest(
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="CSV or Parquet file to write as well.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    anyway: Anyway = False,
+    allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.measurements import read_table
+        from calibray.calibration.result import Result
+        from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import shown
         from calibray.prediction.suggestion import suggest as find
-        from calibray.result import Result
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
-        result = Result.load(folder, anyway=anyway)
+        result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study = result.study
         links = as_links(result, read_table(candidates_file))
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
-        found = find(result, links, count, progress, anyway=anyway)
+        found = find(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
     typer.echo(json.dumps(found.to_dict("records"), indent=2) if as_json else render(*shown(found)))
     if out is not None:
         write_table(out, found)

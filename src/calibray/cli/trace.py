@@ -41,7 +41,7 @@ def trace(
         from calibray.engines import open_workers
         from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks
         from calibray.engines.cluster.workers import InProcess
-        from calibray.report import trace_tables as report
+        from calibray.reporting import trace_tables as report
         from calibray.study import Study
         from calibray.support.output_files import check_file
         from calibray.tables.text import render

@@ -47,7 +47,7 @@ def validate(
 
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
-        from calibray.result.validation import FILE, write_validation
+        from calibray.result.files import VALIDATION_FILE, write_validation
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
@@ -55,11 +55,11 @@ def validate(
 
         study = Study.load(study_file)
         if out is not None:
-            check_outputs(out, (FILE,), study.files(), overwrite)
+            check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
         with open_workers(workers, scheduler) as crew:
-            found = judge(study, blocks=blocks, by=by, crew=crew, progress=progress)
+            found = judge(study, blocks=blocks, by=by, workers=crew, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_validation(found, out)
-        typer.echo(f"Written to {out / FILE}", err=True)
+        write_validation(found, out, found.content())
+        typer.echo(f"Written to {out / VALIDATION_FILE}", err=True)

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibray.optimizers.labels import label
-from calibray.report.style import COLORS, PALETTE, logarithmic, plain_figure, styled
-from calibray.report.style import write as write_figure
+from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
+from calibray.support.figure_style import write as write_figure
 from calibray.support.output_files import write_table
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from calibray.comparison.experiment import METHODS
-from calibray.report import figures, style
+from calibray.reporting import figures
+from calibray.support import figure_style as style
 from calibray.support.output_files import write_text
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from calibray import engines
-from calibray.calibration import calibrate
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
 from calibray.comparison.paper_tables import summary
 from calibray.optimizers.labels import label
-from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress, with_stage
@@ -145,4 +145,4 @@ def _mapped(setup: Setup, seed: int, progress: Progress | None) -> Result:
             {"trace": content["trace"] | {"max_depth": CHEAP_DEPTH}},
         )
     )
-    return calibrate(dear, cheap=cheap, progress=progress)
+    return calibrate(dear, cheap_model=cheap, progress=progress)

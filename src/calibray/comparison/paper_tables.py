@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calibray.optimizers.labels import label
-from calibray.result.tables import ends_text
+from calibray.result.wording import interval_text
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def cost(demo: Demo) -> Table:
         (
             label(method),
             str(result.rt_calls),
-            f"{result.seconds:.2f}",
+            f"{result.cost.seconds:.2f}",
             *_paper(demo, method, "rt_calls", "seconds"),
         )
         for method, result in demo.results.items()
@@ -67,7 +67,7 @@ def permittivity(demo: Demo) -> Table:
     )
     first = next(iter(demo.results.values()))
     rows = []
-    for parameter, before in first.initial_parameters.items():
+    for parameter, before in first.fit.initial_parameters.items():
         material = parameter.split(".")[0]
         found = (result.parameters[parameter] for result in demo.results.values())
         planted = demo.truth[material]
@@ -113,7 +113,7 @@ def trust(demo: Demo) -> Table:
     *_, auto = demo.results.values()
     columns = (Column("parameter"), numbers("value"), numbers("95 % interval"), Column("verdict"))
     rows = tuple(
-        (name, f"{auto.parameters[name]:.2f}", ends_text(found), found.told)
+        (name, f"{auto.parameters[name]:.2f}", interval_text(found), found.label)
         for name, found in auto.intervals.items()
     )
     return Table("How far to trust auto's answer", columns, rows)

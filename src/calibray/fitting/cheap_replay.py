@@ -23,6 +23,7 @@ from calibray.materials import Material
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, Constants
 from calibray.parameters import Parameter, Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.result.remark import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress
 
@@ -197,7 +198,7 @@ class Aid:
     """
 
     model: ReplayedModel | None = None
-    remark: str = ""
+    remark: Remark | None = None
 
 
 def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None = None) -> Aid:
@@ -224,10 +225,14 @@ def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None 
         model = ReplayedModel(engine, len(problem.parameters), ProblemRows(problem))
     except (InputError, EngineError, ImportError) as error:
         reason = " ".join(str(error).split())
-        return Aid(remark=f"No cheap model, as the scene cannot be traced here ({reason}).")
+        return Aid(None, _no_model(f"the scene cannot be traced here ({reason})"))
     if not model.known.any():
-        return Aid(remark="No cheap model, as the trace of the scene reaches none of the links.")
+        return Aid(None, _no_model("the trace of the scene reaches none of the links"))
     return Aid(model)
+
+
+def _no_model(cause: str) -> Remark:
+    return Remark(RemarkKind.NO_CHEAP_MODEL, {"cause": cause})
 
 
 def with_constants(

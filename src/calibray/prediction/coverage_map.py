@@ -7,87 +7,58 @@ a sum of paths by more than 0.05 dB, 10 % by more than 0.7 dB (`python benchmark
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal
+from pathlib import Path
+from typing import Final, Literal, final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.coordinates import Frame
 from calibray.engines.cluster.workers import Workers
 from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import piece_size, predicted
+from calibray.prediction.map_files import save_map
 from calibray.prediction.predict import as_links, opened
+from calibray.prediction.predicted_grid import PredictedGrid
+from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.study import Study
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total
 
-if TYPE_CHECKING:
-    from calibray.result import Result
-
 MOST_CELLS: Final = 1_000_000
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class CoverageMap:
-    """Path loss, or received power, over a grid of square cells.
+class CoverageMap(PredictedGrid):
+    """Path loss, or received power, over a grid of square cells; `PredictedGrid` lists the attributes."""
 
-    Attributes:
-        tx: Position of the transmitter [3], [m].
-        height: Height of the receivers over the ground [m].
-        cell: Width of the cells [m].
-        x: Eastings of the cells' middles, ascending [nx], [m].
-        y: Northings, ascending [ny], [m].
-        z: Heights of the receivers [ny, nx], [m].
-        path_loss_db: Path loss, offsets included [ny, nx], [dB]; +inf where no path leads, NaN at the transmitter.
-        lower_db: Lower end of the interval [ny, nx], [dB]; NaN where no path leads, or without a level.
-        upper_db: Upper end [ny, nx], [dB].
-        level: Probability that a measurement lies within; None where it was not asked for.
-        power_dbm: Transmitted power [dBm] of a map of received power; None for path loss.
-        frame: Where the scene lies on the globe; None where nothing tells.
-        triangles: The scene, for drawing.
-    """
+    def save(
+        self, folder: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False
+    ) -> tuple[str, ...]:
+        """Write the map as GeoTIFF, picture and table.
 
-    tx: NDArray[np.float64]
-    height: float
-    cell: float
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    z: NDArray[np.float64]
-    path_loss_db: NDArray[np.float64]
-    lower_db: NDArray[np.float64]
-    upper_db: NDArray[np.float64]
-    level: float | None
-    power_dbm: float | None
-    frame: Frame | None
-    triangles: Triangles
+        Args:
+            folder: Folder to write `map.tif`, `map.png` and `map.csv` into; made if absent.
+            inputs: Files that the work reads; none of them is ever replaced.
+            overwrite: Replace files that Calibray did not write.
 
-    @property
-    def layers(self) -> dict[str, NDArray[np.float64]]:
-        """What is shown and its interval by name, each [ny, nx]: path loss [dB], or received power [dBm]."""
-        if self.power_dbm is None:
-            value, ends = "path_loss_db", {"lower_db": self.lower_db, "upper_db": self.upper_db}
-            best = self.path_loss_db
-        else:
-            # More loss is less power: the ends change places.
-            value, best = "received_power_dbm", self.power_dbm - self.path_loss_db
-            ends = {"lower_dbm": self.power_dbm - self.upper_db, "upper_dbm": self.power_dbm - self.lower_db}
-        return {value: best, **({} if self.level is None else ends)}
+        Returns:
+            Names of the files; without rasterio the GeoTIFF is not among them.
 
-    def table(self) -> pd.DataFrame:
-        """One row per cell, from south to north and west to east: x_m, y_m, z_m and the layers."""
-        x, y = np.meshgrid(self.x, self.y)
-        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers}
-        return pd.DataFrame({name: values.reshape(-1) for name, values in columns.items()})
+        Raises:
+            InputError: The folder cannot be written, or a file there must not be replaced.
+        """
+        return save_map(self, folder, inputs, overwrite)
 
 
 def coverage_map(
-    result: Result,
+    result: Record,
     tx: Sequence[float] | None = None,
     *,
     height: float = 1.5,
@@ -98,8 +69,8 @@ def coverage_map(
     samples: int | Literal["auto"] | None = None,
     columns: Mapping[str, object] | None = None,
     progress: Progress | None = None,
-    crew: Workers | None = None,
-    anyway: bool = False,
+    workers: Workers | None = None,
+    allow_changed_inputs: bool = False,
 ) -> CoverageMap:
     """Predict path loss over an area, with the interval that a measurement there would lie in.
 
@@ -117,15 +88,15 @@ def coverage_map(
         columns: What the study's columns of groups, carriers or nuisances hold for this transmitter, by name. The
             group of an offset is taken from the links measured there, where these have one.
         progress: Called with the stage "tracing" after every launch.
-        crew: Where blocks of cells are traced and predicted (`engines.open_workers`); here if None.
-        anyway: Predict although a file of the scene or an antenna changed since the calibration.
+        workers: Where blocks of cells are traced and predicted (`engines.open_workers`); here if None.
+        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         The map.
 
     Raises:
         InputError: An argument is impossible, a column is missing, there would be more than a million cells, or
-            `Result.predict_interval` refuses the links.
+            `Record.predict_interval` refuses the links.
         EngineError: There are more paths than fit into memory.
     """
     if samples is not None:
@@ -141,7 +112,7 @@ def coverage_map(
         _check_size("power_dbm", power_dbm, -np.inf)
     frame = known_frame(study)
     above = pd.DataFrame({**_ends(place, place[None] + np.eye(3)[2]), **held})
-    setup = opened(result, as_links(result, above), anyway=anyway)
+    setup = opened(result, as_links(result, above), allow_changed_inputs=allow_changed_inputs)
     triangles = read_triangles(setup.scene)
     x, y = _grid(triangles, bounds, cell)
     z = ground_heights(triangles, x, y) + height
@@ -149,19 +120,19 @@ def coverage_map(
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
     wanted = np.flatnonzero(np.linalg.norm(rx - place, axis=1) > MIN_DISTANCE)
     found = np.full((3, len(rx)), np.nan)
-    size = piece_size(setup, crew)
+    size = piece_size(setup, workers)
     for start in range(0, len(wanted), size):
         block = wanted[start : start + size]
         rows = pd.DataFrame({**_ends(place, rx[block]), **held})
         setup = setup.at(as_links(result, rows))
-        told = predicted(result, setup, level, with_total(progress, int(block[0]), len(rx)), crew)
+        told = predicted(result, setup, level, with_total(progress, int(block[0]), len(rx)), workers)
         for row, name in enumerate(("path_loss_db", "lower_db", "upper_db")[: 1 if level is None else 3]):
             found[row, block] = told[name]
     loss, lower, upper = found.reshape(3, *z.shape)
     return CoverageMap(place, height, cell, x, y, z, loss, lower, upper, level, power_dbm, frame, triangles)
 
 
-def _transmitter(result: Result, tx: Sequence[float] | None) -> NDArray[np.float64]:
+def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:
     """The transmitter's position, given or the only one that was measured."""
     if tx is not None:
         place = np.array(tx, dtype=float).reshape(-1)
@@ -178,13 +149,13 @@ def _transmitter(result: Result, tx: Sequence[float] | None) -> NDArray[np.float
     return known[0]
 
 
-def _with_samples(result: Result, samples: int | Literal["auto"]) -> Result:
+def _with_samples(result: Record, samples: int | Literal["auto"]) -> Record:
     content = result.study.content()
     content["trace"]["samples"] = samples
     return replace(result, study=Study.from_content(content, result.study.path))
 
 
-def _columns(result: Result, tx: NDArray[np.float64], given: Mapping[str, object]) -> dict[str, object]:
+def _columns(result: Record, tx: NDArray[np.float64], given: Mapping[str, object]) -> dict[str, object]:
     """What the study's columns hold at every link from this transmitter."""
     study, held = result.study, dict(given)
     per = study.offset.per if study.offset is not None else None

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
+from calibray.result.record import Record
 from calibray.scenes import Triangles, read_triangles
 from calibray.study import Setup
-
-if TYPE_CHECKING:
-    from calibray.result import Result
 
 BEYOND: Final = "beyond the scene"
 UNDER: Final = "under the ground"
@@ -24,7 +22,7 @@ CLEARANCE: Final = 0.05
 PLACES: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 
 
-def remarks(result: Result, setup: Setup) -> NDArray[np.str_]:
+def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
     """What is to be said of links that are predicted.
 
     Where most links of the calibration stand inside buildings themselves, as indoors, that is not worth saying.

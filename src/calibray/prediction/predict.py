@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,13 +19,11 @@ from calibray.measurements import Measurements, SourceTable
 from calibray.prediction.position_checks import PLACES, remarks
 from calibray.prediction.quantity import as_measured
 from calibray.prediction.residual_field import carried, measured_errors
+from calibray.result.prediction_model import PredictionModel
+from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
 from calibray.validation.conformal import FEW, reach
-
-if TYPE_CHECKING:
-    from calibray.result import Result
-    from calibray.result.chosen import Chosen
 
 TRANSMITTER: Final = "transmitter"
 """What a term of the model that was chosen has an offset for each of, without a column that says so."""
@@ -38,11 +36,11 @@ KnownTerm = tuple[str, NDArray[np.float64], "NDArray[np.str_] | None", dict[str,
 
 
 def predict(
-    result: Result,
+    result: Record,
     links: Measurements | pd.DataFrame,
     progress: Progress | None = None,
     *,
-    anyway: bool = False,
+    allow_changed_inputs: bool = False,
 ) -> NDArray[np.float64]:
     """Path loss at links that were never measured.
 
@@ -52,7 +50,7 @@ def predict(
             the study names for positions, and with its group column, if it has one. The study's column of
             frequencies gives the links' carriers; without it all links have the scene's.
         progress: Called with the stage "tracing" after every launch.
-        anyway: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         Path loss, offsets included [n], [dB]; +inf where no path leads.
@@ -61,16 +59,18 @@ def predict(
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
             scene or an antenna changed since the calibration.
     """
-    return _path_loss(result, opened(result, as_links(result, links), anyway=anyway), progress)
+    return _path_loss(
+        result, opened(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs), progress
+    )
 
 
-def opened(result: Result, links: Measurements, *, anyway: bool = False) -> Setup:
+def opened(result: Record, links: Measurements, *, allow_changed_inputs: bool = False) -> Setup:
     """The study of a calibration, opened for links that were never measured.
 
     Args:
         result: The calibration.
         links: The links.
-        anyway: Open it although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Open it although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         The opened study.
@@ -79,16 +79,16 @@ def opened(result: Result, links: Measurements, *, anyway: bool = False) -> Setu
         InputError: The scene or the parameters cannot be used, or such a file changed.
     """
     setup = Setup.open(result.study, links=links)
-    if not anyway:
+    if not allow_changed_inputs:
         _check_files(result, setup)
     return setup
 
 
-def _path_loss(result: Result, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
+def _path_loss(result: Record, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
     links, study = setup.links, result.study
     beside = _beside(result, links)[0]
-    if result.chosen is not None:
-        loss, shift = _chosen(result, result.chosen, setup, progress, strangers=False)
+    if result.prediction.model is not None:
+        loss, shift = _chosen(result, result.prediction.model, setup, progress, strangers=False)
         return loss + shift.value[0] + beside
     shift = _shift(_terms(result, links), links, {}).value[0] + beside
     paths = setup.trace(result.materials, progress)
@@ -99,12 +99,12 @@ def _path_loss(result: Result, setup: Setup, progress: Progress | None) -> NDArr
 
 
 def predict_interval(
-    result: Result,
+    result: Record,
     links: Measurements | pd.DataFrame,
     level: float = 0.9,
     progress: Progress | None = None,
     *,
-    anyway: bool = False,
+    allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
     """Path loss at links that were never measured, with the interval that a measurement there would lie in.
 
@@ -117,7 +117,7 @@ def predict_interval(
         links: The links, or a table, as for `predict`; groups need not have been measured.
         level: Probability that a measurement lies within.
         progress: Called with the stage "tracing" after every launch.
-        anyway: Predict although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         One row per link: path_loss_db, lower_db, upper_db, and basis, what the interval was taken from. Where no path
@@ -128,14 +128,14 @@ def predict_interval(
         InputError: What `predict` refuses but for groups, the level is not between 0 and 1, or the calibration had too
             few links to tell the size of errors.
     """
-    setup = opened(result, as_links(result, links), anyway=anyway)
+    setup = opened(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
     told = interval(result, setup, level, progress)
     own = as_measured(result.study, setup.links, told)
     return told.assign(**own, remark=remarks(result, setup))
 
 
 def interval(
-    result: Result, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
+    result: Record, setup: Setup, level: float | None = 0.9, progress: Progress | None = None
 ) -> pd.DataFrame:
     """What `predict_interval` gives, of links that are opened already.
 
@@ -157,17 +157,17 @@ def interval(
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must lie between 0 and 1, as 0.9")
     added, share = _beside(result, links)
-    if (chosen := result.chosen) is not None:
+    if (chosen := result.prediction.model) is not None:
         loss, shift = _chosen(result, chosen, setup, progress, strangers=True)
         best, variance, basis = loss + shift.value[0], shift.spread**2, chosen.basis
         size, sizes, freedom = chosen.residual_db, np.array(chosen.sizes_db), chosen.links
     else:
         size, basis, sizes = _residual(result)
-        shift = _shift(_terms(result, links), links, result.draws, strangers=True)
+        shift = _shift(_terms(result, links), links, result.uncertainty.draws, strangers=True)
         names = setup.parameters.names
         values = np.array([[result.parameters[name] for name in names]])
-        if result.draws:
-            values = np.vstack([values, np.stack([result.draws[name] for name in names], axis=1)])
+        if result.uncertainty.draws:
+            values = np.vstack([values, np.stack([result.uncertainty.draws[name] for name in names], axis=1)])
         modelled = replay(setup, setup.trace(result.materials, progress)).path_loss(values) + shift.value
         best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
         drawn = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
@@ -176,7 +176,11 @@ def interval(
         freedom = max(result.counts["calibrated_on"] - len(names), 1)
         basis += "" if len(drawn) else ", parameters as if known"
     # Beside measured links only their own part of the errors is left open.
-    own = size if result.residual_field is None else min(result.residual_field.own_db, size)
+    own = (
+        size
+        if result.prediction.residual_field is None
+        else min(result.prediction.residual_field.own_db, size)
+    )
     deviation = np.sqrt((1.0 - share) * size**2 + share * own**2 + variance)
     factor = (
         float(stdtrit(freedom, (1 + level) / 2))
@@ -197,9 +201,9 @@ def interval(
     )
 
 
-def _beside(result: Result, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _beside(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What measured links nearby add to path loss [n], [dB], and the share of their common errors known then [n]."""
-    field = result.residual_field
+    field = result.prediction.residual_field
     if field is None or links.frequency is not None or not set(PLACES) <= set(result.links):
         return np.zeros(len(links)), np.zeros(len(links))
     known, errors = measured_errors(result.links)
@@ -207,7 +211,7 @@ def _beside(result: Result, links: Measurements) -> tuple[NDArray[np.float64], N
     return carried(field, measured, errors, np.hstack([links.tx, links.rx]))
 
 
-def as_links(result: Result, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
+def as_links(result: Record, links: Measurements | pd.DataFrame | SourceTable) -> Measurements:
     """Links to predict at, of a table or rows of a file.
 
     Args:
@@ -227,7 +231,7 @@ def as_links(result: Result, links: Measurements | pd.DataFrame | SourceTable) -
     return result.study.places(links)
 
 
-def check_groups(result: Result, links: Measurements) -> None:
+def check_groups(result: Record, links: Measurements) -> None:
     """Refuse links of which a nuisance is not known, before anything is traced.
 
     Args:
@@ -237,27 +241,31 @@ def check_groups(result: Result, links: Measurements) -> None:
     Raises:
         InputError: A group has no calibrated offset, or a column is missing.
     """
-    terms = _terms(result, links) if result.chosen is None else _chosen_terms(result.chosen, links)
+    terms = (
+        _terms(result, links)
+        if result.prediction.model is None
+        else _chosen_terms(result.prediction.model, links)
+    )
     _shift(terms, links, {})
 
 
-def _residual(result: Result) -> tuple[float, str, NDArray[np.float64]]:
+def _residual(result: Record) -> tuple[float, str, NDArray[np.float64]]:
     """Standard deviation of single links' errors [dB], what it was taken from, and sizes of errors held out [k]."""
-    if result.residual_db is not None:
+    if result.accuracy.residual_db is not None:
         table, sizes = result.links, np.zeros(0)
-        if result.residual_basis.endswith("links held out"):
+        if result.accuracy.residual_basis.endswith("links held out"):
             away = np.abs(table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float))
             sizes = np.sort(away[table["held_out"].to_numpy(bool) & np.isfinite(away)])
-        return result.residual_db, f"errors of {result.residual_basis}", sizes
+        return result.accuracy.residual_db, f"errors of {result.accuracy.residual_basis}", sizes
     count = result.counts["calibrated_on"]
-    freedom = count - len(result.parameters) - len(result.offsets_db)
+    freedom = count - len(result.parameters) - len(result.nuisance.offsets_db)
     if freedom < 1:
         raise InputError(
             f"{result.study.path}: {count} links are too few to tell the size of errors; measure more, or predict "
             "without a level"
         )
     size = result.rmse_db * float(np.sqrt(count / freedom))
-    return size, f"errors of {count} links calibrated on", np.zeros(0)
+    return size, f"errors of {count} calibration links", np.zeros(0)
 
 
 class Shift(NamedTuple):
@@ -273,7 +281,7 @@ class Shift(NamedTuple):
 
 
 def _chosen(
-    result: Result, chosen: Chosen, setup: Setup, progress: Progress | None, strangers: bool
+    result: Record, chosen: PredictionModel, setup: Setup, progress: Progress | None, strangers: bool
 ) -> tuple[NDArray[np.float64], Shift]:
     """Path loss by the model that was chosen, without its nuisances [n], [dB], and these."""
     links = setup.links
@@ -287,7 +295,7 @@ def _chosen(
     return loss if ceiling is None else np.minimum(loss, ceiling), shift
 
 
-def _chosen_terms(chosen: Chosen, links: Measurements) -> Iterator[KnownTerm]:
+def _chosen_terms(chosen: PredictionModel, links: Measurements) -> Iterator[KnownTerm]:
     for term in chosen.terms:
         labels = None
         if term.per == TRANSMITTER:
@@ -323,16 +331,19 @@ def _shift(
     return Shift(value, np.sqrt(variance))
 
 
-def _terms(result: Result, links: Measurements) -> Iterator[KnownTerm]:
+def _terms(result: Record, links: Measurements) -> Iterator[KnownTerm]:
     """Name, column, labels at the links and coefficients of every nuisance."""
-    if result.offsets_db:
-        grouped = result.study.offset is not None and result.study.offset.per is not None
-        yield OFFSET, np.ones(len(links)), links.group if grouped else None, result.offsets_db
-    for name, known in result.nuisances.items():
-        section = result.study.nuisance[name]
-        labels = None if section.per is None else links.table.labels(section.per)
-        if known:
-            yield name, _column(links, section.by, result.nuisance_centres.get(name, 0.0)), labels, known
+    for name, coefficients in result.nuisance.coefficients.items():
+        if not coefficients:
+            continue
+        if name == OFFSET:
+            grouped = result.study.offset is not None and result.study.offset.per is not None
+            yield name, np.ones(len(links)), links.group if grouped else None, coefficients
+        else:
+            section = result.study.nuisance[name]
+            labels = None if section.per is None else links.table.labels(section.per)
+            centre = result.nuisance.centres.get(name, 0.0)
+            yield name, _column(links, section.by, centre), labels, coefficients
 
 
 def _column(links: Measurements, by: str, centre: float) -> NDArray[np.float64]:
@@ -341,18 +352,18 @@ def _column(links: Measurements, by: str, centre: float) -> NDArray[np.float64]:
     return (np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)) - centre
 
 
-def _check_files(result: Result, setup: Setup) -> None:
+def _check_files(result: Record, setup: Setup) -> None:
     """Refuse a scene that is not the one that was calibrated; results of the version before cannot tell."""
-    if not result.files:
+    if not result.provenance.files:
         return
     # By name, for the folder may have moved as a whole.
     before, now = (
         sorted((Path(file).name, digest) for file, digest in files.items())
-        for files in (result.files, setup.files)
+        for files in (result.provenance.files, setup.files)
     )
     changed = sorted({name for name, _ in set(before) ^ set(now)})
     if changed:
         raise InputError(
             f"{result.study.path}: {', '.join(changed[:5])} changed since the calibration, which may no longer hold; "
-            "calibrate again, or give --anyway (anyway=True)"
+            "calibrate again, or give --allow-changed-inputs (allow_changed_inputs=True)"
         )

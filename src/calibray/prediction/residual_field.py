@@ -8,7 +8,7 @@ is added, and nothing is gained.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-if TYPE_CHECKING:
-    from calibray.result.residuals import ResidualField
+from calibray.result.prediction_model import ResidualField
 
 EXACT: Final = 1000
 """Measured links up to which all of them count; of more, the nearest to each place."""

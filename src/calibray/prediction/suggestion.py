@@ -17,7 +17,7 @@ from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
 from calibray.prediction.experiment_design import FLAT, Beliefs, Errors, Outlook, certain, choose
 from calibray.prediction.predict import as_links, opened
-from calibray.result import Result
+from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers
@@ -37,12 +37,12 @@ PLACES: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 
 
 def suggest(
-    result: Result,
+    result: Record,
     candidates: Measurements | pd.DataFrame,
     count: int = 5,
     progress: Progress | None = None,
     *,
-    anyway: bool = False,
+    allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
     """Where to measure next, by how much narrower the parameters' intervals are expected to be.
 
@@ -52,10 +52,10 @@ def suggest(
 
     Args:
         result: The calibration; one on the engine "replay" or "retrace", whose draws were kept.
-        candidates: Where one could measure: links, or a table, as for `Result.predict`.
+        candidates: Where one could measure: links, or a table, as for `Record.predict`.
         count: How many to suggest.
         progress: Called with the stage "tracing" after every launch.
-        anyway: Go on although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Go on although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
@@ -65,7 +65,7 @@ def suggest(
         words as gain.
 
     Raises:
-        InputError: What `Result.predict` refuses but for groups, the calibration has no draws, or no path leads to any
+        InputError: What `Record.predict` refuses but for groups, the calibration has no draws, or no path leads to any
             candidate.
     """
     if count < 1:
@@ -76,13 +76,13 @@ def suggest(
             f"{study.path}: the engine {study.engine.name!r} answers path loss without derivatives, and suggestions "
             "need them; calibrate on the engine 'replay'"
         )
-    if not result.draws:
+    if not result.uncertainty.draws:
         raise InputError(
             f"{study.path}: the calibration kept no draws of what else explains the links: run it again on the engine "
             "'replay', with more links than unknowns"
         )
     candidates = as_links(result, candidates)
-    there = opened(result, candidates, anyway=anyway)
+    there = opened(result, candidates, allow_changed_inputs=allow_changed_inputs)
     model = _Model(result, Setup.open(study), progress)
     predicted, slope, errors = model.at(there)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
@@ -139,7 +139,7 @@ class _Model:
         progress: Called with the stage "tracing" after every launch.
     """
 
-    def __init__(self, result: Result, setup: Setup, progress: Progress | None) -> None:
+    def __init__(self, result: Record, setup: Setup, progress: Progress | None) -> None:
         self.result, self.progress = result, progress
         self.engine = self._engine(setup)
         problem = Problem.of(setup, self.engine)
@@ -152,7 +152,7 @@ class _Model:
         self.problem = replace(problem, objective=replace(objective, noise_db=self.noise_db))
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
-        drawn = np.stack([result.draws[name] for name in parameters.names], axis=1)
+        drawn = np.stack([result.uncertainty.draws[name] for name in parameters.names], axis=1)
         draws = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), DRAWS)).round().astype(int)]
         self.draws, self.values = len(draws), np.vstack([draws, self._rivals(drawn)])
         self.told = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)
@@ -186,7 +186,7 @@ class _Model:
         section = setup.study.engine
         compress = section.compress_db if isinstance(section, ReplaySection) else None
         # As they were traced for the calibration, so that the cache knows them.
-        materials = None if self.result.retrace_gap_db is None else self.result.materials
+        materials = None if self.result.fit.retrace_gap_db is None else self.result.materials
         return replay(setup, setup.trace(materials, self.progress), compress)
 
     def _replayed(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -249,10 +249,10 @@ class _Model:
         study = self.result.study
         if term.name == OFFSET:
             labels = links.group if study.offset is not None and study.offset.per is not None else None
-            known = self.result.offsets_db
         else:
-            per, known = study.nuisance[term.name].per, self.result.nuisances[term.name]
+            per = study.nuisance[term.name].per
             labels = None if per is None else links.table.labels(per)
+        known = self.result.nuisance.coefficients.get(term.name, {})
         there = term.at(links, labels)
         # A group never seen gets the mean of those that were.
         share = np.where(
@@ -276,7 +276,7 @@ class _Model:
 
 
 def _table(
-    result: Result,
+    result: Record,
     candidates: Measurements,
     predicted: NDArray[np.float64],
     chosen: list[Outlook],
@@ -309,7 +309,7 @@ def _table(
     return pd.DataFrame(table)
 
 
-def _width(result: Result, name: str, narrowed: float) -> float:
+def _width(result: Record, name: str, narrowed: float) -> float:
     """Width of a parameter's interval once it is narrowed, on the scale of the search."""
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)

@@ -1,5 +1,40 @@
-"""What a calibration found: a record that imports no machinery, its files and its tables."""
+"""The record of a finished calibration: sections of plain data, their files, and their wording. It calls nothing."""
 
-from calibray.result.record import FILES, Result
+from calibray.result.files import FILES
+from calibray.result.held_out import HeldOutErrors, Judgement
+from calibray.result.prediction_model import FittedTerm, PredictionModel, ResidualField
+from calibray.result.record import (
+    Accuracy,
+    Cost,
+    Fit,
+    Nuisance,
+    Prediction,
+    Provenance,
+    Record,
+    Uncertainty,
+)
+from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Interval, Reason, ReasonKind, Verdict
 
-__all__ = ["FILES", "Result"]
+__all__ = [
+    "FILES",
+    "Accuracy",
+    "Cost",
+    "Fit",
+    "FittedTerm",
+    "HeldOutErrors",
+    "Interval",
+    "Judgement",
+    "Nuisance",
+    "Prediction",
+    "PredictionModel",
+    "Provenance",
+    "Reason",
+    "ReasonKind",
+    "Record",
+    "Remark",
+    "RemarkKind",
+    "ResidualField",
+    "Uncertainty",
+    "Verdict",
+]

@@ -1,4 +1,4 @@
-"""The tables of a result's folder, read and checked: a row for every link, and a row for every RT call."""
+"""The tables of a result's folder, read and checked: one row per link, one row per RT call."""
 
 from __future__ import annotations
 
@@ -19,14 +19,11 @@ HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f",
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """The columns of each file, and the kinds of their numbers."""
 
-MAYBE: Final = ("leverage", "depth", "chosen_db")
-"""Columns of numbers that are there where they could be known."""
-
-FIRST_NAMES: Final = {"result-links.csv": "links.csv", "result-history.csv": "history.csv"}
-"""What the version before called the files."""
+OPTIONAL: Final = ("leverage", "depth", "chosen_db")
+"""Columns of numbers that are optional."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")
-"""Columns that hold a number in every row; in others, a link without a path is infinite or left open."""
+"""Columns without infinite or missing values; in the others a link without a path is infinite or empty."""
 
 
 def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
@@ -34,7 +31,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
 
     Args:
         folder: The result's folder.
-        name: The file's name; what the version before called it serves as well.
+        name: The file's name.
         columns: The columns that it must have, and the kinds of their values: "i", "f" or "b".
 
     Returns:
@@ -45,9 +42,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     """
     file = folder / name
     if not exists(file):
-        file = folder / FIRST_NAMES[name]
-    if not exists(file):
-        raise InputError(f"{folder / name}: is no file; name the --out folder of `calibray run`")
+        raise InputError(f"{file}: is no file; name the --out folder of `calibray run`")
     try:
         # A group may be called 7, or NA.
         table = pd.read_csv(file, converters={"group": str})
@@ -72,7 +67,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
             )
     if not len(table):
         raise InputError(f"{file}: has no rows; run the study again")
-    places = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in MAYBE]
+    places = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
     if strange := [column for column in places if table[column].dtype.kind not in "if"]:
         raise InputError(
             f"{file}: column {strange[0]!r} holds something else than it should; run the study again"

@@ -16,15 +16,16 @@ from calibray.fitting.minima import BASINS, likely, minima
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.parameters import Parameters
+from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.support.blas_threads import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.buildings import over_buildings
 from calibray.uncertainty.curvature import alone, by_curvature, covariances
 from calibray.uncertainty.emulator import ensemble
 from calibray.uncertainty.importance_sampling import ENOUGH, Draws, pooled, sample
-from calibray.uncertainty.intervals import CONFIDENCE, Interval
 from calibray.uncertainty.likelihood import Explaining
-from calibray.uncertainty.remarks import ROUGH, contradicted, departures, missed
+from calibray.uncertainty.remarks import departures, missed, outside_interval
 from calibray.uncertainty.undeclared_offset import forgotten_offset
 from calibray.uncertainty.verdicts import verdicts
 from calibray.uncertainty.widening import widened
@@ -88,7 +89,7 @@ class Certainty:
         noise: Weights of the kinds of noise, and of a forgotten offset.
         free_offset_db: The offset that fits best beside the study's model, where that has none [dB].
         free_offset_error_db: Its standard error [dB].
-        remarks: What is to be said aloud, a sentence each.
+        remarks: Warnings and advice.
         calls: Replays that this took.
         seconds: Time that this took [s].
     """
@@ -100,7 +101,7 @@ class Certainty:
     noise: dict[str, float] = field(default_factory=dict)
     free_offset_db: float | None = None
     free_offset_error_db: float | None = None
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
     calls: int = 0
     seconds: float = 0.0
 
@@ -137,7 +138,7 @@ def _approximate(
     """The same by what stands in for an engine without derivatives, and the replays that it took."""
     stands, name = ensemble(problem, trail, model), problem.setup.study.engine.name
     if stands is None:
-        reason = f"{len(trail.candidates)} calls of the engine are too few to tell how path loss depends on anything"
+        reason = Reason(ReasonKind.TOO_FEW_CALLS, {"calls": len(trail.candidates)})
         return Certainty(_whole(problem.parameters, reason)), 0
     mean, *drawn = (
         replace(problem, engine=engine, observable=PATH_LOSS) for engine in (stands.mean, *stands.drawn)
@@ -145,24 +146,28 @@ def _approximate(
     alike = stands.apart_db < ALIKE * trail.best_value
     spent = trail.rt_calls if model is None else model.calls
     found = _certain(mean, [mean] if alike else drawn, trail, spent, progress)
-    way = "" if stands.replayed is None else ", by way of the corrected replay of its scene"
-    remark = (
-        f"Intervals are approximate: the engine {name!r} gives no derivatives, so {stands.calls} of its calls stand in "
-        f"for it{way}; of these the better half are foretold to {stands.error_db:.2g} dB, each from all others."
+    remark = Remark(
+        RemarkKind.APPROXIMATE_INTERVALS,
+        {
+            "engine": name,
+            "calls": stands.calls,
+            "error_db": float(stands.error_db),
+            "replay": stands.replayed is not None,
+        },
     )
     intervals = {name: replace(each, approximate=True) for name, each in found.intervals.items()}
     calls = 0 if stands.replayed is None else stands.replayed.calls
     return replace(found, intervals=intervals, remarks=(remark, *found.remarks)), calls
 
 
-def _whole(parameters: Parameters, reason: str) -> dict[str, Interval]:
+def _whole(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
     """Intervals that tell nothing."""
     return {
         each.name: Interval(
             (each.upper - each.lower) / np.sqrt(12.0),
             each.lower,
             each.upper,
-            "not identifiable",
+            Verdict.NOT_IDENTIFIABLE,
             (),
             reason,
             True,
@@ -179,12 +184,15 @@ def _certain(
     local = by_curvature(problem, trail, told)
     freedom = told.num_rows - problem.unknowns
     if freedom < 1:
-        reason = f"{told.num_rows} links are too few for so many unknowns"
+        reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": told.num_rows})
         return Certainty(
-            {name: replace(each, verdict="not identifiable", reason=reason) for name, each in local.items()}
+            {
+                name: replace(each, verdict=Verdict.NOT_IDENTIFIABLE, reason=reason)
+                for name, each in local.items()
+            }
         )
     if told.value[0] < EXACT_DB:
-        reason = "the data hold no noise"
+        reason = Reason(ReasonKind.NO_NOISE)
         return Certainty({name: replace(each, reason=reason) for name, each in local.items()})
     return _from_draws(problem, engines, trail, local, freedom, spent, progress)
 
@@ -205,13 +213,13 @@ def _from_draws(
         free_offset_db=offset.offset_db, free_offset_error_db=offset.error_db, remarks=offset.remarks
     )
     if problem.objective.num_counted > LINKS:
-        crowd = f"for more than {LINKS:,} links, errors that neighbours share are not looked at"
+        crowd = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": LINKS})
         return replace(found, intervals=alone(local, crowd))
     explaining = Explaining.of(problem, lowest[0], least, freedom)
     tried = explaining.marginal.models
     size = _size(problem, spent, len(engines), explaining.replays)
     if size is None:
-        return replace(found, intervals=alone(local, "draws would cost more than five calibrations"))
+        return replace(found, intervals=alone(local, Reason(ReasonKind.TOO_EXPENSIVE)))
     # What fits worse by least squares may fit best where errors are alike or have heavy tails.
     places = np.concatenate([known[np.argsort(square)[:KNOWN]], offset.minima[:BASINS]])
     explained = explaining(places)
@@ -229,7 +237,8 @@ def _from_draws(
     best, likeliest = problem.parameters.named(trail.best), problem.parameters.named(top)
     said = (
         *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
-        *contradicted(problem, best, told, likeliest, behind, noise), *(ROUGH,) * posterior.flattened,
+        *outside_interval(problem, best, told, likeliest, behind, noise),
+        *(Remark(RemarkKind.FEW_DRAWS),) * posterior.flattened,
     )  # fmt: skip
     return replace(
         found,

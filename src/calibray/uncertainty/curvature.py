@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.fitting.search import Trail
-from calibray.uncertainty.intervals import Interval, intervals
+from calibray.result.verdict import Interval, Reason
+from calibray.uncertainty.linear_theory import intervals
 
 
 def by_curvature(problem: Problem, trail: Trail, told: Evaluation) -> dict[str, Interval]:
@@ -42,17 +43,16 @@ def by_curvature(problem: Problem, trail: Trail, told: Evaluation) -> dict[str, 
     }
 
 
-def alone(local: dict[str, Interval], why: str) -> dict[str, Interval]:
+def alone(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
     """Intervals by curvature that stand by themselves, with the reason.
 
     Args:
         local: The intervals.
-        why: Why there is nothing better.
+        reason: Why there is nothing better.
 
     Returns:
         The same intervals, the reason told.
     """
-    reason = f"by the curvature at the optimum alone: {why}"
     return {name: replace(each, reason=reason) for name, each in local.items()}
 
 

@@ -1,4 +1,4 @@
-"""What a calibration's draws give reason to say aloud, a sentence each."""
+"""Remarks that follow from a calibration's draws."""
 
 from __future__ import annotations
 
@@ -9,59 +9,52 @@ import numpy as np
 
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
+from calibray.result.remark import Remark, RemarkKind, Value
+from calibray.result.verdict import Interval
+from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.importance_sampling import Draws
-from calibray.uncertainty.intervals import Interval
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 
-SURE: Final = 0.5
-"""Weight from which on a departure from independent Gaussian errors is said aloud."""
+LIKELY: Final = 0.5
+"""Posterior weight above which a departure from independent Gaussian noise is reported."""
 
 SLACK: Final = 0.02
-"""Share of a parameter's range within which a value beside an interval is taken to lie in it."""
+"""Share of a parameter's range by which a value may lie outside an interval before it is reported."""
 
-MOST: Final = 1000.0
-"""Ratio beyond which how much more likely something is is not told."""
+MISSED_DB: Final = 0.01
+"""RMSE by which draws must undercut the method's best candidate before it is said to have missed the optimum [dB]."""
 
-ROUGH: Final = (
-    "Draws that explain the data are too few among so many parameters: intervals are rough, and a place that fits may "
-    "be missing. Calibrate fewer parameters, or give them priors."
-)
-"""Said where the posterior was flattened."""
+BEST_DRAWS: Final = 16
+"""Draws of highest density that are checked for it."""
 
 DEPARTURES: Final = {
-    CORRELATED: "Errors of neighbouring links are alike",
-    HEAVY: "Errors have heavy tails, as outliers make them",
-    DIFFERING: "Errors grow where materials matter more, as where walls of one material differ",
+    CORRELATED: RemarkKind.CORRELATED_NOISE,
+    HEAVY: RemarkKind.HEAVY_TAILS,
+    DIFFERING: RemarkKind.HETEROGENEITY,
 }
 
-CAUSES: Final = {
-    CORRELATED: "errors that neighbours share make many links count as few",
-    HEAVY: "links far off count less where errors have heavy tails",
-    DIFFERING: "links that lean on walls count less where walls of one material differ",
-    GAUSSIAN: "errors differ in a way that squares do not tell",
-}
-"""Why what explains the links best has not the least sum of squares, by the kind of noise that most speaks for."""
+CAUSES: Final = (CORRELATED, HEAVY, DIFFERING, GAUSSIAN)
 
 
-def departures(noise: Mapping[str, float]) -> tuple[str, ...]:
-    """Said where errors are likely not independent and Gaussian.
+def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
+    """Noise models that the data favour over independent Gaussian noise.
 
     Args:
-        noise: Weights of the kinds of noise.
+        noise: Posterior weights of the noise models.
 
     Returns:
-        A sentence for each kind that is likely.
+        A remark for each that is likely.
     """
+    gaussian = float(noise.get(GAUSSIAN, 0.0))
     return tuple(
-        f"{said} (weight {noise[kind]:.2f}, independent Gaussian errors {noise.get(GAUSSIAN, 0.0):.2f}); intervals "
-        "allow for it."
-        for kind, said in DEPARTURES.items()
-        if noise.get(kind, 0.0) > SURE
+        Remark(remark, {"weight": float(noise[kind]), "gaussian_weight": gaussian})
+        for kind, remark in DEPARTURES.items()
+        if noise.get(kind, 0.0) > LIKELY
     )
 
 
-def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[str, ...]:
-    """Said where draws lie below what the method found.
+def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[Remark, ...]:
+    """Whether draws have a lower objective than the best candidate of the method.
 
     Args:
         problem: The problem.
@@ -69,64 +62,51 @@ def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[str, ...]:
         trail: The finished search.
 
     Returns:
-        A sentence, or none.
+        A remark, or none.
     """
-    top = posterior.point[np.argsort(-posterior.density)[:16]]
+    top = posterior.point[np.argsort(-posterior.density)[:BEST_DRAWS]]
     lowest = float(problem.squares(top).value.min())
-    if lowest > trail.best_value - 0.01:
+    if lowest > trail.best_value - MISSED_DB:
         return ()
-    return (
-        f"The method missed the optimum: draws reach {lowest:.2f} dB, it found {trail.best_value:.2f} dB; intervals "
-        "are those around the optimum.",
-    )
+    return (Remark(RemarkKind.MISSED_OPTIMUM, {"draws_db": lowest, "found_db": float(trail.best_value)}),)
 
 
-def contradicted(
+def outside_interval(
     problem: Problem,
-    found: Mapping[str, float],
-    told: Mapping[str, Interval],
-    likeliest: Mapping[str, float],
-    behind: float,
+    optimum: Mapping[str, float],
+    intervals: Mapping[str, Interval],
+    most_probable: Mapping[str, float],
+    log_odds: float,
     noise: Mapping[str, float],
-) -> tuple[str, ...]:
-    """Said where a value that fits best by its squares lies outside its own interval.
+) -> tuple[Remark, ...]:
+    """Whether values of least RMSE lie outside their own intervals.
 
     Args:
         problem: The problem.
-        found: The values of the least RMSE, by parameter.
-        told: The intervals.
-        likeliest: The values of the best draw, by parameter.
-        behind: Logarithm of the density of the best draw over that of the least RMSE.
-        noise: Weights of the kinds of noise.
+        optimum: The values of least RMSE by parameter.
+        intervals: The intervals.
+        most_probable: The values of the draw of highest density by parameter.
+        log_odds: Logarithm of the density of that draw over that of the values of least RMSE.
+        noise: Posterior weights of the noise models.
 
     Returns:
-        What disagrees and why, and what to do; nothing where none does.
+        A remark that names the parameters and the cause, or none.
     """
     outside = []
     for parameter in problem.parameters:
-        value, pieces = found[parameter.name], told[parameter.name].pieces
-        slack = SLACK * (parameter.upper - parameter.lower)
-        if pieces and not any(low - slack <= value <= high + slack for low, high in pieces):
-            ranges = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
-            outside.append(
-                f"{parameter.name} {value:.4g}, interval {ranges}, likeliest {likeliest[parameter.name]:.4g}"
-            )
+        interval, slack = intervals[parameter.name], SLACK * (parameter.upper - parameter.lower)
+        if interval.pieces and not interval.contains(optimum[parameter.name], slack):
+            outside.append(parameter.name)
     if not outside:
         return ()
-    kinds = {kind: noise.get(kind, 0.0) for kind in CAUSES}
-    cause = CAUSES[max(kinds, key=kinds.__getitem__)]
     holdout = problem.setup.study.holdout
-    advice = "Do not take the values of the least RMSE for the materials'; blocks held out tell what predicts best."
-    if holdout is None or holdout.where is not None:
-        advice = (
-            "Predictions go by the values of the least RMSE unless blocks held out speak for another model: say "
-            "[holdout] blocks = 4, and do not take these values for the materials'."
-        )
-    ratio = float(np.exp(np.clip(behind, 0.0, np.log(MOST))))
-    times = f"more than {MOST:,.0f}" if ratio >= 0.999 * MOST else f"{ratio:.2g}"
-    return (
-        f"The least RMSE is not where the links are explained best: {'; '.join(outside)}. The RMSE takes the errors of "
-        f"all links as independent; intervals do not, for {cause}, and the likeliest values are {times} times as "
-        "likely.",
-        advice,
-    )
+    values: dict[str, Value] = {
+        "names": outside,
+        "values": [float(optimum[name]) for name in outside],
+        "pieces": [[float(end) for piece in intervals[name].pieces for end in piece] for name in outside],
+        "most_probable": [float(most_probable[name]) for name in outside],
+        "cause": max(CAUSES, key=lambda kind: noise.get(kind, 0.0)),
+        "odds": float(np.exp(np.clip(log_odds, 0.0, np.log(MOST_ODDS)))),
+        "blocks": holdout is not None and holdout.where is None,
+    }
+    return (Remark(RemarkKind.OUTSIDE_INTERVAL, values),)

@@ -14,7 +14,8 @@ from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import rounds
 from calibray.optimizers import LeastSquares
-from calibray.uncertainty.intervals import CONFIDENCE
+from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import CONFIDENCE
 from calibray.uncertainty.likelihood import has_offset
 
 STARTS: Final = 16
@@ -32,13 +33,13 @@ class ForgottenOffset:
         minima: Minima with it that may matter, the lowest first [k, d].
         offset_db: The offset that fits best [dB]; None where it was not tried, or changes nothing.
         error_db: Its standard error [dB].
-        remarks: What is to be said aloud: a sentence where it is not zero.
+        remarks: A warning where it is significantly not zero.
     """
 
     minima: NDArray[np.float64]
     offset_db: float | None = None
     error_db: float | None = None
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
 
 def forgotten_offset(
@@ -74,11 +75,10 @@ def forgotten_offset(
     if not ratio > 0 or not np.isfinite(ratio):
         return ForgottenOffset(shifted)
     error = abs(offset) / float(np.sqrt(ratio))
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
     if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= NOTED_DB:
+        rmse = {"rmse_db": float(np.sqrt(left)), "rmse_without_db": float(np.sqrt(square))}
         remarks = (
-            f"A free offset would be {offset:+.1f} dB, with a standard error of {error:.1f} dB, and not zero: the RMSE "
-            f"would be {np.sqrt(left):.2f} instead of {np.sqrt(square):.2f} dB. Say [offset] if cables or gains may be "
-            "off.",
+            Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": float(error), **rmse}),
         )
     return ForgottenOffset(shifted, offset, error, remarks)

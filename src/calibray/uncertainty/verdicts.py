@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.result.verdict import Reason, ReasonKind
+from calibray.result.verdict import Verdict as VerdictName
 from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.importance_sampling import Draws
 
@@ -57,14 +59,14 @@ class Verdict:
     Attributes:
         pieces: Lower and upper end of every piece of the credible set, ascending; within the bounds.
         best: Value at the point of the highest density.
-        name: "identified", "weakly identified", "ambiguous", "at bound" or "not identifiable".
-        reason: Why, in words.
+        name: The verdict.
+        reason: Why.
     """
 
     pieces: tuple[tuple[float, float], ...]
     best: float
-    name: str
-    reason: str
+    name: VerdictName
+    reason: Reason
 
     @property
     def lower(self) -> float:
@@ -123,31 +125,26 @@ def verdicts(
         own = sum(end - start for start, end in lean) / (upper[index] - lower[index])
         ends = ends or _touched(lean, lower[index], upper[index])
         if share > WEAKLY >= own and len(lean) == 1 and not ends:
-            name = "weakly identified"
-            reason = (
-                f"the buildings that were seen are told to within {own:.0%} of the range; how far they stand for "
-                "others is not known, for walls of one material may differ"
-            )
+            name = VerdictName.WEAKLY_IDENTIFIED
+            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(own)})
         elif share > WEAKLY and own > WEAKLY:
-            name, change = "not identifiable", _effect(index, modelled, best, lower, upper)
+            name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, lower, upper)
             if change < SILENT_DB:
-                reason = f"no link's path loss changes by more than {change:.1f} dB over its whole range"
+                reason = Reason(ReasonKind.NO_EFFECT, {"change_db": change})
                 told = (_evened(told, float(lower[index]), float(upper[index])),)
             else:
                 reason = _blindness(index, draws, names, change, noise_db)
         elif max(len(pieces), len(lean)) > 1:
             several = (lean, basis) if len(lean) > 1 else (pieces, draws)
-            name, reason = "ambiguous", _separate(index, *several, shown)
+            name, reason = VerdictName.AMBIGUOUS, _separate(index, *several, shown)
         elif ends:
-            side = (
-                f"below {shown(index, high):.4g}" if ends == ["lower"] else f"above {shown(index, low):.4g}"
-            )
-            reason = f"it reaches the {ends[0]} bound: the data say only that it lies {side}"
-            name = "at bound"
+            other_end = shown(index, high if ends == ["lower"] else low)
+            reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
+            name = VerdictName.AT_BOUND
         else:
-            name = "identified" if share <= IDENTIFIED else "weakly identified"
-            reason = f"nine tenths of the posterior take up {share:.0%} of the range"
-            reason += _apart(index, pieces, told, draws, shown)
+            name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
+            others = _apart(index, pieces, told, draws, shown)
+            reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
         found.append(Verdict(told, float(best[index]), name, reason))
     return found
 
@@ -168,14 +165,14 @@ def _evened(pieces: tuple[tuple[float, float], ...], lower: float, upper: float)
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
 
-def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> str:
-    """The ranges that explain the links, with what speaks for each."""
-    parts, value = [], draws.point[:, index]
+def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> Reason:
+    """The modes that explain the links, with their weights."""
+    modes, value = [], draws.point[:, index]
     for low, high in pieces:
         inside = (value >= low) & (value <= high)
         middle = value[inside][np.argmax(draws.density[inside])] if inside.any() else 0.5 * (low + high)
-        parts.append(f"{shown(index, float(middle)):.4g} ({draws.weight[inside].sum():.0%} of the posterior)")
-    return f"{len(pieces)} separate ranges explain the links: around {', '.join(parts)}"
+        modes.append((float(shown(index, float(middle))), float(draws.weight[inside].sum())))
+    return Reason(ReasonKind.SEPARATE_RANGES, ranges=tuple(modes))
 
 
 def _apart(
@@ -184,14 +181,14 @@ def _apart(
     told: tuple[tuple[float, float], ...],
     draws: Draws,
     shown: Shown,
-) -> str:
-    """What the interval that is told has apart from the set that is judged, with what speaks for each; none often."""
+) -> tuple[tuple[float, float, float], ...]:
+    """Pieces of the reported interval outside the judged set, with their weights; mostly none."""
     others, value = [], draws.point[:, index]
     for low, high in told:
         if not any(start <= high and low <= end for start, end in pieces):
             weight = draws.weight[(value >= low) & (value <= high)].sum()
-            others.append(f"{shown(index, low):.4g} to {shown(index, high):.4g} ({weight:.0%} of it)")
-    return f"; apart from them lies {', '.join(others)}" if others else ""
+            others.append((float(shown(index, low)), float(shown(index, high)), float(weight)))
+    return tuple(others)
 
 
 def _effect(
@@ -208,7 +205,7 @@ def _effect(
     return float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
 
 
-def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> str:
+def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
     """Why most of the range fits though links depend on it: another parameter makes up for it, or errors are large."""
     rank = np.argsort(np.argsort(draws.resampled(400), axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
@@ -220,10 +217,7 @@ def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, no
     traded[index] = 0.0
     if traded.max() > TRADED:
         other = names[int(np.argmax(traded))]
-        return f"{other} makes up for it: they trade off with a rank correlation of {traded.max():.2f}"
+        return Reason(ReasonKind.TRADE_OFF, {"parameter": other, "correlation": float(traded.max())})
     if change > LARGE * noise_db:
-        return (
-            f"links change by up to {change:.1f} dB over its range, and what else is unknown makes up for that: "
-            "an offset, or errors that links share"
-        )
-    return f"links change by up to {change:.1f} dB over its range, too little against errors of {noise_db:.1f} dB"
+        return Reason(ReasonKind.CONFOUNDED, {"change_db": change})
+    return Reason(ReasonKind.NOISE, {"change_db": change, "noise_db": noise_db})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from calibray.uncertainty.intervals import Interval
+from calibray.result.verdict import Interval, Reason, ReasonKind, Verdict
 from calibray.uncertainty.verdicts import IDENTIFIED, WEAKLY
 
 
@@ -22,14 +22,14 @@ def widened(drawn: Interval, local: Interval, share: Callable[[float], float]) -
         identified.
 
     Example:
-        >>> few = Interval(0.1, 2.0, 3.0, "identified", ((2.0, 3.0),), "narrow")
-        >>> wide = widened(few, Interval(0.1, 4.0, 9.0, "identified"), lambda value: value / 10)
-        >>> wide.lower, wide.upper, wide.verdict
+        >>> few = Interval(0.1, 2.0, 3.0, Verdict.IDENTIFIED, ((2.0, 3.0),))
+        >>> wide = widened(few, Interval(0.1, 4.0, 9.0, Verdict.IDENTIFIED), lambda value: value / 10)
+        >>> wide.lower, wide.upper, str(wide.verdict)
         (2.0, 9.0, 'not identifiable')
     """
     lower, upper = min(drawn.lower, local.lower), max(drawn.upper, local.upper)
     left, verdict, reason = share(upper) - share(lower), drawn.verdict, drawn.reason
-    if verdict in ("identified", "weakly identified") and left > IDENTIFIED:
-        verdict = "weakly identified" if left <= WEAKLY else "not identifiable"
-        reason = f"too few draws explain the data to rule out more than {1 - left:.0%} of the range"
+    if verdict in (Verdict.IDENTIFIED, Verdict.WEAKLY_IDENTIFIED) and left > IDENTIFIED:
+        verdict = Verdict.WEAKLY_IDENTIFIED if left <= WEAKLY else Verdict.NOT_IDENTIFIABLE
+        reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": float(left)})
     return replace(drawn, lower=lower, upper=upper, pieces=((lower, upper),), verdict=verdict, reason=reason)

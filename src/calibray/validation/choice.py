@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
-from calibray.result.chosen import Chosen, ChosenTerm
+from calibray.result.held_out import Model
+from calibray.result.prediction_model import FittedTerm, PredictionModel
 from calibray.study import Study
 from calibray.validation.baselines import fitted_law
-from calibray.validation.validation import BEFORE, CALIBRATED, LAW, Validation
+from calibray.validation.validation import Validation
 from calibray.validation.variants import TX_OFFSET, minima, predicted, twins
 
 SEARCHES: Final = 16
@@ -25,7 +26,7 @@ MOST: Final = 400
 
 def choose_model(
     problem: Problem, validation: Validation, best: NDArray[np.float64]
-) -> tuple[Chosen, NDArray[np.float64]]:
+) -> tuple[PredictionModel, NDArray[np.float64]]:
     """Fit the model that held-out blocks speak for to all links that count.
 
     Kriging is not among those chosen from: it tells nothing beyond the measured places, which blocks are not about.
@@ -43,18 +44,20 @@ def choose_model(
     basis = f"{name}, errors on {len(validation.labels)} blocks held out in turn"
     size, sizes = validation.scale(name), _some(validation.sizes(name))
     study, frequency = problem.setup.study, problem.setup.study.scene.frequency
-    if name == LAW:
+    if name == Model.LOG_DISTANCE:
         law, rise = fitted_law(problem.setup.links, problem.objective, frequency)
-        chosen = Chosen(name, None, _terms(law, rise[None], study), size, basis, count, sizes)
+        chosen = PredictionModel(name, None, _terms(law, rise[None], study), size, basis, count, sizes)
         return chosen, predicted(law, rise)
     variant, point = twins(problem, best)[name], best
-    if name == BEFORE:
+    if name == Model.INITIAL:
         point = problem.parameters.to_search(problem.parameters.start)
-    elif name != CALIBRATED:
+    elif name != Model.CALIBRATED:
         point = minima(variant, best[None], SEARCHES)[0]
     told = variant.evaluate(point[None])
     values = problem.parameters.named(problem.parameters.from_search(point))
-    chosen = Chosen(name, values, _terms(variant.objective, told.modelled, study), size, basis, count, sizes)
+    chosen = PredictionModel(
+        name, values, _terms(variant.objective, told.modelled, study), size, basis, count, sizes
+    )
     return chosen, predicted(variant.objective, told.modelled[0])
 
 
@@ -65,7 +68,7 @@ def _some(sizes: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(sizes.tolist())
 
 
-def _terms(objective: Objective, path_loss: NDArray[np.float64], study: Study) -> tuple[ChosenTerm, ...]:
+def _terms(objective: Objective, path_loss: NDArray[np.float64], study: Study) -> tuple[FittedTerm, ...]:
     """Terms and their coefficients where the model gives a path loss [1, L]."""
     coefficients = objective.coefficients(path_loss)
     filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
@@ -79,6 +82,6 @@ def _terms(objective: Objective, path_loss: NDArray[np.float64], study: Study) -
         else:
             per = OFFSET if term.name == OFFSET else str(study.nuisance[term.name].per)
         found.append(
-            ChosenTerm(term.name, term.by, per, dict(zip(term.labels, values, strict=True)), term.centre)
+            FittedTerm(term.name, term.by, per, dict(zip(term.labels, values, strict=True)), term.centre)
         )
     return tuple(found)

@@ -15,13 +15,14 @@ from calibray.errors import EngineError, InputError
 from calibray.fitting.noise_floor import heard
 from calibray.fitting.noise_level import weighed
 from calibray.fitting.problem import Problem
+from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import kriging, log_distance
 from calibray.validation.blocks import blocks as parted
-from calibray.validation.validation import BEFORE, CALIBRATED, FIELD, KRIGING, LAW, Validation
+from calibray.validation.validation import Validation
 from calibray.validation.variants import NOTHING, fitted, predicted
 
 BLOCKS: Final = 4
@@ -39,7 +40,7 @@ def validate(
     *,
     blocks: int | None = None,
     by: str | None = None,
-    crew: Workers | None = None,
+    workers: Workers | None = None,
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
 ) -> Validation:
@@ -49,7 +50,7 @@ def validate(
         study: The study, opened or not; on the engine "replay".
         blocks: Number of spatial blocks, each held out in turn; the study's, or 4, if None and `by` is None.
         by: Column whose labels are held out in turn; "tx" for the place of the transmitter.
-        crew: Where blocks of links live that are traced and replayed together (`engines.open_workers`).
+        workers: Where blocks of links live that are traced and replayed together (`engines.open_workers`).
         progress: Called with the stages "tracing" and "validating".
         tracer: What opens the scene in a ray tracer; a study that is open brings its own.
 
@@ -68,7 +69,7 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, workers=crew))))
+    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, workers=workers))))
     return validated(problem, blocks, by, progress)
 
 
@@ -121,7 +122,7 @@ def validated(
             errors.setdefault(name, np.full(len(links), np.nan))[here] = (model - objective.measured)[here]
         if progress is not None:
             progress("validating", number + 1, len(labels))
-    judged = (block >= 0) & np.isfinite(errors[BEFORE]) & np.isfinite(errors[CALIBRATED])
+    judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
     whole = {name: each for name, each in errors.items() if np.isfinite(each[judged]).all()}
     position = np.where(judged, block, -1)
     return Validation(labels, position, whole, links.rx)
@@ -171,8 +172,8 @@ def models(
         name: predicted(variant.objective, variant.modelled(points[:1])[0])
         for name, (variant, points) in fitted(part, known).items()
     }
-    found[LAW] = log_distance(setup.links, objective, setup.study.scene.frequency)
-    for name, law in ((KRIGING, LAW), (FIELD, CALIBRATED)):
+    found[Model.LOG_DISTANCE] = log_distance(setup.links, objective, setup.study.scene.frequency)
+    for name, law in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
         try:
             found[name] = kriging(setup.links, objective, found[law])
         except (InputError, EngineError):

@@ -23,8 +23,8 @@ from calibray.fitting.search import rounds
 from calibray.optimizers import LeastSquares
 from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
+from calibray.result.held_out import Model
 from calibray.study import Setup
-from calibray.validation.validation import BEFORE, CALIBRATED, PER_TX, PRIOR, PRIOR_PER_TX, SLOPE
 
 SPREAD: Final = 0.3
 """Standard deviation of the logarithm of a parameter around its start, where the model has priors."""
@@ -60,15 +60,15 @@ def fitted(
     Returns:
         The problem that each solves, and its minima, the best first [k, d], by name.
     """
-    if CALIBRATED in known:
-        calibrated = minima(part, known[CALIBRATED])
+    if Model.CALIBRATED in known:
+        calibrated = minima(part, known[Model.CALIBRATED])
     else:
         calibrated = minima(part, np.zeros((0, len(part.parameters))), _all_over(part))
     found = {}
     for name, variant in twins(part, calibrated[0]).items():
-        if name == BEFORE:
+        if name == Model.INITIAL:
             points = part.parameters.to_search(part.parameters.start)[None]
-        elif name == CALIBRATED:
+        elif name == Model.CALIBRATED:
             points = calibrated
         else:
             points = minima(variant, known.get(name, calibrated))
@@ -84,21 +84,21 @@ def twins(part: Problem, best: NDArray[np.float64]) -> dict[str, Problem]:
         best: Its optimum, by which the noise is told that priors are weighed against [d].
 
     Returns:
-        The problem that each solves, by its name; of `BEFORE` only the nuisance is to be fitted.
+        The problem that each solves, by its name; of `Model.INITIAL` only the nuisance is to be fitted.
     """
     setup, objective = part.setup, part.objective
     rows = objective.num_counted
     noise = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
     prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
     found = {
-        BEFORE: replace(part, objective=_with_term(objective, CONSTANT, setup)),
-        CALIBRATED: part,
-        PRIOR: prior,
-        SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
+        Model.INITIAL: replace(part, objective=_with_term(objective, CONSTANT, setup)),
+        Model.CALIBRATED: part,
+        Model.PRIOR: prior,
+        Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
     }
     if (per_tx := _per_transmitter(objective, setup)) is not None:
-        found[PER_TX] = replace(part, objective=per_tx)
-        found[PRIOR_PER_TX] = replace(prior, objective=replace(per_tx, noise_db=noise))
+        found[Model.PER_TRANSMITTER] = replace(part, objective=per_tx)
+        found[Model.PRIOR_PER_TRANSMITTER] = replace(prior, objective=replace(per_tx, noise_db=noise))
     return found
 
 

@@ -1,0 +1,193 @@
+"""The result of a calibration: its record, and what can be done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from calibray.measurements import Measurements
+from calibray.reporting import diagnostics, result_tables
+from calibray.result import files, wording
+from calibray.result.record import Record
+from calibray.support.progress import Progress
+from calibray.tables import display
+from calibray.validation.validation import Validation
+
+if TYPE_CHECKING:
+    from calibray.engines.cluster.workers import Workers
+    from calibray.prediction.coverage_map import CoverageMap
+
+# What traces or evaluates paths is imported by the verbs that need it, so that a stored result is shown without it.
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Record):
+    """A finished calibration; `Record` lists its sections."""
+
+    def __repr__(self) -> str:
+        return display.text(*result_tables.summary(self))
+
+    def _repr_html_(self) -> str:
+        return display.html(*result_tables.summary(self))
+
+    @classmethod
+    def load(cls, folder: str | Path, *, allow_changed_inputs: bool = False) -> Result:
+        """Read a folder that `save` wrote.
+
+        Args:
+            folder: The folder.
+            allow_changed_inputs: Read it although its files changed since they were written.
+
+        Returns:
+            The result.
+
+        Raises:
+            InputError: The folder holds no result, one of another version, or one that was damaged or edited.
+        """
+        return cls(**files.read(folder, allow_changed_inputs=allow_changed_inputs))
+
+    @cached_property
+    def validation(self) -> Validation | None:
+        """The validation, where blocks were held out in turn; None otherwise."""
+        return None if self.held_out is None else Validation.of(self.held_out)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Warnings and advice, the judgement on held-out links, and why predictions use their model."""
+        return wording.remarks(self, "" if self.validation is None else self.validation.choice)
+
+    @property
+    def diagnostics(self) -> dict[str, pd.DataFrame]:
+        """Residuals, leverage, power, trade-offs and neighbours as tables; see `calibray.reporting.diagnostics`."""
+        return diagnostics.diagnostics(self)
+
+    def content(self) -> dict[str, Any]:
+        """The result as plain values, as in `result.json`."""
+        return files.content(self, self.remarks)
+
+    def save(self, folder: str | Path, overwrite: bool = False) -> None:
+        """Write `result.json`, `result-links.csv`, `result-history.csv` and the calibrated `result-scene.xml`.
+
+        After a validation, `result-validation.json` as well. No file is ever half-written.
+
+        Args:
+            folder: Folder to write into; made if absent.
+            overwrite: Replace files that Calibray did not write.
+
+        Raises:
+            InputError: The folder cannot be written, or a file there must not be replaced.
+        """
+        validation = None if self.validation is None else self.validation.content()
+        files.write(self, folder, overwrite, sentences=self.remarks, validation=validation)
+
+    def predict(
+        self,
+        links: Measurements | pd.DataFrame,
+        progress: Progress | None = None,
+        *,
+        allow_changed_inputs: bool = False,
+    ) -> NDArray[np.float64]:
+        """Predict path loss at new links.
+
+        Args:
+            links: The links, or a table with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], or with those that
+                the study names for positions, and with its group column, if it has one. The study's column of
+                frequencies gives the carriers; without it all links have the scene's.
+            progress: Called with the stage "tracing" after every launch.
+            allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+
+        Returns:
+            Path loss with nuisances [links], [dB]; +inf where no path leads.
+
+        Raises:
+            InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
+                the scene or an antenna changed since the calibration.
+        """
+        from calibray.prediction.predict import predict
+
+        return predict(self, links, progress, allow_changed_inputs=allow_changed_inputs)
+
+    def predict_interval(
+        self,
+        links: Measurements | pd.DataFrame,
+        level: float = 0.9,
+        progress: Progress | None = None,
+        *,
+        allow_changed_inputs: bool = False,
+    ) -> pd.DataFrame:
+        """Predict path loss at new links, with the interval that contains a measurement there.
+
+        Args:
+            links: The links, or a table, as for `predict`; groups need not have been measured.
+            level: Probability that a measurement lies within.
+            progress: Called with the stage "tracing" after every launch.
+            allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
+
+        Returns:
+            One row per link: path_loss_db, lower_db, upper_db [dB], basis (what the interval was computed from), the
+            three in the measured quantity where that is not path loss, and remark, on a position where no antenna
+            should be.
+
+        Raises:
+            InputError: What `predict` refuses except unknown groups, the level is not between 0 and 1, or the
+                calibration had too few links to estimate the size of residuals.
+        """
+        from calibray.prediction.predict import predict_interval
+
+        return predict_interval(self, links, level, progress, allow_changed_inputs=allow_changed_inputs)
+
+    def coverage_map(
+        self,
+        tx: Sequence[float] | None = None,
+        *,
+        height: float = 1.5,
+        cell: float = 5.0,
+        bounds: Sequence[float] | None = None,
+        level: float | None = 0.9,
+        power_dbm: float | None = None,
+        samples: int | Literal["auto"] | None = None,
+        columns: Mapping[str, object] | None = None,
+        progress: Progress | None = None,
+        workers: Workers | None = None,
+        allow_changed_inputs: bool = False,
+    ) -> CoverageMap:
+        """Predict path loss over an area; see `calibray.coverage_map` for the arguments, the result and errors."""
+        from calibray.prediction.coverage_map import coverage_map
+
+        return coverage_map(
+            self, tx, height=height, cell=cell, bounds=bounds, level=level, power_dbm=power_dbm, samples=samples,
+            columns=columns, progress=progress, workers=workers, allow_changed_inputs=allow_changed_inputs,
+        )  # fmt: skip
+
+    def suggest(
+        self,
+        candidates: Measurements | pd.DataFrame,
+        count: int = 5,
+        progress: Progress | None = None,
+        *,
+        allow_changed_inputs: bool = False,
+    ) -> pd.DataFrame:
+        """Suggest where to measure next; see `calibray.suggest` for the arguments, the result and errors."""
+        from calibray.prediction.suggestion import suggest
+
+        return suggest(self, candidates, count, progress, allow_changed_inputs=allow_changed_inputs)
+
+    def report(self, file: str | Path, *, overwrite: bool = False, progress: Progress | None = None) -> Path:
+        """Write the result as one HTML page; see `calibray.report` for the arguments and errors."""
+        from calibray.reporting.page import report
+
+        return report(self, file, overwrite=overwrite, progress=progress)
+
+    def export(self, folder: str | Path, *, copy: bool = False, overwrite: bool = False) -> tuple[str, ...]:
+        """Write the calibrated scene for Sionna RT, and its materials as tables; see `calibray.reporting.export`."""
+        from calibray.reporting.export import export
+
+        return export(self, folder, copy, overwrite)

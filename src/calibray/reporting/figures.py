@@ -1,0 +1,242 @@
+"""Figures of calibrations: the paper's, and what is left of path loss when all is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from calibray.optimizers.labels import label
+from calibray.reporting.link_survey import Survey
+from calibray.reporting.trust_figures import examined
+from calibray.result.record import Record
+from calibray.support.figure_style import (
+    BLUE,
+    COLORS,
+    FAINT,
+    INK,
+    LINE,
+    ORANGE,
+    dress,
+    logarithmic,
+    plain_figure,
+    residual_figure,
+    styled,
+)
+from calibray.support.messages import shortened
+
+SYMBOLS: Final = 60
+"""Links up to which every one has its own symbol on a line."""
+
+SHADED: Final = 500
+"""Links up to which they stand in the order of the study's file, those held out shaded."""
+
+MANY: Final = 2000
+"""Points beyond which a figure holds them as an image."""
+
+UNEQUAL: Final = 4
+"""How many times as many RT calls one method may spend as another before their axis is logarithmic."""
+
+LONG: Final = 1000
+"""RT calls beyond which the axis of the best RMSE is logarithmic: most is gained in the first."""
+
+GROUPS: Final = 24
+"""Groups that are shown, those with the most links first."""
+
+
+@styled()
+def cumulative_cost(results: Mapping[str, Record]) -> Figure:
+    """RT calls and time over iterations (the paper's figure of cumulative cost).
+
+    Args:
+        results: Results by method.
+
+    Returns:
+        The figure.
+    """
+    figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, column, y in zip(
+        panels, ("call", "seconds"), ("RT calls so far", "Time so far [s]"), strict=True
+    ):
+        dress(axes, "Iteration" if column == "seconds" else "", y)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        for method, result in results.items():
+            value = result.history.groupby("iteration")[column].max()
+            end = f"{value.iloc[-1]:.4g}"
+            axes.plot(
+                value.index, value, "o-", ms=4, color=COLORS.get(method), label=f"{label(method)}: {end}"
+            )
+            if method == "sgwo-im":
+                calls = result.history.groupby("iteration")["call"].max().diff()
+                lean = calls[calls < calls.iloc[1]]
+                if len(lean):
+                    axes.axvline(
+                        lean.index[0] - 1, color=COLORS[method], ls="--", lw=1, label="surrogate takes over"
+                    )
+        axes.legend(frameon=False)
+    if _unequal(results):
+        logarithmic(panels[0], "y")
+    return figure
+
+
+@styled()
+def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
+    """Best RMSE so far over RT calls.
+
+    Args:
+        results: Results by method.
+        optimum_db: RMSE of the global optimum, drawn as a line, [dB]; None where it is not known.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = plain_figure("RT calls", "Best RMSE so far [dB]")
+    for method, result in results.items():
+        history = result.history
+        axes.step(
+            history["call"], history["best_db"], where="post", color=COLORS.get(method),
+            label=f"{label(method)}: {result.rmse_db:.3f} dB",
+        )  # fmt: skip
+    if _unequal(results) or max(result.history["call"].max() for result in results.values()) > LONG:
+        logarithmic(axes, "x")
+        axes.set_xlim(left=1)
+    if optimum_db is not None:
+        axes.axhline(optimum_db, color=INK, ls="--", lw=1, label=f"global optimum: {optimum_db:.3f} dB")
+    axes.legend(frameon=False)
+    return figure
+
+
+@styled()
+def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
+    """Path loss by receiver: measured, before calibration and after.
+
+    Args:
+        results: Results by method, all of the same links.
+
+    Returns:
+        The figure.
+    """
+    links = next(iter(results.values())).links
+    place, few, many = np.arange(1, len(links) + 1), len(links) <= SYMBOLS, len(links) > SHADED
+    # Of many links a curve can be read only in the order of what was measured.
+    order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else place - 1
+    what = "Receiver" if few else "Link, by measured path loss" if many else "Link"
+    figure, axes = plain_figure(what, "Path loss [dB]", width=10.0)
+    held_out = links["held_out"].to_numpy(bool)
+    if not many and 0 < held_out.sum() < len(links):
+        for number, (start, end) in enumerate(_runs(held_out)):
+            name = None if number else "held out"
+            axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0, label=name)
+
+    def draw(column: pd.Series, line: str, dots: str, layer: int = 2, **style: Any) -> None:
+        values = column.to_numpy(float)[order]
+        shown = np.where(np.isfinite(values), values, np.nan)
+        axes.plot(place, shown, line if few else dots, rasterized=len(links) > MANY, zorder=layer, **style)
+
+    draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
+    draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
+    for number, (method, result) in enumerate(results.items()):
+        color, size = COLORS.get(method, BLUE), 2 if many else 4
+        # Lines on top of each other are thinner, so that those below are seen.
+        width = 1.3 + 1.4 * (len(results) - 1 - number)
+        draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=width)
+    axes.set_xlim(0, len(links) + 1)
+    axes.legend(frameon=False, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
+    return figure
+
+
+@styled()
+def residual_over_distance(survey: Survey) -> Figure:
+    """What is left of each link's path loss, over the distance between its ends.
+
+    Args:
+        survey: The links.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = residual_figure("Distance [m]")
+    left, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
+    for mask, color, marker, name in (
+        (~held_out, BLUE, "o", "calibrated on"),
+        (held_out, ORANGE, "^", "held out"),
+    ):
+        shown = mask & np.isfinite(left)
+        if shown.any():
+            size = 40 if shown.sum() <= 100 else 16 if shown.sum() <= 1000 else 5
+            axes.scatter(survey.distance[shown], left[shown], s=size, c=color, marker=marker, alpha=0.7, lw=0,
+                         label=f"{name} ({shown.sum():,})", rasterized=len(left) > MANY)  # fmt: skip
+    known = survey.distance[np.isfinite(left)]
+    if len(known) and known.max() > 8 * known.min():
+        logarithmic(axes, "x")
+    axes.legend(frameon=False, loc="best")
+    return figure
+
+
+@styled()
+def residual_by_group(survey: Survey) -> Figure:
+    """What is left of the links' path loss, in each group.
+
+    Args:
+        survey: The links, which have groups.
+
+    Returns:
+        The figure: quartiles as a box, the median as a line, and all but 10 % between the whiskers.
+    """
+    left = survey.residual_db
+    frame = pd.DataFrame({"group": survey.group, "left": left}).dropna()
+    sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
+    names = sorted(sizes.index[:GROUPS])
+    figure, axes = plain_figure("Calibrated - measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", color=LINE)
+    axes.axvline(0, color=INK, lw=0.8)
+    values = [frame.loc[frame["group"] == name, "left"].to_numpy() for name in names]
+    if values:
+        lines = {"color": BLUE, "linewidth": 1.2}
+        axes.boxplot(values, orientation="horizontal", whis=(5, 95), showfliers=False, widths=0.5, boxprops=lines,
+                     whiskerprops=lines, capprops=lines, medianprops={"color": ORANGE, "linewidth": 2})  # fmt: skip
+    labels = [f"{shortened(name, 28)} ({len(value):,})" for name, value in zip(names, values, strict=True)]
+    axes.set_yticks(range(1, len(names) + 1), labels)
+    axes.invert_yaxis()
+    return figure
+
+
+def every(result: Record, links: Survey | None) -> dict[str, Figure]:
+    """The figures of a calibration.
+
+    Args:
+        result: The calibration.
+        links: Where its links stand; None where that is not known.
+
+    Returns:
+        Figures by name.
+    """
+    method = {result.study.method.name: result}
+    figures = {
+        "convergence": convergence(method),
+        "cumulative-cost": cumulative_cost(method),
+        "path-loss": path_loss_by_receiver(method),
+    }
+    if links is not None:
+        figures["residual-over-distance"] = residual_over_distance(links)
+        if links.group is not None:
+            figures["residual-by-group"] = residual_by_group(links)
+    return figures | examined(result)
+
+
+def _unequal(results: Mapping[str, Record]) -> bool:
+    calls = [result.history["call"].max() for result in results.values()]
+    return bool(max(calls) > UNEQUAL * min(calls))
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and end of every run of links in a mask."""
+    edge = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [(int(start), int(end)) for start, end in edge.reshape(-1, 2)]

@@ -1,0 +1,250 @@
+"""Figures of how far a calibration can be trusted: values that the links leave possible, validation, diagnostics."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from calibray.result.record import Record
+from calibray.support.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    LINE,
+    ORANGE,
+    PALETTE,
+    dress,
+    plain_figure,
+    residual_figure,
+    styled,
+)
+from calibray.support.messages import shortened
+from calibray.validation.validation import Validation
+
+SHOWN: Final = 12
+"""Parameters that are shown, those that the links tell least first."""
+
+BARS: Final = 36
+"""Bars over the range of a parameter."""
+
+ROWS: Final = 14
+"""Rows of a figure of bars."""
+
+
+def examined(result: Record) -> dict[str, Figure]:
+    """The figures that there is something to show in.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        Figures by name.
+    """
+    tables, figures = result.diagnostics, {}
+    if all(len(result.uncertainty.draws.get(name, ())) > 1 for name in result.parameters):
+        figures["possible-values"] = possible_values(result)
+    if result.held_out is not None:
+        validation = Validation.of(result.held_out)
+        figures["held-out-errors"] = held_out_errors(validation)
+        figures["held-out-blocks"] = held_out_blocks(validation)
+    if "power" in tables:
+        figures["power"] = power(tables["power"])
+    if "neighbours" in tables:
+        figures["neighbours"] = neighbours(tables["neighbours"])
+    if "leverage" in tables:
+        figures["leverage"] = leverage(tables["leverage"])
+    if "depth" in tables and len(tables["depth"]) > 1:
+        figures["residual-by-depth"] = by_depth(tables["depth"])
+    return figures
+
+
+@styled()
+def possible_values(result: Record) -> Figure:
+    """Draws of every parameter over its range, with the pieces of its interval.
+
+    Args:
+        result: The calibration, with draws of every parameter.
+
+    Returns:
+        The figure.
+    """
+    names = sorted(result.parameters, key=lambda name: -_share(result, name))[:SHOWN]
+    columns = min(3, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(10.0 if columns > 1 else 6.4, 0.5 + 1.9 * rows), dpi=150, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, name in zip(panels, names, strict=False):
+        _possible(axes, result, name)
+    for axes in panels[len(names) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _possible(axes: Axes, result: Record, name: str) -> None:
+    section, interval = result.study.parameters[name], result.intervals.get(name)
+    lower, upper = map(float, section.bounds)
+    log = section.scale == "log"
+    ends = np.geomspace(lower, upper, BARS + 1) if log else np.linspace(lower, upper, BARS + 1)
+    dress(axes, shortened(name, 34), "")
+    count, _ = np.histogram(result.uncertainty.draws[name], ends)
+    axes.stairs(count / len(result.uncertainty.draws[name]), ends, fill=True, color=BLUE, alpha=0.45, lw=0)
+    for low, high in () if interval is None else (interval.pieces or ((interval.lower, interval.upper),)):
+        axes.plot([low, high], [0, 0], color=BLUE, lw=4, solid_capstyle="butt", clip_on=False, zorder=3)
+    axes.axvline(result.fit.initial_parameters[name], color=FAINT, lw=1.2, ls="--")
+    axes.axvline(result.parameters[name], color=ORANGE, lw=1.6)
+    axes.set(xlim=(lower, upper), ylim=(0, None), yticks=[])
+    if log:
+        axes.set_xscale("log")
+    axes.spines["left"].set_visible(False)
+    if interval is not None:
+        axes.set_title(interval.verdict, fontsize=9, color=FAINT, loc="right")
+
+
+def _share(result: Record, name: str) -> float:
+    """Share of a parameter's range that its draws spread over."""
+    section = result.study.parameters[name]
+    scale = np.log if section.scale == "log" else np.asarray
+    return float(
+        np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(np.array(section.bounds, dtype=float)))
+    )
+
+
+@styled()
+def held_out_errors(validation: Validation) -> Figure:
+    """Share of the links held out whose error is within so many dB, by model.
+
+    Args:
+        validation: The validation.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = plain_figure("Error of a link held out [dB]", "Share of links within it")
+    judged, reach = validation.block >= 0, 0.0
+    for name, color in _colors(validation):
+        error = np.sort(np.abs(validation.errors[name][judged]))
+        share = np.arange(1, len(error) + 1) / len(error)
+        reach = max(reach, float(np.quantile(error, 0.97)))
+        wide = 2.2 if name == validation.best else 1.2
+        axes.step(error, share, where="post", color=color, lw=wide, label=f"{name}: {_rmse(error):.2f} dB")
+    axes.set(xlim=(0, reach or 1.0), ylim=(0, 1.02))
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    return figure
+
+
+@styled()
+def held_out_blocks(validation: Validation) -> Figure:
+    """RMSE of every model on every block.
+
+    Args:
+        validation: The validation.
+
+    Returns:
+        The figure.
+    """
+    count = len(validation.labels)
+    figure, axes = plain_figure("Block", "RMSE held out [dB]")
+    for name, color in _colors(validation):
+        values = [_rmse(validation.errors[name][validation.block == number]) for number in range(count)]
+        best = name == validation.best
+        axes.plot(range(count), values, "o-" if best else "o--", color=color, ms=5 if best else 3.5,
+                  lw=1.8 if best else 0.8, label=name)  # fmt: skip
+    step = -(-count // 12)
+    axes.set_xticks(range(0, count, step), [shortened(label, 12) for label in validation.labels[::step]])
+    axes.set_ylim(0, None)
+    axes.legend(frameon=False, fontsize=8, ncols=2)
+    return figure
+
+
+def _colors(validation: Validation) -> list[tuple[str, str]]:
+    """Models with the colour of each; the calibrated ones have those of the page."""
+    calibrated = iter((BLUE, ORANGE, GREEN))
+    others = iter((FAINT, *PALETTE, *PALETTE))
+    return [
+        (name, next(calibrated, INK) if name.startswith("calibrated") else next(others))
+        for name in validation.errors
+    ]
+
+
+def _rmse(error: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
+
+
+@styled()
+def power(table: pd.DataFrame) -> Figure:
+    """Share of the links' power by what its paths meet.
+
+    Args:
+        table: The diagnostics' table "power".
+
+    Returns:
+        The figure.
+    """
+    shown = table.head(ROWS)
+    names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
+    figure, axes = plain_figure("Share of a link's power, on the mean [%]", "", height=1.2 + 0.3 * len(shown))
+    axes.grid(axis="y", visible=False)
+    axes.grid(axis="x", color=LINE)
+    axes.barh(range(len(shown)), 100 * shown["share"], color=BLUE, height=0.6)
+    axes.set_yticks(range(len(shown)), [shortened(name, 30) for name in names])
+    axes.invert_yaxis()
+    return figure
+
+
+@styled()
+def neighbours(table: pd.DataFrame) -> Figure:
+    """Semivariance of residuals over the distance between links.
+
+    Args:
+        table: The diagnostics' table "neighbours".
+
+    Returns:
+        The figure.
+    """
+    figure, axes = plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
+    axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=BLUE)
+    axes.set(xlim=(0, None), ylim=(0, None))
+    return figure
+
+
+@styled()
+def leverage(table: pd.DataFrame) -> Figure:
+    """Residual of every link over its leverage.
+
+    Args:
+        table: The diagnostics' table "leverage".
+
+    Returns:
+        The figure.
+    """
+    figure, axes = residual_figure("Leverage")
+    size = 40 if len(table) <= 100 else 16 if len(table) <= 1000 else 5
+    axes.scatter(table["leverage"], table["residual_db"], s=size, c=BLUE, alpha=0.7, lw=0,
+                 rasterized=len(table) > 2000)  # fmt: skip
+    axes.set_xlim(0, None)
+    return figure
+
+
+@styled()
+def by_depth(table: pd.DataFrame) -> Figure:
+    """Mean residual by the number of interactions of the strongest path, with its standard error.
+
+    Args:
+        table: The diagnostics' table "depth".
+
+    Returns:
+        The figure.
+    """
+    figure, axes = residual_figure("Interactions of the strongest path")
+    error = table["standard_deviation_db"] / np.sqrt(table["links"])
+    axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=BLUE, capsize=3)
+    labels = [f"{row.depth:.0f}\n({row.links:,})" for row in table.itertuples()]
+    axes.set_xticks(table["depth"].to_numpy(float), labels)
+    axes.set_xlim(table["depth"].min() - 0.5, table["depth"].max() + 0.5)
+    return figure

@@ -1,0 +1,315 @@
+"""The files of a result: written whole, and read back into the same sections by a closed model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from calibray.errors import InputError
+from calibray.result.held_out import HeldOutErrors, Model
+from calibray.result.record import (
+    Accuracy,
+    Cost,
+    Count,
+    Fit,
+    Nuisance,
+    Prediction,
+    Provenance,
+    Record,
+    Uncertainty,
+)
+from calibray.result.rows import COLUMNS, read_rows
+from calibray.scenes import export_scene, read_scene
+from calibray.study import Study
+from calibray.study.validation_errors import explain
+from calibray.support.messages import shortened
+from calibray.support.output_files import check_outputs, check_unchanged, write_text
+from calibray.support.strict_models import Section
+
+VERSION: Final = 1
+"""The version of `result.json` that is written and read."""
+
+FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
+"""What a result is written to; users have files called links.csv and scene.xml themselves."""
+
+RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
+VALIDATION_FILE: Final = "result-validation.json"
+
+
+class LinkCounts(Section):
+    """Numbers of links, for readers of the file; see `Record.counts`."""
+
+    calibrated_on: Count
+    held_out: Count
+    rows_without_path: tuple[int, ...]
+    rows_with_enclosed_tx: tuple[int, ...] | None
+    rows_with_enclosed_rx: tuple[int, ...] | None
+
+
+class Stored(Section):
+    """The content of `result.json`: the sections of a `Record`."""
+
+    version: Literal[1]
+    study_file: str
+    study: dict[str, Any]
+    links: LinkCounts
+    fit: Fit
+    accuracy: Accuracy
+    uncertainty: Uncertainty
+    nuisance: Nuisance
+    prediction: Prediction
+    cost: Cost
+    provenance: Provenance
+    sentences: tuple[str, ...] = ()
+
+
+SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "cost", "provenance")
+
+
+def content(record: Record, sentences: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A result as plain values, without its tables.
+
+    Args:
+        record: The result.
+        sentences: Its remarks as text.
+
+    Returns:
+        The content of `result.json`.
+    """
+    values = {
+        name: TypeAdapter(type(part)).dump_python(part, mode="json") for name, part in _sections(record)
+    }
+    return {
+        "version": VERSION,
+        "study_file": str(record.study.path.resolve()),
+        "study": record.study.content(),
+        "links": record.counts,
+        **values,
+        "sentences": list(sentences),
+    }
+
+
+def _sections(record: Record) -> list[tuple[str, Any]]:
+    return [(name, getattr(record, name)) for name in SECTIONS]
+
+
+def write(
+    record: Record,
+    folder: str | Path,
+    overwrite: bool = False,
+    *,
+    sentences: tuple[str, ...] = (),
+    validation: dict[str, Any] | None = None,
+) -> None:
+    """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
+
+    Each file is written next to its place and then moved there, so that none is ever half-written.
+
+    Args:
+        record: The result.
+        folder: Folder to write into; made if absent.
+        overwrite: Replace files that Calibray did not write.
+        sentences: Its remarks as text.
+        validation: Figures of the validation, for readers of the file.
+
+    Raises:
+        InputError: The folder cannot be written, or a file there must not be replaced.
+    """
+    target = check_outputs(folder, (*FILES, VALIDATION_FILE), record.study.files(), overwrite)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        study = record.study
+        scene = record.scene or read_scene(
+            study.scene_source, study.scene.frequency, study.overrides, study.objects
+        )
+        export_scene(scene, record.materials, target / SCENE_FILE)
+        write_text(target / LINKS_FILE, record.links.to_csv(index=False, float_format="%.10g"))
+        write_text(target / HISTORY_FILE, record.history.to_csv(index=False, float_format="%.9g"))
+        # A validation of an earlier calibration must not stay.
+        (target / VALIDATION_FILE).unlink(missing_ok=True)
+        if record.held_out is not None:
+            write_validation(record.held_out, target, validation or {})
+        write_text(target / RESULT_FILE, json.dumps(content(record, sentences), indent=2) + "\n")
+    except OSError as error:
+        raise InputError(
+            f"output folder {target}: cannot be written ({error.strerror}); name another"
+        ) from None
+
+
+def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str, Any]:
+    """Read a folder that `write` wrote.
+
+    Args:
+        folder: The folder.
+        allow_changed_inputs: Read it although its files changed since they were written.
+
+    Returns:
+        The fields of a `Record`.
+
+    Raises:
+        InputError: The folder holds no result, one of another version, or one that was damaged or edited.
+    """
+    source = Path(folder) / RESULT_FILE
+    stored, study = _read_stored(source)
+    links, history = (read_rows(source.parent, name, columns) for name, columns in COLUMNS.items())
+    if not allow_changed_inputs:
+        for name in (RESULT_FILE, *COLUMNS, VALIDATION_FILE):
+            if (source.parent / name).exists():
+                check_unchanged(source.parent / name)
+    held_out = read_validation(source.parent, len(links))
+    sections = {name: getattr(stored, name) for name in SECTIONS}
+    return {"study": study, "links": links, "history": history, "held_out": held_out, **sections}
+
+
+def _read_stored(source: Path) -> tuple[Stored, Study]:
+    try:
+        values = json.loads(source.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{source}: is no result of `calibray run` ({error}); name its --out folder"
+        ) from None
+    if not isinstance(values, dict):
+        raise InputError(f"{source}: holds no table; run the study again")
+    if values.get("version") != VERSION:
+        raise InputError(
+            f"{source}: has version {shortened(repr(values.get('version')))}, need {VERSION}; run the study again"
+        )
+    try:
+        # From JSON, lists pass for tuples and nothing else is converted.
+        stored = Stored.model_validate_json(json.dumps(values))
+    except RecursionError:
+        raise InputError(f"{source}: is nested too deep; run the study again") from None
+    except ValidationError as error:
+        refusal = explain(error, Stored, values, str(source))
+        raise refusal from None
+    study = Study.from_content(stored.study, stored.study_file)
+    _check_consistent(stored, study, source)
+    return stored, study
+
+
+def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
+    """Refuse sections that contradict each other or the study."""
+    names, fit = list(study.parameters), stored.fit
+    for key, values in (("parameters", fit.parameters), ("initial_parameters", fit.initial_parameters)):
+        if sorted(values) != sorted(names):
+            odd = sorted(set(names) ^ set(values))[0]
+            raise InputError(
+                f"{source}: fit.{key}: {shortened(repr(odd))} is missing or not among the study's parameters; run "
+                "the study again"
+            )
+    for name in names:
+        material, _, constant = name.rpartition(".")
+        if material not in fit.materials:
+            raise InputError(
+                f"{source}: fit.materials: {shortened(repr(material))} is calibrated and missing; run the study again"
+            )
+        value, calibrated = getattr(fit.materials[material], constant, None), fit.parameters[name]
+        # A coefficient of a law is no constant of the material itself.
+        if value is not None and abs(value - calibrated) > 1e-9 * max(abs(value), 1e-300):
+            raise InputError(
+                f"{source}: fit.materials.{material}.{constant} = {value:g}, but fit.parameters has {calibrated:g}; "
+                "run the study again"
+            )
+    uncertainty, nuisance = stored.uncertainty, stored.nuisance
+    if unknown := sorted(set(uncertainty.intervals) - set(names)):
+        raise InputError(
+            f"{source}: uncertainty.intervals: {shortened(repr(unknown[0]))} is no parameter of the study"
+        )
+    lengths = {len(values) for values in uncertainty.draws.values()}
+    if len(lengths) > 1 or (uncertainty.draws and not set(names) <= set(uncertainty.draws)):
+        raise InputError(f"{source}: uncertainty.draws: are not one of each parameter; run the study again")
+    offset = {"offset"} if study.offset is not None else set()
+    if set(nuisance.coefficients) != set(study.nuisance) | offset:
+        raise InputError(f"{source}: nuisance.coefficients: are not those of the study; run the study again")
+    if wild := [value for value in nuisance.offsets_db.values() if abs(value) > 500]:
+        raise InputError(
+            f"{source}: nuisance.coefficients.offset: {wild[0]:g} dB is beyond -500 to 500; run the study again"
+        )
+
+
+def write_validation(held_out: HeldOutErrors, folder: Path, figures: dict[str, Any]) -> None:
+    """Write held-out errors into a result's folder.
+
+    Args:
+        held_out: The errors.
+        folder: The folder.
+        figures: What follows from them, for readers of the file.
+    """
+    values = {
+        "version": VERSION,
+        **figures,
+        "blocks": list(held_out.labels),
+        "level": held_out.level,
+        "links": {
+            "block": held_out.block.tolist(),
+            "position": np.round(held_out.position, 4).tolist(),
+            "errors_db": {str(name): _rounded(errors) for name, errors in held_out.errors.items()},
+        },
+    }
+    write_text(folder / VALIDATION_FILE, json.dumps(values, indent=2) + "\n")
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float | None]:
+    """Values to 0.0001 dB; None for what is not finite, which JSON does not know."""
+    return [round(value, 4) if np.isfinite(value) else None for value in values.tolist()]
+
+
+def read_validation(folder: Path, links: int) -> HeldOutErrors | None:
+    """Read the held-out errors of a result.
+
+    Args:
+        folder: The result's folder.
+        links: Number of links of the result.
+
+    Returns:
+        The errors; None without validation.
+
+    Raises:
+        InputError: The file was damaged, edited, or belongs to other links.
+    """
+    file = folder / VALIDATION_FILE
+    if not file.is_file():
+        return None
+    try:
+        return _checked_validation(file, json.loads(file.read_text(encoding="utf-8")), links)
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"{file}: is no validation of `calibray validate` ({error}); validate again"
+        ) from None
+
+
+def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldOutErrors:
+    if values["version"] != VERSION:
+        raise InputError(f"{file}: has version {values['version']!r}, need {VERSION}; validate again")
+    rows = values["links"]
+    held_out = HeldOutErrors(
+        labels=tuple(map(str, values["blocks"])),
+        block=np.array(rows["block"], dtype=np.int64),
+        errors={str(name): np.array(errors, dtype=float) for name, errors in rows["errors_db"].items()},
+        position=np.array(rows["position"], dtype=float),
+        level=float(values["level"]),
+    )
+    block, position = held_out.block, held_out.position
+    lengths = {"block": len(block), "position": len(position)}
+    lengths |= {name: len(errors) for name, errors in held_out.errors.items()}
+    if wrong := [name for name, length in lengths.items() if length != links]:
+        raise InputError(f"{file}: {wrong[0]} is not of the result's {links} links; validate again")
+    judged = block >= 0
+    if position.shape != (links, 3) or not judged.any() or block.max() >= len(held_out.labels):
+        raise InputError(f"{file}: blocks or positions are not those of a validation; validate again")
+    if not all(np.isfinite(errors[judged]).all() for errors in held_out.errors.values()):
+        raise InputError(f"{file}: an error of a judged link is missing; validate again")
+    if not {Model.INITIAL, Model.CALIBRATED} <= set(held_out.errors):
+        raise InputError(
+            f"{file}: is no validation of `calibray validate` (a model is missing); validate again"
+        )
+    if not 0 < held_out.level < 1:
+        raise InputError(f"{file}: level = {held_out.level:g} is not between 0 and 1; validate again")
+    return held_out

@@ -1,0 +1,90 @@
+"""Held-out errors: residuals of several models on links that none of them was fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from calibray.result.verdict import CONFIDENCE
+
+
+class Model(StrEnum):
+    """The models that validation compares."""
+
+    INITIAL = "initial materials"
+    CALIBRATED = "calibrated"
+    PRIOR = "calibrated with prior"
+    SLOPE = "calibrated with slope"
+    PER_TRANSMITTER = "calibrated, offset per transmitter"
+    PRIOR_PER_TRANSMITTER = "calibrated with prior, offset per transmitter"
+    RESIDUAL_FIELD = "calibrated with residual field"
+    LOG_DISTANCE = "log-distance"
+    KRIGING = "kriging"
+
+
+BASELINES: Final = (Model.INITIAL, Model.LOG_DISTANCE, Model.KRIGING)
+"""Models that calibrate no material."""
+
+FITTED: Final = (
+    Model.CALIBRATED,
+    Model.PRIOR,
+    Model.SLOPE,
+    Model.PER_TRANSMITTER,
+    Model.PRIOR_PER_TRANSMITTER,
+)
+"""Models that calibrate materials and can make predictions anywhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutErrors:
+    """Residuals of several models on the same links, each link predicted without its block.
+
+    Attributes:
+        labels: Names of the blocks.
+        block: Block of every link [links]; -1 where it is not judged.
+        errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN where it is not judged.
+        position: Positions of the receivers [links, 3], [m].
+        level: Nominal coverage of the intervals.
+    """
+
+    labels: tuple[str, ...]
+    block: NDArray[np.int64]
+    errors: dict[str, NDArray[np.float64]]
+    position: NDArray[np.float64]
+    level: float = 0.9
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The calibrated model compared with its best baseline, on links that neither was fitted to.
+
+    Attributes:
+        links: Number of links.
+        rmse_db: RMSE of the calibrated model [dB].
+        baseline: Name of the best baseline.
+        baseline_rmse_db: Its RMSE [dB].
+        error_db: Bootstrap standard error of the difference [dB].
+        clusters: Number of clusters of neighbouring links that were resampled.
+    """
+
+    links: int
+    rmse_db: float
+    baseline: str
+    baseline_rmse_db: float
+    error_db: float
+    clusters: int
+
+    @property
+    def gain_db(self) -> float:
+        """RMSE of the baseline minus that of the calibrated model [dB]; positive where calibration helped."""
+        return self.baseline_rmse_db - self.rmse_db
+
+    @property
+    def helped(self) -> bool:
+        """Whether the gain exceeds its standard error significantly (Student's t, one degree less than clusters)."""
+        return self.gain_db > float(stdtrit(max(self.clusters - 1, 1), (1 + CONFIDENCE) / 2)) * self.error_db

@@ -1,0 +1,62 @@
+"""The prediction model: what predictions, maps and exports use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class FittedTerm:
+    """A nuisance term with its coefficients.
+
+    Attributes:
+        name: Its name.
+        by: Its column: "constant", "log_distance", or a column of the links' table.
+        per: Its groups: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
+        coefficients: Coefficient by group, [dB] per unit of the column; groups without data have the others' mean.
+        centre: What is subtracted from the column.
+    """
+
+    name: str
+    by: str
+    per: str
+    coefficients: dict[str, float]
+    centre: float = 0.0
+
+
+@dataclass(frozen=True)
+class PredictionModel:
+    """The model that validation chose, fitted to all links.
+
+    Attributes:
+        name: Its name; see `held_out.Model`.
+        parameters: Values of the parameters in the fields' units; None where the model uses no scene.
+        terms: Its nuisance terms.
+        residual_db: Root mean square of its held-out residuals [dB].
+        basis: The links that these residuals were computed on.
+        links: Number of these links.
+        sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
+    """
+
+    name: str
+    parameters: dict[str, float] | None
+    terms: tuple[FittedTerm, ...] = field(default_factory=tuple)
+    residual_db: float = 0.0
+    basis: str = ""
+    links: int = 1
+    sizes_db: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class ResidualField:
+    """The spatially correlated part of the residuals; see `prediction.residual_field`.
+
+    Attributes:
+        range_m: Distance at which the correlation has fallen to 1/e [m].
+        shared_db: Standard deviation of the correlated part [dB].
+        own_db: Standard deviation of each link's uncorrelated part [dB].
+    """
+
+    range_m: float
+    shared_db: float
+    own_db: float

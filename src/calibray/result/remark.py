@@ -1,0 +1,40 @@
+"""Remarks: warnings and advice about a calibration, as data. `wording` makes sentences of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class RemarkKind(StrEnum):
+    """What a remark says; the comments name the values of each."""
+
+    CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
+    HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
+    HETEROGENEITY = "heterogeneity"  # weight, gaussian_weight
+    UNDECLARED_OFFSET = "undeclared offset"  # offset_db, error_db, rmse_db, rmse_without_db
+    MISSED_OPTIMUM = "missed optimum"  # draws_db, found_db
+    OUTSIDE_INTERVAL = (
+        "outside interval"  # names, values, pieces (ends in a row), most_probable, cause, odds, blocks
+    )
+    FEW_DRAWS = "few draws"
+    APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
+    NO_CHEAP_MODEL = "no cheap model"  # cause
+    NOT_JUDGED = "not judged"
+
+
+Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
+"""What JSON can hold of a remark."""
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One warning or piece of advice.
+
+    Attributes:
+        kind: What it says.
+        values: Its numbers and names; see `RemarkKind`.
+    """
+
+    kind: RemarkKind
+    values: dict[str, Value] = field(default_factory=dict)

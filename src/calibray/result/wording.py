@@ -1,0 +1,278 @@
+"""The sentences of a result, for terminal, page and JSON. Statistics return data; only this module makes text of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from calibray.result.held_out import HeldOutErrors, Judgement, Model
+from calibray.result.record import Record
+from calibray.result.remark import Remark, RemarkKind
+from calibray.result.verdict import Interval, Reason, ReasonKind
+
+MOST_ODDS: Final = 1000.0
+"""Odds beyond which the number itself is not reported."""
+
+SHOWN_PIECES: Final = 3
+"""Most pieces of an interval that are listed one by one."""
+
+NOT_JUDGED: Final = (
+    "No links were held out, so nothing shows which model predicts new links best. Set [holdout] blocks = 4, or run "
+    "calibray validate."
+)
+
+
+def interval_text(interval: Interval) -> str:
+    """The ends of an interval, of each piece while they are few.
+
+    Args:
+        interval: The interval.
+
+    Returns:
+        The ends, as "2.1 to 3.4".
+    """
+    hull = ((interval.lower, interval.upper),)
+    pieces = interval.pieces if 1 < len(interval.pieces) <= SHOWN_PIECES else hull
+    return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in pieces)
+
+
+def reason_text(reason: Reason | None) -> str:
+    """Why a verdict is what it is.
+
+    Args:
+        reason: The reason.
+
+    Returns:
+        A clause without a full stop; empty without a reason.
+    """
+    return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
+
+
+def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
+    text = f"90 % of the posterior covers {values['share']:.0%} of the range"
+    if ranges:
+        others = ", ".join(f"{low:.4g} to {high:.4g} ({weight:.0%} of it)" for low, high, weight in ranges)
+        text += f"; the 95 % interval also includes {others}"
+    return text
+
+
+def _separate(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
+    modes = ", ".join(f"{value:.4g} ({weight:.0%} of the posterior)" for value, weight in ranges)
+    return f"{len(ranges)} separate ranges fit the links, around {modes}"
+
+
+_REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ...], ...]], str]]] = {
+    ReasonKind.WIDTH: _width,
+    ReasonKind.SEPARATE_RANGES: _separate,
+    ReasonKind.SEEN_BUILDINGS: lambda values, _: (
+        f"for the buildings that were measured it is known to {values['share']:.0%} of the range; other buildings of "
+        "this material may differ"
+    ),
+    ReasonKind.AT_BOUND: lambda values, _: (
+        f"the interval reaches the {values['side']} bound: the links only show that the value is "
+        f"{'below' if values['side'] == 'lower' else 'above'} {values['value']:.4g}"
+    ),
+    ReasonKind.NO_EFFECT: lambda values, _: (
+        f"no link's path loss changes by more than {values['change_db']:.1f} dB over the whole range"
+    ),
+    ReasonKind.TRADE_OFF: lambda values, _: (
+        f"it trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"
+    ),
+    ReasonKind.CONFOUNDED: lambda values, _: (
+        f"links change by up to {values['change_db']:.1f} dB over its range, but other unknowns compensate: an offset, "
+        "or noise that links share"
+    ),
+    ReasonKind.NOISE: lambda values, _: (
+        f"links change by up to {values['change_db']:.1f} dB over its range, too little against noise of "
+        f"{values['noise_db']:.1f} dB"
+    ),
+    ReasonKind.TOO_FEW_LINKS: lambda values, _: (
+        f"{values['links']:.0f} links are too few for this number of unknowns"
+    ),
+    ReasonKind.TOO_FEW_DRAWS: lambda values, _: (
+        f"too few draws fit the data to rule out more than {1 - values['share']:.0%} of the range"
+    ),
+    ReasonKind.TOO_FEW_CALLS: lambda values, _: (
+        f"{values['calls']:.0f} calls of the engine are too few to show how path loss depends on any parameter"
+    ),
+    ReasonKind.NO_NOISE: lambda values, _: "the data contain no noise",
+    ReasonKind.TOO_MANY_LINKS: lambda values, _: (
+        f"from the curvature at the optimum alone: for more than {values['limit']:,.0f} links, correlated noise is not "
+        "considered"
+    ),
+    ReasonKind.TOO_EXPENSIVE: lambda values, _: (
+        "from the curvature at the optimum alone: draws would cost more than five calibrations"
+    ),
+}
+
+
+def remark_text(remark: Remark) -> str:
+    """A warning or advice.
+
+    Args:
+        remark: The remark.
+
+    Returns:
+        One or several sentences.
+    """
+    return _REMARKS[remark.kind](remark.values)
+
+
+def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
+    return lambda values: (
+        f"{finding} (weight {values['weight']:.2f}, independent Gaussian noise {values['gaussian_weight']:.2f}). The "
+        "intervals allow for it."
+    )
+
+
+_CAUSES: Final = {
+    "correlated": "neighbouring links share part of their noise, so that many links count as few",
+    "student-t": "outliers count less where noise has heavy tails",
+    "heterogeneous": "links that depend on single buildings count less where buildings differ",
+    "gaussian": "the noise differs in a way that squares do not show",
+}
+
+
+def _ranges(ends: list[float]) -> str:
+    return ", ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(ends[::2], ends[1::2], strict=True))
+
+
+def _outside_interval(values: dict[str, Any]) -> str:
+    odds = values["odds"]
+    times = f"more than {MOST_ODDS:,.0f}" if odds >= 0.999 * MOST_ODDS else f"{odds:.2g}"
+    rows = zip(values["names"], values["values"], values["pieces"], values["most_probable"], strict=True)
+    parameters = "; ".join(
+        f"{name} {value:.4g}, interval {_ranges(ends)}, most probable {probable:.4g}"
+        for name, value, ends, probable in rows
+    )
+    text = (
+        f"The candidate of least RMSE is not the most probable one: {parameters}. RMSE treats the "
+        f"noise of all links as independent; the intervals do not, since {_CAUSES[values['cause']]}. The most probable "
+        f"values are {times} times as probable. Do not take the values of least RMSE for the materials' constants."
+    )
+    if values["blocks"]:
+        return text + " Held-out blocks show which model predicts best."
+    return (
+        text
+        + " Predictions use the values of least RMSE unless validation chooses another model: set [holdout] blocks = 4."
+    )
+
+
+def _approximate_intervals(values: dict[str, Any]) -> str:
+    replay = ", with the corrected replay of its scene" if values["replay"] else ""
+    return (
+        f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
+        f"fitted to {values['calls']} of its calls{replay}. It predicts the better half of these calls to "
+        f"{values['error_db']:.2g} dB, each from all others."
+    )
+
+
+_REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
+    RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
+    RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
+    RemarkKind.HETEROGENEITY: _noise_remark(
+        "The noise is larger where materials matter more, as if buildings of one material differed"
+    ),
+    RemarkKind.UNDECLARED_OFFSET: lambda values: (
+        f"The data show an undeclared offset of {values['offset_db']:+.1f} dB, standard error {values['error_db']:.1f} "
+        f"dB. With it the RMSE would be {values['rmse_db']:.2f} instead of {values['rmse_without_db']:.2f} dB. Add "
+        "[offset] if cables or antenna gains may be off."
+    ),
+    RemarkKind.MISSED_OPTIMUM: lambda values: (
+        f"The method missed the optimum: draws reach {values['draws_db']:.2f} dB, the method {values['found_db']:.2f} "
+        "dB. The intervals are those around the optimum."
+    ),
+    RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
+    RemarkKind.FEW_DRAWS: lambda values: (
+        "Too few draws fit the data among so many parameters. The intervals are rough, and a mode may be missing. "
+        "Calibrate fewer parameters, or give them priors."
+    ),
+    RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
+    RemarkKind.NO_CHEAP_MODEL: lambda values: f"There is no cheap model: {values['cause']}.",
+    RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
+}
+
+
+def judgement_text(judgement: Judgement) -> str:
+    """Whether calibration helped on held-out links, over which baseline, by how much, and how certain that is.
+
+    Args:
+        judgement: The comparison.
+
+    Returns:
+        A sentence.
+    """
+    error = f"RMSE {judgement.rmse_db:.2f} dB on {judgement.links} held-out links"
+    baseline = f"than {judgement.baseline}, the best baseline (bootstrap error {judgement.error_db:.2f} dB)"
+    if judgement.gain_db <= 0:
+        return f"Calibration did not help on held-out links: {error}, {-judgement.gain_db:.2f} dB more {baseline}."
+    verb = "helped" if judgement.helped else "did not clearly help"
+    return f"Calibration {verb} on held-out links: {error}, {judgement.gain_db:.2f} dB less {baseline}."
+
+
+def choice_text(chosen: str, best: str) -> str:
+    """Which model predictions use, and why.
+
+    Args:
+        chosen: The prediction model.
+        best: The model of least held-out RMSE among those that predict anywhere.
+
+    Returns:
+        A sentence.
+    """
+    if chosen == best:
+        return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks."
+    reason = "uses the scene" if best == Model.LOG_DISTANCE else "keeps the initial materials"
+    return (
+        f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
+        "bootstrap error."
+    )
+
+
+def chosen_model_text(record: Record) -> str:
+    """The held-out accuracy of the prediction model, where it is not the calibrated one.
+
+    Args:
+        record: The result.
+
+    Returns:
+        A sentence; empty where predictions use the calibrated model.
+    """
+    model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
+    if model is None or model.name == Model.CALIBRATED or calibrated_db is None:
+        return ""
+    return (
+        f"On held-out blocks the prediction model {model.name!r} has {model.residual_db:.2f} dB, the calibrated model "
+        f"{calibrated_db:.2f} dB."
+    )
+
+
+def block_sentence(held_out: HeldOutErrors) -> str:
+    """How many blocks were held out.
+
+    Args:
+        held_out: The held-out errors.
+
+    Returns:
+        A sentence.
+    """
+    return f"{len(held_out.labels)} blocks of links were held out in turn."
+
+
+def remarks(record: Record, choice: str = "") -> tuple[str, ...]:
+    """All remarks about a result.
+
+    Args:
+        record: The result.
+        choice: Why predictions use their model, where validation chose it.
+
+    Returns:
+        The sentences: warnings and advice, the judgement on held-out links, the choice of the prediction model.
+    """
+    sentences = [remark_text(remark) for remark in record.uncertainty.remarks]
+    if record.accuracy.judgement is not None:
+        sentences.append(judgement_text(record.accuracy.judgement))
+    chosen = chosen_model_text(record)
+    if chosen:
+        sentences.append(f"{choice} {chosen}".strip())
+    return tuple(sentences)

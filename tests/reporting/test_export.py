@@ -1,0 +1,143 @@
+"""The export: plain Sionna RT, in a process of its own, gives the reported path loss; materials are as calibrated."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import calibray as cb
+import planted
+from calibray.calibration.result import Result
+from calibray.cli.app import app
+from calibray.errors import InputError
+from calibray.materials import Material
+from calibray.reporting.export import FILES, export, matlab
+from calibray.scenes import export_scene, read_scene
+from changed import changed
+from small_scenes import block, write_scene
+
+LIMIT_DB = 0.05
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study calibrated on the street canyon, with an offset per half and dipoles, and its result in `out`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CALIBRAY_CACHE", "")
+        target = tmp_path_factory.mktemp("study")
+        table = planted.campaign(noise_db=0.3, blocked=True)
+        study = planted.study(
+            target,
+            table.assign(path_loss_db=table.path_loss_db.where(np.isfinite(table.path_loss_db), 110.0)),
+            offset={"per": "half"},
+            antennas={"tx": {"pattern": "dipole", "polarization": "V", "orientation": [0.0, 0.2, 0.0]}},
+            method={"name": "auto", "options": {"starts": 4, "iterations": 10}},
+        )
+        cb.calibrate(study, out=target / "out")
+        return target
+
+
+def test_plain_sionna_gives_the_reported_path_loss(folder, tmp_path):
+    """One receiver at a time, from a folder that was moved away with its meshes."""
+    done = CliRunner().invoke(app, ["export", str(folder / "out"), "-o", str(tmp_path / "here"), "--copy"])
+    assert (done.exit_code, done.stdout) == (0, ""), done.output
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    ran = subprocess.run(
+        [sys.executable, tmp_path / "there" / "load_scene.py"], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    rows = list(csv.DictReader(io.StringIO(ran.stdout)))
+    links = Result.load(folder / "out").links
+    assert [int(row["row"]) for row in rows] == links.row.tolist()
+    computed = np.array([float(row["computed_db"]) for row in rows])
+    assert np.isinf(computed).tolist() == np.isinf(links.after_db).tolist()
+    reached = np.isfinite(computed)
+    assert reached.sum() == len(links) - 1
+    assert computed[reached] == pytest.approx(links.after_db[reached].to_numpy(), abs=LIMIT_DB)
+    # Nor would the scene before calibration, or one without offsets, have done.
+    assert np.abs(computed[reached] - links.before_db[reached].to_numpy()).max() > 10 * LIMIT_DB
+    assert "calibray" not in (tmp_path / "there" / "load_scene.py").read_text().replace("Calibray", "")
+
+
+def test_tables_hold_the_calibrated_constants_and_intervals(folder, tmp_path):
+    result = Result.load(folder / "out")
+    assert export(result, tmp_path) == FILES
+    assert all((tmp_path / name).is_file() for name in FILES)
+    table = pd.read_csv(tmp_path / "materials.csv").set_index("material")
+    content = json.loads((tmp_path / "materials.json").read_text())
+    for name, value in result.parameters.items():
+        material, _, constant = name.rpartition(".")
+        assert table.loc[material, constant] == pytest.approx(value)
+        interval = result.intervals[name]
+        assert table.loc[material, f"{constant}_lower"] == pytest.approx(interval.lower)
+        assert content[material][f"{constant}_upper"] == pytest.approx(interval.upper)
+        assert content[material][f"{constant}_verdict"] == interval.verdict
+    scene = read_scene(tmp_path / "scene.xml", result.study.scene.frequency)
+    assert scene.materials[table.loc["wood", "scene_name"]] == result.materials["wood"]
+
+
+def test_coefficients_over_frequency_are_exported(folder, tmp_path):
+    law = {"itu_a": 5.1, "itu_b": 0.1, "itu_c": 0.02, "itu_d": 0.9}
+    export(changed(Result.load(folder / "out"), laws={"wood": law}), tmp_path)
+    content = json.loads((tmp_path / "materials.json").read_text())
+    assert {name: content["wood"][name] for name in law} == law
+    assert "itu_a" not in content["marble"]
+
+
+@pytest.mark.skipif(shutil.which("octave-cli") is None, reason="needs octave-cli")
+def test_octave_reads_the_materials(tmp_path):
+    names = ["it's", 'a "b" % c', "nan\nbanana"]
+    table = pd.DataFrame({"material": names, "relative_permittivity": [2.5, np.nan, 4.0]})
+    (tmp_path / "materials.m").write_text(matlab(table, 3.5e9))
+    code = "T = materials; printf('%s|', T.material{:}); printf('%g,', T.relative_permittivity);"
+    ran = subprocess.run(
+        ["octave-cli", "--norc", "--eval", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ran.stdout == 'it\'s|a "b" % c|nan\\nbanana|2.5,NaN,4,', ran.stderr
+
+
+def test_meshes_of_one_name_are_kept_apart(tmp_path):
+    scene = read_scene(
+        write_scene(tmp_path, {"a": block((0, 0, 0), (1, 1, 1)), "b": block((2, 2, 0), (3, 3, 1))}), 3e9
+    )
+    (tmp_path / "more").mkdir()
+    shutil.move(tmp_path / "meshes" / "b.ply", tmp_path / "more" / "a.ply")
+    scene = replace(scene, xml=scene.xml.replace("meshes/b.ply", "more/a.ply"))
+    (tmp_path / "out").mkdir()
+    stone = {"stone": Material(5.0, 0.05, 0.2)}
+    export_scene(scene, stone, tmp_path / "out" / "scene.xml", copy_meshes=True)
+    copies = {path.name: path.read_text() for path in (tmp_path / "out" / "meshes").glob("*.ply")}
+    assert copies == {
+        "a.ply": (tmp_path / "meshes" / "a.ply").read_text(),
+        "a-2.ply": (tmp_path / "more" / "a.ply").read_text(),
+    }
+    assert len(read_scene(tmp_path / "out" / "scene.xml", 3e9).objects) == 2
+
+
+def test_files_of_others_are_not_replaced(folder, tmp_path):
+    result = Result.load(folder / "out")
+    (tmp_path / "links.csv").write_text("mine")
+    with pytest.raises(InputError, match="was not written by Calibray"):
+        export(result, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["links.csv"]
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(InputError, match="was not written by Calibray"):
+        cb.report(result, tmp_path / "report.html")
+    export(result, tmp_path, overwrite=True)
+    export(result, tmp_path)
+
+
+def test_a_folder_that_is_a_file_is_refused(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file; name another folder"):
+        export(Result.load(folder / "out"), tmp_path / "file")

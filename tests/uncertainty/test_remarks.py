@@ -1,0 +1,48 @@
+"""The remark on values of least RMSE that lie outside their own intervals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import planted
+from calibray.fitting.problem import Problem
+from calibray.measurements import links_from_frame
+from calibray.result import Interval, RemarkKind, Verdict
+from calibray.result.wording import remark_text
+from calibray.study import Setup, Study
+from calibray.uncertainty.noise_models import CORRELATED
+from calibray.uncertainty.remarks import outside_interval
+
+NAMES = tuple(planted.TRUTH)
+
+
+def remarks(optimum: dict[str, float], log_odds: float = 3.0, **sections: Any) -> tuple[str, ...]:
+    study = Study.from_content(planted.content("links.csv", **sections))
+    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
+    pieces = ((2.0, 3.0), (6.0, 9.0))
+    intervals = {name: Interval(0.1, 2.0, 9.0, Verdict.AMBIGUOUS, pieces) for name in NAMES}
+    probable, noise = dict.fromkeys(NAMES, 7.0), {CORRELATED: 0.9, "gaussian": 0.1}
+    found = outside_interval(problem, optimum, intervals, probable, log_odds, noise)
+    assert all(remark.kind is RemarkKind.OUTSIDE_INTERVAL for remark in found)
+    return tuple(map(remark_text, found))
+
+
+def test_values_within_their_intervals_give_no_remark():
+    assert remarks(dict.fromkeys(NAMES, 2.5)) == ()
+    assert remarks(dict.fromkeys(NAMES, 5.9)) == ()  # within the slack
+
+
+def test_values_outside_their_intervals_are_named_with_the_reason():
+    outside = {**dict.fromkeys(NAMES, 2.5), NAMES[1]: 4.4}
+    (text,) = remarks(outside)
+    assert f"{NAMES[1]} 4.4, interval 2 to 3, 6 to 9, most probable 7" in text
+    assert NAMES[0] not in text
+    assert "neighbouring links share part of their noise" in text
+    assert f"{np.exp(3.0):.2g} times as probable" in text
+    assert "blocks = 4" in text
+    # With blocks held out already, that advice would be empty.
+    assert "blocks = 4" not in remarks(outside, holdout={"blocks": 3})[0]
+    assert remarks(outside, holdout={"where": "rx_x > 0"})[0] == text
+    assert "more than 1,000 times" in remarks(outside, 50.0)[0]
