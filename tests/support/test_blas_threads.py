@@ -1,9 +1,17 @@
 """One thread for the linear algebra, and as many as before afterwards."""
 
 import pytest
-from threadpoolctl import threadpool_info
+import scipy.linalg  # noqa: F401  (loads the second BLAS, so that both are counted from the start)
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from calibray.support import blas_threads
+
+
+@pytest.fixture(autouse=True)
+def _two_threads():
+    """The suite runs with one thread, which would hide a limit that has no effect."""
+    with threadpool_limits(2, user_api="blas"):
+        yield
 
 
 def _numbers():

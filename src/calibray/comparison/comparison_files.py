@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.report.style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.report.style import write as write_figure
 from calibray.support.output_files import write_table

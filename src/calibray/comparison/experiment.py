@@ -15,7 +15,7 @@ from typing import Any, Final
 from calibray import engines
 from calibray.calibration import calibrate
 from calibray.comparison.paper_tables import summary
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.result import Result
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.result.tables import ends_text
 from calibray.tables import Column, Table, numbers
 

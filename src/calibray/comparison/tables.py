@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pandas as pd
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.tables import Column, Table, numbers
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The box that is searched, and its map to and from the unit cube."""
+"""The search box, and its map to and from the unit cube."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Box:
         return 0.5 * (self.lower + self.upper)
 
     def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move points outside of the box to its nearest face.
+        """Move points outside the box to its nearest face.
 
         Args:
             x: Points [..., d].

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.report.style import (
     BLUE,
     COLORS,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.report.link_survey import residual
 from calibray.tables.display import hertz, named
