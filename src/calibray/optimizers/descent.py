@@ -51,27 +51,12 @@ class Starts:
     searches: NDArray[np.int64]
 
     def rows(self, keep: NDArray[np.bool_]) -> Starts:
-        """Choose searches.
-
-        Args:
-            keep: True for those to keep [s].
-
-        Returns:
-            Those searches.
-        """
+        """The searches where `keep` is True [s]."""
         return Starts(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
-    """Form the models at evaluated points.
-
-    Args:
-        unit: The points in the unit cube [s, d].
-        evaluated: Their residuals and Jacobian.
-
-    Returns:
-        The searches; one whose evaluation failed has infinite cost.
-    """
+    """Form the models at evaluated points of the unit cube [s, d]; a failed evaluation has infinite cost."""
     r, j = evaluated
     failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
@@ -90,14 +75,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 
 
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The step of every search inside the cube, and the decrease of cost that its model predicts.
-
-    Args:
-        starts: The searches.
-
-    Returns:
-        Steps in the unit cube [s, d] and predicted decreases [s].
-    """
+    """Steps inside the unit cube [s, d], and the decreases of cost that the models predict [s]."""
     count, dimension = starts.unit.shape
     # The floor keeps the matrix regular where two parameters act alike and damping has faded.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
@@ -131,16 +109,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
-    """Accept or reject the trial points.
-
-    Args:
-        starts: The searches before the step.
-        trial: The models at their trial points.
-        predicted: Decrease of cost that was predicted [s].
-
-    Returns:
-        The searches after it, with their new damping.
-    """
+    """Accept or reject trial points by the decrease of cost that was predicted [s], and update the damping."""
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4
     gain = np.where(better, ratio, 0.0)
@@ -275,14 +244,6 @@ def distinct(starts: Starts, separation: float) -> Starts:
 
 
 def joined(first: Starts, second: Starts) -> Starts:
-    """Concatenate searches.
-
-    Args:
-        first: Searches.
-        second: Further searches.
-
-    Returns:
-        All of them.
-    """
+    """Concatenate searches."""
     names = [field.name for field in fields(Starts)]
     return Starts(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))

@@ -55,11 +55,7 @@ class Evaluations:
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """The residuals [n, m], for algorithms that use them.
-
-        Raises:
-            InputError: There are none.
-        """
+        """The residuals [n, m], for algorithms that use them."""
         if self.residuals is None:
             raise InputError(
                 "residuals = None; this optimizer uses them: call tell(x, y, residuals=..., ...)"
@@ -68,38 +64,20 @@ class Evaluations:
 
     @property
     def slopes(self) -> NDArray[np.float64]:
-        """The derivatives of the residuals [n, m, d], for algorithms that use them.
-
-        Raises:
-            InputError: There are none.
-        """
+        """The derivatives of the residuals [n, m, d], for algorithms that use them."""
         if self.jacobian is None:
             raise InputError("jacobian = None; this optimizer uses them: call tell(x, y, jacobian=..., ...)")
         return self.jacobian
 
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
-        """Choose evaluations.
-
-        Args:
-            rows: Their indices [k].
-
-        Returns:
-            The k evaluations, in that order.
-        """
+        """The evaluations with these indices [k], in that order."""
         residuals = None if self.residuals is None else self.residuals[rows]
         jacobian = None if self.jacobian is None else self.jacobian[rows]
         return Evaluations(self.x[rows], self.y[rows], residuals, jacobian)
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Concatenate evaluations.
-
-        Args:
-            parts: At least one set of evaluations, all with the same information.
-
-        Returns:
-            All of them.
-        """
+        """Concatenate at least one set of evaluations, all with the same information."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
             present = [array for array in arrays if array is not None]
@@ -125,11 +103,7 @@ class Archive:
         return sum(len(part) for part in self._parts)
 
     def add(self, evaluations: Evaluations) -> None:
-        """Append evaluations.
-
-        Args:
-            evaluations: Checked evaluations. Their Jacobians are not kept.
-        """
+        """Append checked evaluations; their Jacobians are not kept."""
         self._parts.append(Evaluations(evaluations.x, evaluations.y, evaluations.residuals))
         lowest = self._parts[-1].rows(np.argmin(evaluations.y, keepdims=True))
         if self._leading is None or lowest.y[0] < self._leading.y[0]:
@@ -156,10 +130,7 @@ class Archive:
         return self._leading
 
     def all(self) -> Evaluations:
-        """Every evaluation so far, without Jacobians.
-
-        Returns:
-            The evaluations, in the order told.
+        """Every evaluation so far in the order told, without Jacobians.
 
         Raises:
             InputError: Nothing has been told yet.
@@ -299,14 +270,7 @@ def check_order(evaluations: Evaluations, archive: Archive) -> None:
 
 
 def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The default objective.
-
-    Args:
-        residuals: Residuals [n, m].
-
-    Returns:
-        Their root mean square [n].
-    """
+    """The default objective: the root mean square [n] of residuals [n, m]."""
     return np.sqrt(np.mean(residuals**2, axis=1))
 
 
@@ -328,14 +292,7 @@ def merge_repeated(
 
 
 def read_only(array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make an array read-only, in place.
-
-    Args:
-        array: The array.
-
-    Returns:
-        The same array.
-    """
+    """Make an array read-only in place, and return it."""
     array.setflags(write=False)
     return array
 

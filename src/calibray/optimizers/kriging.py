@@ -73,34 +73,16 @@ class Kriging:
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict residuals and their derivatives.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Mean [k, m] and Jacobian by the coordinates of the unit cube [k, m, d].
-        """
+        """Predicted residuals [k, m] and their Jacobian [k, m, d] at points of the unit cube [k, d]."""
         inputs = Inputs.plain(unit)
         return self.process.mean(inputs), self.process.slope(inputs)
 
     def left_out(self) -> NDArray[np.float64]:
-        """Predict every evaluated point from all the others, scales kept.
-
-        Returns:
-            Residuals [n, m].
-        """
+        """Residuals of every evaluated point predicted from all the others, scales kept [n, m]."""
         return self.residuals - self.process.left_out_errors()
 
     def with_point(self, point: NDArray[np.float64]) -> Kriging:
-        """Add a point as if it had been evaluated exactly as predicted.
-
-        Args:
-            point: The point [d].
-
-        Returns:
-            A model with the same mean and prior, certain at that point too.
-        """
+        """Add a point [d] as if evaluated exactly as predicted: same mean and prior, but certain there too."""
         unit = np.vstack([self.process.inputs.unit, point])
         residuals = np.vstack([self.residuals, self.predict(point[None])[0]])
         return Kriging(solve(unit, residuals, self.process.kernel).process, self.root)
@@ -137,29 +119,12 @@ def fit(
 
 
 def likelihood(unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Likelihood:
-    """The restricted likelihood of kernels.
-
-    Args:
-        unit: Evaluated points in the unit cube [n, d].
-        residuals: Residuals there [n, m].
-
-    Returns:
-        The likelihood.
-    """
+    """The restricted likelihood of kernels, given residuals [n, m] at points of the unit cube [n, d]."""
     return Likelihood(Inputs.plain(unit), residuals, linear=True)
 
 
 def solve(unit: NDArray[np.float64], residuals: NDArray[np.float64], kernel: Kernel) -> Kriging:
-    """The model of a known kernel.
-
-    Args:
-        unit: Evaluated points in the unit cube [n, d].
-        residuals: Residuals there [n, m].
-        kernel: The kernel.
-
-    Returns:
-        The model.
-    """
+    """The model with a known kernel, given residuals [n, m] at points of the unit cube [n, d]."""
     process = condition(Inputs.plain(unit), residuals, kernel, linear=True)
     return Kriging(process, process.root)
 

@@ -43,14 +43,7 @@ class Inputs:
 
     @staticmethod
     def plain(unit: NDArray[np.float64]) -> Inputs:
-        """Points without a cheap model.
-
-        Args:
-            unit: Coordinates in the unit cube [n, d].
-
-        Returns:
-            The inputs.
-        """
+        """Points of the unit cube [n, d] without a cheap model."""
         return Inputs(unit, np.zeros((len(unit), 0)))
 
 
@@ -82,51 +75,22 @@ class Kernel:
         return Kernel(scale**2 * np.exp(hyper[:3]), np.exp(hyper[3:-1]), float(scale**2 * np.exp(hyper[-1])))
 
     def logarithms(self, scale: float = 1.0) -> NDArray[np.float64]:
-        """The inverse of `of`.
-
-        Args:
-            scale: Factor whose square multiplies variances and nugget.
-
-        Returns:
-            Logarithms of v_0, v_1 and v_2, of the rates [d], and of the nugget [3 + d + 1]; -inf of a variance of 0.
-        """
+        """The inverse of `of`; -inf for a variance of 0."""
         with np.errstate(divide="ignore"):
             variances = np.log(self.variances / scale**2)
         return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
 
     def covariance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
-        """Covariance between points, without the nugget.
-
-        Args:
-            a: Points [k].
-            b: Points [n].
-
-        Returns:
-            Covariance [k, n].
-        """
+        """Covariance between points a [k] and b [n] without the nugget [k, n]."""
         smooth = matern(self.distance(a, b))
         return self.variances[0] + self.variances[1] * a.response @ b.response.T + self.variances[2] * smooth
 
     def variance(self, at: Inputs) -> NDArray[np.float64]:
-        """Prior variance, without the nugget.
-
-        Args:
-            at: Points [k].
-
-        Returns:
-            Variance [k].
-        """
+        """Prior variance at points without the nugget [k]."""
         return self.variances[0] + self.variances[1] * np.sum(at.response**2, axis=1) + self.variances[2]
 
     def matrix(self, at: Inputs) -> NDArray[np.float64]:
-        """Covariance of the points among themselves, with the nugget.
-
-        Args:
-            at: Points [n].
-
-        Returns:
-            K [n, n].
-        """
+        """Covariance of points among themselves with the nugget, K [n, n]."""
         return self.covariance(at, at) + self.nugget * np.eye(len(at.unit))
 
     def distance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
@@ -135,11 +99,11 @@ class Kernel:
 
 
 class Trend(NamedTuple):
-    """What a trend leaves of evaluated points.
+    """A trend at evaluated points.
 
     Attributes:
         contrasts: C [n, f].
-        left_inverse: Values at the points to the coefficients of the trend through them [p, n].
+        left_inverse: Maps values at the points to the coefficients of the trend through them [p, n].
     """
 
     contrasts: NDArray[np.float64]
@@ -147,15 +111,7 @@ class Trend(NamedTuple):
 
     @staticmethod
     def of(unit: NDArray[np.float64], linear: bool) -> Trend:
-        """Split the points.
-
-        Args:
-            unit: Points of the unit cube [n, d].
-            linear: Whether the trend is linear; else there is none.
-
-        Returns:
-            The trend at these points.
-        """
+        """The linear trend at points [n, d], or none."""
         if not linear:
             return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
         basis = trend_basis(unit)
@@ -233,14 +189,7 @@ class Process:
         return mean, np.maximum(prior - np.sum(known**2, axis=0), 0.0)  # eqs. 2.25, 2.26, 2.41, 2.42
 
     def mean(self, at: Inputs) -> NDArray[np.float64]:
-        """Predict the residuals, without their variance.
-
-        Args:
-            at: Points [k].
-
-        Returns:
-            Mean [k, m].
-        """
+        """Predicted residuals at points [k, m]."""
         mean = self.kernel.covariance(at, self.inputs) @ self.weights
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
@@ -255,14 +204,11 @@ class Process:
         Returns:
             Derivatives by these coordinates [k, m, d].
         """
-        rates = self.kernel.rates
+        rates, variances = self.kernel.rates, self.kernel.variances
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
-        smooth = matern_slope(self.kernel.distance(at, self.inputs))
-        by_coordinate = self.kernel.variances[2] * smooth[:, None] * toward
+        by_coordinate = variances[2] * matern_slope(self.kernel.distance(at, self.inputs))[:, None] * toward
         if response_slope is not None:
-            by_coordinate += (
-                self.kernel.variances[1] * np.moveaxis(response_slope, 1, -1) @ self.inputs.response.T
-            )
+            by_coordinate += variances[1] * np.moveaxis(response_slope, 1, -1) @ self.inputs.response.T
         slope = by_coordinate @ self.weights
         if self.linear:
             slope = slope + self.coefficients[1:]
@@ -278,25 +224,9 @@ class Process:
 
 
 def condition(
-    inputs: Inputs,
-    values: NDArray[np.float64],
-    kernel: Kernel,
-    *,
-    linear: bool = False,
-    freedom: float = 0.0,
+    inputs: Inputs, values: NDArray[np.float64], kernel: Kernel, *, linear: bool = False, freedom: float = 0.0
 ) -> Process:
-    """Condition a process on values.
-
-    Args:
-        inputs: The evaluated points.
-        values: Values of every residual there [n, m].
-        kernel: The kernel.
-        linear: Whether there is a linear trend.
-        freedom: Degrees of freedom of the prior of a residual's variance; 0 if the variance is profiled out.
-
-    Returns:
-        The process.
-    """
+    """Condition a process on values; for the arguments see `Process`."""
     trend, matrix = Trend.of(inputs.unit, linear), kernel.matrix(inputs)
     lower = np.asarray(np.linalg.cholesky(trend.contrasts.T @ matrix @ trend.contrasts), dtype=np.float64)
     whitened = solve_triangular(lower, trend.contrasts.T @ values, lower=True)
@@ -309,13 +239,7 @@ class Likelihood:
     """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
 
     Without a prior of the variances each one takes its most likely value; with one the residuals follow a
-    multivariate t distribution.
-
-    Args:
-        inputs: The evaluated points.
-        values: Values of every residual there [n, m].
-        linear: Whether there is a linear trend.
-        freedom: Degrees of freedom of the prior of a residual's variance; 0 for no prior.
+    multivariate t distribution. For the arguments see `Process`.
     """
 
     def __init__(
@@ -354,7 +278,7 @@ class Likelihood:
         free = len(lower)
         value = residuals * np.log(np.diag(lower)).sum()
         value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
-        # Half the derivative by K (eq. 5.9), each residual weighted by its precision.
+        # Derivative by K (eq. 5.9), each residual weighted by its precision.
         gap = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
         gap *= 0.5
         by_variance = kernel.variances * [gap.sum(), np.sum(gap * self.response), np.sum(gap * smooth)]
@@ -363,13 +287,13 @@ class Likelihood:
 
 
 class Prior(NamedTuple):
-    """Independent normal priors of the logarithms of v_0, v_1, v_2, rates and nugget, within bounds.
+    """Independent normal priors of the logarithms of v_0, v_1, v_2, rates and nugget, within bounds [3 + d + 1].
 
     Attributes:
-        mean: Means [3 + d + 1].
-        spread: Standard deviations [3 + d + 1].
-        lower: Lower bounds [3 + d + 1].
-        upper: Upper bounds [3 + d + 1].
+        mean: Means.
+        spread: Standard deviations.
+        lower: Lower bounds.
+        upper: Upper bounds.
         fixed: How many of the first ones stay at their mean.
     """
 
@@ -420,40 +344,19 @@ def most_probable(
 
 
 def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The Matern kernel of smoothness 5/2 (eq. 4.17).
-
-    Args:
-        distance: Distance in length scales [...].
-
-    Returns:
-        Correlation [...].
-    """
+    """The Matern kernel of smoothness 5/2 at a distance in length scales [...] (eq. 4.17)."""
     a = np.sqrt(5.0) * distance
     return (1.0 + a + a * a / 3.0) * np.exp(-a)
 
 
 def matern_slope(distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivative of the Matern kernel, divided by the distance; finite at 0.
-
-    Args:
-        distance: Distance in length scales r [...].
-
-    Returns:
-        M'(r) / r [...].
-    """
+    """Derivative of the Matern kernel divided by the distance, M'(r) / r [...]; finite at 0."""
     a = np.sqrt(5.0) * distance
     return -5.0 / 3.0 * (1.0 + a) * np.exp(-a)
 
 
 def trend_basis(unit: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The functions of a linear trend: 1 and the coordinates.
-
-    Args:
-        unit: Points of the unit cube [n, d].
-
-    Returns:
-        Their values at the points [n, 1 + d].
-    """
+    """The functions of a linear trend, 1 and the coordinates, at points of the unit cube [n, 1 + d]."""
     return np.hstack([np.ones((len(unit), 1)), unit])
 
 

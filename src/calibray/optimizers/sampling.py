@@ -83,15 +83,7 @@ def draw_around(
 
 
 def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of points to the nearest of others.
-
-    Args:
-        x: Points [k, d].
-        points: The others [n, d], at least one.
-
-    Returns:
-        Distance [k].
-    """
+    """Distance of each point x [k, d] to the nearest of at least one other [n, d]."""
     return cdist(x, points).min(axis=1)
 
 

@@ -65,14 +65,7 @@ class Session:
         return self._finished
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates that wait for their evaluation.
-
-        Returns:
-            Points [n, d]; the same again until they are told.
-
-        Raises:
-            InputError: The search has ended.
-        """
+        """See `Optimizer.ask`."""
         self._advance()
         if self._asked is None:
             raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to go on")
@@ -85,17 +78,7 @@ class Session:
         residuals: ArrayLike | None = None,
         jacobian: ArrayLike | None = None,
     ) -> None:
-        """Take evaluations; those at open candidates answer them, others only join the archive.
-
-        Args:
-            x: Points [n, d].
-            y: Value [n], +inf for a failed evaluation.
-            residuals: Residuals [n, m].
-            jacobian: Derivatives of the residuals [n, m, d].
-
-        Raises:
-            InputError: An evaluation is malformed; nothing of the call is kept.
-        """
+        """See `Optimizer.tell`."""
         evaluations = checked_evaluations(
             self.archive.box, x, y, residuals, jacobian, self._uses, self._objective
         )

@@ -220,16 +220,7 @@ class SGWOIM(Optimizer):
 
 
 def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations) -> Evaluations:
-    """Update the pack's memory where a score is strictly lower.
-
-    Args:
-        memory: The best evaluation of each wolf.
-        wolves: Wolves that were evaluated.
-        answers: Their evaluations.
-
-    Returns:
-        The updated memory.
-    """
+    """Update the pack's memory with the answers of evaluated wolves, where a score is strictly lower."""
     x, y = memory.x.copy(), memory.y.copy()
     better = answers.y < y[wolves]
     x[wolves[better]], y[wolves[better]] = answers.x[better], answers.y[better]

@@ -284,15 +284,7 @@ def improvement(
 
 
 def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Local minima of the predicted objective.
-
-    Args:
-        model: The model of the residuals.
-        starts: Starting points in the unit cube [s, d].
-
-    Returns:
-        The minima, lowest first [k, d].
-    """
+    """Local minima of the predicted objective, lowest first [k, d], searched from starts in the unit cube [s, d]."""
     ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
     return ends.unit[np.argsort(ends.cost, kind="stable")]
 

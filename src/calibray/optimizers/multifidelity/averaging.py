@@ -56,14 +56,7 @@ class Averaged:
     members: tuple[Corrected, ...]
 
     def predict(self, unit: NDArray[np.float64]) -> Prediction:
-        """Predict residuals.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            The prediction.
-        """
+        """Predict the residuals at points of the unit cube [k, d]."""
         predictions = [member.predict(unit) for member in self.members]
         mean = np.mean([residuals for residuals, _ in predictions], axis=0)
         variance = np.zeros(len(unit))
@@ -73,14 +66,7 @@ class Averaged:
         return Prediction(mean, variance / len(predictions), predictions)
 
     def with_point(self, point: NDArray[np.float64]) -> Averaged:
-        """Add a point as if it had been evaluated exactly as predicted.
-
-        Args:
-            point: The point of the unit cube [d].
-
-        Returns:
-            Members that agree there.
-        """
+        """Add a point of the unit cube [d] as if evaluated exactly as predicted; the members then agree there."""
         residuals = self.predict(point[None]).mean
         return Averaged(tuple(member.with_point(point, residuals) for member in self.members))
 
@@ -101,13 +87,7 @@ class ErrorRecord:
         return (1.0 + sum(self.ratios)) / (1.0 + len(self.ratios))
 
     def add(self, mean: NDArray[np.float64], variance: float, residuals: NDArray[np.float64]) -> None:
-        """Add a step.
-
-        Args:
-            mean: Predicted residuals [m].
-            variance: Predicted variance of a residual, averaged, without the stretch.
-            residuals: Observed residuals [m].
-        """
+        """Add a step: predicted residuals [m], their averaged variance without the stretch, observed ones [m]."""
         ratio = float(np.mean((residuals - mean) ** 2)) / max(variance, 1e-12)
         self.ratios.append(min(ratio, CAPPED))
 

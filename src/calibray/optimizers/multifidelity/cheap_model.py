@@ -54,14 +54,7 @@ class Constants:
         return self.upper - self.lower
 
     def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Draw constants from their prior.
-
-        Args:
-            normal: Standard normal numbers [k, q].
-
-        Returns:
-            Constants within the bounds [k, q].
-        """
+        """Constants from their prior within the bounds [k, q], from standard normal numbers [k, q]."""
         return np.clip(self.centre + self.spread * normal, self.lower, self.upper)
 
 

@@ -66,15 +66,7 @@ class Response:
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
 
     def inputs(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Inputs:
-        """Points as the discrepancy's kernel sees them.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-            residuals: Residuals of the cheap model there [k, m].
-
-        Returns:
-            The inputs.
-        """
+        """Points of the unit cube [k, d] as the discrepancy sees them, from the cheap model's residuals [k, m]."""
         return Inputs(unit, self.scaled(residuals - self.centre))
 
     def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -126,14 +118,7 @@ class Corrected:
         return cheap + mean, share
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict residuals and their derivatives.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Mean [k, m] and Jacobian by the coordinates of the unit cube [k, m, d].
-        """
+        """Predicted residuals [k, m] and their Jacobian [k, m, d] at points of the unit cube [k, d]."""
         cheap, slope, inputs, response_slope = self.base_and_slope(unit)
         return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
 
@@ -165,29 +150,14 @@ class Corrected:
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
     def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
-        """Add a point as if it had been evaluated.
-
-        Args:
-            point: The point of the unit cube [d].
-            residuals: Its residuals [1, m].
-
-        Returns:
-            A model certain at that point too.
-        """
+        """Add a point of the unit cube [d] as if evaluated with these residuals [1, m]."""
         unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
         cheap, inputs = self.base(unit)
         process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
         return replace(self, residuals=answers, discrepancy=process)
 
     def with_constants(self, constants: NDArray[np.float64]) -> Corrected:
-        """Other constants, with a discrepancy through the same answers and the same kernel.
-
-        Args:
-            constants: The constants [q].
-
-        Returns:
-            The model.
-        """
+        """Other constants [q], with a discrepancy through the same answers and with the same kernel."""
         moved = replace(self, constants=constants)
         cheap, inputs = moved.base(self.unit)
         process = discrepancy.solve(inputs, self.residuals - cheap, self.discrepancy.kernel)
@@ -248,34 +218,14 @@ def correct(
 def cheap_residuals(
     model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Residuals of a cheap model.
-
-    Args:
-        model: The cheap model.
-        box: The box searched.
-        unit: Points of the unit cube [k, d].
-        constants: The model's constants [q].
-
-    Returns:
-        Residuals [k, m].
-    """
+    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m]."""
     return model.residuals(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
 
 
 def cheap_and_slope(
     model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals of a cheap model, and their derivatives by the coordinates of the unit cube.
-
-    Args:
-        model: The cheap model.
-        box: The box searched.
-        unit: Points of the unit cube [k, d].
-        constants: The model's constants [q].
-
-    Returns:
-        Residuals [k, m] and Jacobian [k, m, d].
-    """
+    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m], and Jacobian [k, m, d]."""
     answer = model.answer(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
     return answer.residuals, answer.by_point * box.width
 

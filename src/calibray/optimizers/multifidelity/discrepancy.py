@@ -87,16 +87,7 @@ def fit(
 
 
 def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Process:
-    """The process of a known kernel.
-
-    Args:
-        inputs: The evaluated points.
-        values: Discrepancy there [n, m].
-        kernel: The kernel.
-
-    Returns:
-        The process.
-    """
+    """The process with a known kernel, given discrepancies [n, m]."""
     return condition(inputs, values, kernel, freedom=FREEDOM)
 
 

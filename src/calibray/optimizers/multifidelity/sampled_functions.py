@@ -46,27 +46,12 @@ class PriorDraw:
     amplitude: NDArray[np.float64]
 
     def values(self, at: Inputs) -> NDArray[np.float64]:
-        """Evaluate it at points [k].
-
-        Args:
-            at: The points.
-
-        Returns:
-            Values [k, m].
-        """
+        """Values at points [k, m]."""
         cosines = np.cos(at.unit @ self.frequency.T + self.phase)
         return self.offset + at.response @ self.steepness + cosines @ self.amplitude
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Its derivatives.
-
-        Args:
-            at: Points [k].
-            response_slope: Derivatives of their responses by the coordinates of the unit cube [k, r, d].
-
-        Returns:
-            Derivatives by these coordinates [k, m, d].
-        """
+        """Derivatives at points [k, m, d], from those of their responses [k, r, d]."""
         sines = -np.sin(at.unit @ self.frequency.T + self.phase)[:, :, None] * self.frequency
         waves = np.einsum("kfd,fm->kmd", sines, self.amplitude, optimize=True)
         return waves + np.einsum("krd,rm->kmd", response_slope, self.steepness, optimize=True)
@@ -85,14 +70,7 @@ class SampledFunction:
     rest: Process
 
     def values(self, at: Inputs) -> NDArray[np.float64]:
-        """Evaluate it.
-
-        Args:
-            at: Points [k].
-
-        Returns:
-            Values [k, m].
-        """
+        """Values at points [k, m]."""
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
