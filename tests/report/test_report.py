@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import shown
-from calibray.comparison import paper_tables as demo
-from calibray.comparison import tables as comparison
+from calibray.comparison import comparison
 from calibray.report import doctor_table as diagnosis
 from calibray.report import ledger_table as ledger
 from calibray.report import trace_tables as trace
@@ -57,7 +56,7 @@ def test_a_ledger_is_printed_as_ever():
 
 
 def test_the_demo_the_comparison_and_the_doctor_are_printed_as_ever():
-    assert render(*demo.tables(shown.demo())) == golden("demo")
+    assert render(*shown.demo().tables()) == golden("demo")
     assert render(comparison.table(shown.comparison())) == golden("comparison")
     assert markdown.render(comparison.table(shown.comparison())) == golden("comparison-markdown")
     assert render(diagnosis.table(shown.diagnosis())) == golden("doctor")
@@ -155,8 +154,7 @@ tables = "glance html markdown text"
 for name in [f"calibray.tables.{each}" for each in tables.split()]:
     importlib.import_module(name)
 assert "pandas" not in sys.modules
-for name in ("calibray.result.tables", "calibray.comparison.tables", "calibray.comparison.paper_tables"):
-    importlib.import_module(name)
+importlib.import_module("calibray.result.tables")
 for name in "diagnosis excess figures ledger trace".split():
     importlib.import_module(f"calibray.report.{name}")
 heavy = ("jax", "drjit", "mitsuba", "sionna", "calibray.calibration")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,7 +58,7 @@ class Optimizer(ABC):
     schedule: ClassVar[Schedule | None]
     takes_starts: ClassVar[bool]
     _session: Session
-    _budget: int | None
+    _budget: Any  # int, or None if the method stops by itself
 
     @classmethod
     def needs_derivatives(cls) -> bool:
