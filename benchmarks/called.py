@@ -135,7 +135,9 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
         model = ReplayedModel(stored, count, ProblemRows(asked)) if way == "mapped" else None
         optimizer = {
             "derivatives": lambda: LeastSquares(*bounds, starts=64, seed=turn),
-            "mapped": lambda model=model: SpaceMapping(*bounds, model=model, budget=10 * count, seed=turn),
+            "mapped": lambda model=model: SpaceMapping(
+                *bounds, cheap_model=model, budget=10 * count, seed=turn
+            ),
             "planes": lambda: VectorSurrogate(*bounds, budget=20 * count, seed=turn),
         }[way]()
         trail = search(asked, optimizer)

@@ -23,11 +23,12 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+from calibray.optimizers.labels import label
+
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.fitting.cheap_replay import HELPED
-from calibray.optimizers.labels import label
 from calibray.tables import Column, Table, markdown, numbers
 from problem_families.comparison import FamilyComparison, compare_family, seed_range
 from problem_families.tables import tables

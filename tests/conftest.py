@@ -1,5 +1,14 @@
 """What all tests share: reproducible property tests, one cache of compiled code, no lines of progress."""
 
+# ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
+
+import os
+
+# Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
+# read these when they are imported; subprocesses inherit them.
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
 import pytest
 from hypothesis import settings
 

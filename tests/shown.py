@@ -11,9 +11,8 @@ import pandas as pd
 import synthetic
 from calibray.calibration.result import Result
 from calibray.comparison.comparison import Comparison
-from calibray.comparison.contestant import Contender
 from calibray.comparison.experiment import Demo
-from calibray.comparison.run_log import MethodRun
+from calibray.comparison.method_runs import BudgetedMethod, MethodRun
 from calibray.doctor import Check, Diagnosis
 from calibray.paths import Kind, Paths
 from calibray.study import Study
@@ -72,22 +71,23 @@ def convergence() -> Convergence:
 
 def comparison() -> Comparison:
     """Four methods from three seeds, one of which failed and one never came near."""
-    contenders = tuple(
-        Contender.parse(name, 225) for name in ("sgwo-im", "gwo@600", "gaussian-process", "least-squares")
+    methods = tuple(
+        BudgetedMethod.parse(name, 225)
+        for name in ("sgwo-im", "gwo@600", "gaussian-process", "least-squares")
     )
     random = np.random.default_rng(4)
 
-    def run(contender: Contender, seed: int) -> MethodRun:
-        calls = tuple(sorted(random.choice(np.arange(1, contender.budget + 1), 9, replace=False).tolist()))
+    def run(method: BudgetedMethod, seed: int) -> MethodRun:
+        calls = tuple(sorted(random.choice(np.arange(1, method.budget + 1), 9, replace=False).tolist()))
         best = tuple((2.0 + np.sort(10.0 ** random.uniform(-4, 1, 9))[::-1]).tolist())
-        return MethodRun(contender.method, contender.budget, seed, contender.budget, calls, best, 0.5 + seed)
+        return MethodRun(method.method, method.budget, seed, method.budget, calls, best, 0.5 + seed)
 
-    runs = {contender.name: tuple(run(contender, seed) for seed in range(3)) for contender in contenders}
+    runs = {method.name: tuple(run(method, seed) for seed in range(3)) for method in methods}
     runs["gaussian-process"] = (
         *runs["gaussian-process"][:2],
         MethodRun("gaussian-process", 225, 2, 0, (), (), 0.1, "LinAlgError: not positive definite"),
     )
-    return Comparison("street", contenders, runs, 2.0, "least-squares from 2048 starts")
+    return Comparison("street", methods, runs, 2.0, "least-squares from 2048 starts")
 
 
 def demo() -> Demo:

@@ -15,9 +15,9 @@ import pytest
 
 import calibray as cb
 from calibray import engines
-from calibray.comparison import comparison
-from calibray.comparison.problems import study_arena
-from calibray.comparison.run_log import Runs
+from calibray.comparison import compare as comparison
+from calibray.comparison.method_runs import BudgetedMethod, RunFile
+from calibray.comparison.problem import study_problem
 from calibray.paths import Kind
 
 LEGACY = Path(__file__).parent / "legacy"
@@ -113,17 +113,17 @@ def test_a_comparison_finds_its_runs(folder, monkeypatch):
     """What a run depends on is named anew by later code, which runs it again; under its old name it is found."""
     path = folder / "compare" / "runs.jsonl"
     problem, code = json.loads(path.read_text().splitlines()[0])["problem"].split("-")
-    arena = study_arena(folder / "replay.toml")
-    found = Runs(path, f"{problem}-{code}")
-    again = comparison.run_contender(arena, comparison.Contender.parse("random", 24), 1)
-    assert again.calls == found.find("random", 24, 1).calls
-    assert again.best == pytest.approx(found.find("random", 24, 1).best, abs=TRACED_DB)
+    opened = study_problem(folder / "replay.toml")
+    earlier = RunFile(path, f"{problem}-{code}").find(("random", 24, 1))
+    again = BudgetedMethod.parse("random", 24).run(opened, 1)
+    assert again.calls == earlier.calls
+    assert again.best == pytest.approx(earlier.best, abs=TRACED_DB)
 
-    monkeypatch.setattr(comparison, "code", lambda: code)
-    monkeypatch.setattr(comparison, "run_contender", None)
-    monkeypatch.setattr(comparison, "_optimum", None)
+    monkeypatch.setattr(comparison, "code_fingerprint", lambda: code)
+    monkeypatch.setattr(BudgetedMethod, "run", None)
+    monkeypatch.setattr(comparison, "_search_optimum", None)
     finished = comparison.compare(
-        lambda: replace(arena, fingerprint=problem),
+        lambda: replace(opened, fingerprint=problem),
         ["random", "sgwo-im"],
         seeds=2,
         budget=24,

@@ -1,11 +1,11 @@
-"""A family of planted problems: for judging methods where nobody tuned them.
+"""Planted problems, drawn from seeds, for judging methods on problems that they were not tuned on.
 
-A problem is drawn from its seed: a district or an office, the carrier, 2 to 8 parameters with their planted values, 20
-to 200 links measured with 1 to 4 dB of noise and perhaps offsets; an *engine* that answers like an expensive one, and
-beside it a *cheap* model of the same scene that lacks some of what the engine has (`Differences`), and may be told
-wrong thicknesses and conductivities. Both evaluate traced paths, so a family is judged in minutes.
+A seed determines a district or an office, the carrier, 2 to 8 parameters with their planted values, and 20 to 200 links
+measured with 1 to 4 dB of noise and perhaps offsets. It also determines an *engine* that acts as the expensive one, and
+a *cheap model* of the same scene that lacks some features of the engine (`Differences`) and may have wrong thicknesses
+and conductivities. Both evaluate traced paths, so a family is judged in minutes.
 
-A family is all problems of a kind over a range of seeds. Seeds below 1000 are for development.
+A family is all problems of one kind over a range of seeds. Seeds below 1000 are for development.
 """
 
 from __future__ import annotations
@@ -35,40 +35,39 @@ from calibray.tracing import cache
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.settings import Antenna, TraceSettings
 from problem_families import optima
-from problem_families.numpy_replay import Direct
-from problem_families.office import office_site
-from problem_families.sites import Site, Stuff, district_site
+from problem_families.numpy_replay import NumpyReplay
+from problem_families.sites import MaterialRange, Site, district_site, office_site
 
 FamilyKind = Literal["district", "office"]
 
 CARRIERS: Final = (0.9e9, 2.1e9, 3.5e9, 4e9, 5.9e9, 10e9)  # [Hz]
-PARAMETERS: Final = (2, 8)  # least and most
+PARAMETERS: Final = (2, 8)  # fewest and most
 LINKS: Final = (20, 200)
 NOISE_DB: Final = (1.0, 4.0)
 OFFSET_DB: Final = 3.0  # standard deviation of a transmitter's offset
 UPPER_PERMITTIVITY: Final = (9.0, 15.0)
 CONDUCTIVITIES: Final = (1e-3, 1.0)  # [S/m], bounds of the search
 HALF_SPACE: Final = 100.0
-"""Thickness of a slab whose far side no wave comes back from, at the conductivities that occur [m]."""
+"""Thickness of a slab so lossy that no wave returns from its far side [m]."""
 
 DRAWN: Final = 2.5
-"""Links drawn for each one kept: some of them no path leads to."""
+"""Links drawn for each one kept, because some have no path."""
 
 ONE_SIDED: Final = 8
-"""Of the links that the engine reaches and the cheap model does not, one of so many is kept."""
+"""Of the links that only the engine reaches, one in this number is kept."""
 
 SAMPLES: Final = 100_000
 DIFFUSE_SAMPLES: Final = 1_000
 WEAK: Final = 0.003
-"""Share of a link's power below which a path is left out, to make an evaluation quick."""
+"""Share of a link's power below which a path is left out, for speed."""
 
 PROBES: Final = 8
 STARTS: Final = 64
-"""Local searches for the global optimum; its file says how many."""
+"""Local searches for the global optimum."""
 
 
-class Told(NamedTuple):
-    """What an optimizer is told of points of the search space."""
+class Answer(NamedTuple):
+    """The evaluation of points of the search space."""
 
     value: NDArray[np.float64]
     residuals: NDArray[np.float64]
@@ -77,16 +76,16 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True)
 class Differences:
-    """What the engine has that the cheap model lacks.
+    """Differences of the engine from the cheap model.
 
     Attributes:
-        depth: Most interactions of a path, engine and cheap model.
+        depth: Largest number of interactions of a path, of the engine and of the cheap model.
         diffraction: Whether the engine diffracts.
         diffuse_reflection: Whether its surfaces scatter.
-        half_space: Whether its walls have one face (Fresnel's coefficients) where the cheap model has slabs.
-        antennas: Whether its antennas are dipoles where the cheap model has isotropic ones.
+        half_space: Whether its walls have one face (Fresnel's coefficients) and those of the cheap model are slabs.
+        antennas: Whether its antennas are dipoles and those of the cheap model isotropic.
         position_error: Standard deviation between their positions, in x and y [m].
-        misinformed: Whether the cheap model is told wrong thicknesses and conductivities.
+        wrong_constants: Whether the cheap model has wrong thicknesses and conductivities.
     """
 
     depth: tuple[int, int]
@@ -95,7 +94,7 @@ class Differences:
     half_space: bool
     antennas: bool
     position_error: float
-    misinformed: bool
+    wrong_constants: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +105,10 @@ class PlantedProblem:
         kind: "district" or "office".
         seed: Its seed.
         frequency: Carrier [Hz].
-        parameters: What is calibrated, with bounds [d]; they own the search space.
+        parameters: The calibrated parameters with their bounds [d], which define the search space.
         engine: The expensive engine.
-        cheap: The cheap model: the same parameters on the paths of a simpler trace, +inf for a link that it has no path
-            to. `cheap.paths` are those, and the materials that it was told; a `Replay` of them has exact derivatives.
-        differences: What the engine has that the cheap model lacks.
+        cheap: The cheap model: the same parameters on the paths of a simpler trace, +inf for a link without a path.
+        differences: Differences of the engine from the cheap model.
         measured: Measured path loss [L], [dB].
         station: Transmitter of each link [L].
         offsets: Whether every transmitter's measurements have an unknown offset.
@@ -122,8 +120,8 @@ class PlantedProblem:
     seed: int
     frequency: float
     parameters: Parameters
-    engine: Direct
-    cheap: Direct
+    engine: NumpyReplay
+    cheap: NumpyReplay
     differences: Differences
     measured: NDArray[np.float64]
     station: NDArray[np.int64]
@@ -141,44 +139,12 @@ class PlantedProblem:
         """Upper bounds of the search space [d]."""
         return self.parameters.search_bounds[1]
 
-    def evaluate(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Ask the engine.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB].
-        """
-        return self.engine.path_loss(candidates)
-
-    def cheap_rmse_db(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """RMSE of the cheap model at points of the search space, over the links that it reaches.
-
-        Args:
-            points: Points of the search space [n, d].
-
-        Returns:
-            RMSE [n], [dB].
-        """
-        loss = self.cheap.path_loss(self.parameters.from_search(points))
-        reached = np.isfinite(loss)
-        residuals = self.residuals(np.where(reached, loss, self.measured))
-        return np.sqrt(np.sum(residuals**2 * reached, axis=1) / np.maximum(reached.sum(axis=1), 1))
-
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss less the measurements, each transmitter's best offset taken out where there are offsets.
-
-        Args:
-            path_loss: Of any model [n, L], [dB].
-
-        Returns:
-            Residuals [n, L], [dB].
-        """
+        """Residuals of a path loss [n, L], with each transmitter's best offset eliminated if there are offsets [dB]."""
         return self._without_offsets(path_loss - self.measured)
 
-    def told(self, points: NDArray[np.float64], derivatives: bool = False) -> Told:
-        """What an optimizer is told.
+    def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Answer:
+        """Evaluate the engine.
 
         Args:
             points: Points of the search space [n, d].
@@ -196,13 +162,13 @@ class PlantedProblem:
         else:
             loss = self.engine.path_loss(candidates)
         residuals = self.residuals(loss)
-        return Told(np.sqrt(np.mean(residuals**2, axis=1)), residuals, jacobian)
+        return Answer(np.sqrt(np.mean(residuals**2, axis=1)), residuals, jacobian)
 
     @property
     def fingerprint(self) -> str:
-        """All that the engine's answers and their residuals depend on, as SHA-256 in hexadecimal."""
+        """SHA-256 of everything that an evaluation depends on, in hexadecimal."""
         digest = hashlib.sha256(json.dumps([self.kind, self.offsets, self.parameters.names]).encode())
-        middle = self.told(0.5 * (self.lower + self.upper)[None]).residuals
+        middle = self.evaluate(0.5 * (self.lower + self.upper)[None]).residuals
         # Derived numbers may differ by rounding between machines.
         for part in (self.lower, self.upper, self.measured, self.station, middle):
             digest.update(np.round(part, 6).astype("<f8").tobytes())
@@ -211,19 +177,19 @@ class PlantedProblem:
     @property
     def minimum_rmse_db(self) -> float:
         """The lowest RMSE over the bounds [dB], found by least squares from `STARTS` points and then kept on disk."""
-        known = optima.find(self.fingerprint, STARTS)
-        if known is not None:
-            return known
+        kept = optima.find(self.fingerprint, STARTS)
+        if kept is not None:
+            return kept
         search = LeastSquares(self.lower, self.upper, starts=STARTS, x0=self.parameters.to_search(self.truth))
         while not search.done:
             points = search.ask()
-            told = self.told(points, derivatives=True)
-            search.tell(points, told.value, residuals=told.residuals, jacobian=told.jacobian)
+            answer = self.evaluate(points, derivatives=True)
+            search.tell(points, answer.value, residuals=answer.residuals, jacobian=answer.jacobian)
         optima.keep(self.fingerprint, STARTS, search.best.y)
         return search.best.y
 
     def _without_offsets(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rows over the links [..., L] less each transmitter's mean, where there are offsets."""
+        """Rows over the links [..., L] minus each transmitter's mean, if there are offsets."""
         if not self.offsets:
             return rows
         share = (self.station == np.arange(self.station.max() + 1)[:, None]).astype(np.float64)
@@ -257,13 +223,12 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
     site = (office_site if kind == "office" else district_site)(rng, int(np.ceil(DRAWN * count)))
     frequency = float(rng.choice(CARRIERS))
     differences = _differences(site, rng)
-    truth = {name: _material(stuff, frequency, differences, rng) for name, stuff in site.stuffs.items()}
-    rich, poor = _traced(site, truth, frequency, differences, rng)
-    kept = _kept(rich, poor)[:count]
-    rich, poor = take_links(rich, kept), take_links(poor, kept)
+    truth = {name: _material(ranges, frequency, differences, rng) for name, ranges in site.materials.items()}
+    engine_paths, cheap_paths = _trace(site, truth, frequency, differences, rng)
+    kept = _kept(engine_paths, cheap_paths)[:count]
     parameters = _parameters(truth, frequency, rng)
     planted = np.array([getattr(truth[item.material], item.field) for item in parameters])
-    engine = _without_weak_paths(rich, parameters)
+    engine = _without_weak_paths(take_links(engine_paths, kept), parameters)
     station = np.unique(site.tx[kept], axis=0, return_inverse=True)[1].reshape(-1)
     noise, offsets = float(rng.uniform(*NOISE_DB)), bool(rng.random() < 0.5)
     error = noise * rng.standard_normal(len(kept))
@@ -274,7 +239,7 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
         frequency,
         parameters,
         engine,
-        _without_weak_paths(poor, parameters),
+        _without_weak_paths(take_links(cheap_paths, kept), parameters),
         differences,
         engine.path_loss(planted[None])[0] + error,
         station,
@@ -284,21 +249,23 @@ def problem(seed: int, kind: str = "district") -> PlantedProblem:
     )
 
 
-def _kept(rich: Paths, poor: Paths) -> NDArray[np.int64]:
+def _kept(engine_paths: Paths, cheap_paths: Paths) -> NDArray[np.int64]:
     """Links that the engine reaches, most of which the cheap model reaches too."""
-    engine, cheap = (np.bincount(paths.link, minlength=paths.num_links) > 0 for paths in (rich, poor))
+    engine, cheap = (
+        np.bincount(paths.link, minlength=paths.num_links) > 0 for paths in (engine_paths, cheap_paths)
+    )
     return np.flatnonzero(engine & (cheap | (np.arange(len(engine)) % ONE_SIDED == 0)))
 
 
-def _without_weak_paths(paths: Paths, parameters: Parameters) -> Direct:
-    """The program without paths that hold less than `WEAK` of their link's power at every one of some candidates."""
-    whole = Direct(paths, parameters)
+def _without_weak_paths(paths: Paths, parameters: Parameters) -> NumpyReplay:
+    """The program without paths that carry less than `WEAK` of their link's power for all of some candidates."""
+    whole = NumpyReplay(paths, parameters)
     unit = design("sobol", PROBES, len(parameters), np.random.default_rng(0))
     power = whole.path_powers(parameters.from_unit(unit))
     link = np.zeros((len(power), paths.num_links))
     np.add.at(link.T, paths.link, power.T)
     strong = (power >= WEAK * link[:, paths.link]).any(axis=0)
-    return Direct(take(paths, np.flatnonzero(strong)), parameters)
+    return NumpyReplay(take(paths, np.flatnonzero(strong)), parameters)
 
 
 def _differences(site: Site, rng: np.random.Generator) -> Differences:
@@ -312,40 +279,42 @@ def _differences(site: Site, rng: np.random.Generator) -> Differences:
         half_space=bool(draw[3] < 0.3) and not site.indoors,
         antennas=bool(draw[4] < 0.4),
         position_error=float(rng.uniform(0.2, 1.0)) * (0.2 if site.indoors else 1.0) * bool(draw[5] < 0.4),
-        misinformed=bool(draw[6] < 0.5),
+        wrong_constants=bool(draw[6] < 0.5),
     )
 
 
-def _material(stuff: Stuff, frequency: float, differences: Differences, rng: np.random.Generator) -> Material:
-    """The true constants of a material, as the engine has them."""
-    conductivity = float(np.exp(rng.uniform(*np.log(stuff.conductivity)))) * frequency / 4e9
-    thickness, scattering = rng.uniform(*stuff.thickness), rng.uniform(*stuff.scattering_coefficient)
+def _material(
+    ranges: MaterialRange, frequency: float, differences: Differences, rng: np.random.Generator
+) -> Material:
+    """The true constants of a material, which the engine has."""
+    conductivity = float(np.exp(rng.uniform(*np.log(ranges.conductivity)))) * frequency / 4e9
+    thickness, scattering = rng.uniform(*ranges.thickness), rng.uniform(*ranges.scattering_coefficient)
     return Material(
-        float(rng.uniform(*stuff.relative_permittivity)),
+        float(rng.uniform(*ranges.relative_permittivity)),
         conductivity,
         HALF_SPACE if differences.half_space else float(thickness),
         float(scattering) if differences.diffuse_reflection else 0.0,
     )
 
 
-def _told(
+def _believed(
     site: Site, truth: Mapping[str, Material], differences: Differences, rng: np.random.Generator
 ) -> dict[str, Material]:
-    """The materials as the cheap model is told them: they do not scatter, and have two faces."""
-    told = {}
+    """The materials of the cheap model: they do not scatter, and have two faces."""
+    believed = {}
     for name, material in truth.items():
-        thickness = (
-            float(rng.uniform(*site.stuffs[name].thickness)) if differences.half_space else material.thickness
-        )
-        wrong, decades = rng.uniform(0.3, 1.7), rng.uniform(-0.5, 0.5)
-        factor = (float(wrong), float(10.0**decades)) if differences.misinformed else (1.0, 1.0)
-        told[name] = Material(
-            material.relative_permittivity, material.conductivity * factor[1], thickness * factor[0]
-        )
-    return told
+        thickness = material.thickness
+        if differences.half_space:
+            thickness = float(rng.uniform(*site.materials[name].thickness))
+        factor, decades = rng.uniform(0.3, 1.7), rng.uniform(-0.5, 0.5)
+        conductivity = material.conductivity
+        if differences.wrong_constants:
+            thickness, conductivity = thickness * float(factor), conductivity * float(10.0**decades)
+        believed[name] = Material(material.relative_permittivity, conductivity, thickness)
+    return believed
 
 
-def _traced(
+def _trace(
     site: Site,
     truth: Mapping[str, Material],
     frequency: float,
@@ -353,8 +322,8 @@ def _traced(
     rng: np.random.Generator,
 ) -> tuple[Paths, Paths]:
     """The paths of the engine and of the cheap model."""
-    told = _told(site, truth, differences, rng)
-    moved = _Links(*(_moved(ends, differences.position_error, rng) for ends in (site.tx, site.rx)))
+    believed = _believed(site, truth, differences, rng)
+    moved = _Links(*(_displaced(ends, differences.position_error, rng) for ends in (site.tx, site.rx)))
     dipole, simple = Antenna("dipole", "V"), Antenna("iso" if differences.antennas else "dipole", "V")
     base = TraceSettings(
         max_depth=differences.depth[0],
@@ -365,18 +334,16 @@ def _traced(
     cheap = replace(base, max_depth=differences.depth[1], diffraction=False)
     with TemporaryDirectory() as folder:
         scene = site.write(Path(folder))
-        rich = _paths(scene, truth, moved, frequency, base, dipole)
+        engine_paths = _paths(scene, truth, moved, frequency, base, dipole)
         if differences.diffuse_reflection:
             scattering = replace(
                 base, max_depth=2, diffraction=False, diffuse_reflection=True, samples=DIFFUSE_SAMPLES
             )
             mixed = _paths(scene, truth, moved, frequency, scattering, dipole)
-            diffuse = np.add.reduceat(
-                np.append(mixed.kind == InteractionKind.DIFFUSE, False), mixed.first[:-1]
-            )
-            diffuse = np.where(np.diff(mixed.first) > 0, diffuse, 0)
-            rich = concatenate([rich, take(mixed, np.flatnonzero(diffuse))])
-        return rich, _paths(scene, told, _Links(site.tx, site.rx), frequency, cheap, simple)
+            path = np.repeat(np.arange(mixed.num_paths), np.diff(mixed.first))
+            diffuse = np.unique(path[mixed.kind == InteractionKind.DIFFUSE])
+            engine_paths = concatenate([engine_paths, take(mixed, diffuse)])
+        return engine_paths, _paths(scene, believed, _Links(site.tx, site.rx), frequency, cheap, simple)
 
 
 @dataclass(frozen=True)
@@ -385,10 +352,10 @@ class _Links:
     rx: NDArray[np.float64]
 
 
-def _moved(ends: NDArray[np.float64], error: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Ends of links [n, 3], [m], displaced in the plan; those that stand together stay together."""
-    places, owner = np.unique(ends, axis=0, return_inverse=True)
-    step = np.clip(rng.standard_normal((len(places), 2)), -2.0, 2.0)
+def _displaced(ends: NDArray[np.float64], error: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Ends of links [n, 3], [m], displaced in the plan; equal ends stay equal."""
+    positions, owner = np.unique(ends, axis=0, return_inverse=True)
+    step = np.clip(rng.standard_normal((len(positions), 2)), -2.0, 2.0)
     return ends + error * np.pad(step, [(0, 0), (0, 1)])[owner.reshape(-1)]
 
 
@@ -413,7 +380,7 @@ def _paths(
 
 
 def _parameters(truth: Mapping[str, Material], frequency: float, rng: np.random.Generator) -> Parameters:
-    """What is calibrated: permittivities first, then conductivities."""
+    """The calibrated parameters: permittivities first, then conductivities."""
     wanted = int(rng.integers(PARAMETERS[0], PARAMETERS[1] + 1))
     names = rng.permutation(sorted(truth)).tolist()
     permittivities = min(len(names), max(2, int(np.ceil(0.65 * wanted))))

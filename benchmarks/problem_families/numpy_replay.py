@@ -1,18 +1,20 @@
 """A path program evaluated by NumPy, without compiling.
 
-A family has a path program for each problem, and compiling one takes ten seconds and more where waves diffract:
-longer than all that is asked of it. Path loss is that of `calibray.fields` to rounding, at some microseconds an
-interaction. Derivatives follow a wave back from the receiver: at every interaction what comes later is one number for
-each polarization, b, of which a change dr of a coefficient makes the power of the path change by 2 Re(b dr).
+Every problem of a family has its path program, and compiling one with diffraction takes more than ten seconds: longer
+than all its evaluations. Path loss equals that of `calibray.fields` to rounding, at some microseconds per interaction.
+Coefficients and their derivatives follow ITU-R P.2040-3. Derivatives are propagated from the receiver backwards: at
+every interaction, the later ones are summarized by one number b per polarization, such that a change dr of a
+coefficient changes the power of the path by 2 Re(b dr).
 """
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import speed_of_light
+from scipy.constants import epsilon_0, speed_of_light
 from scipy.sparse import csr_matrix
 
 from calibray.fields import material_table
@@ -20,23 +22,120 @@ from calibray.fields.diffraction import affine_form
 from calibray.materials import FIELDS
 from calibray.parameters import Parameters
 from calibray.paths import Kind, Paths
-from problem_families.coefficients import ACTING, Complex, Pair, Surfaces
+
+Complex = NDArray[np.complex128]
+
+ACTING: Final = ("relative_permittivity", "conductivity", "thickness", "scattering_coefficient")
+"""Constants that the coefficients depend on, in the order of the tables below."""
+
 
 BLOCK: Final = 200_000
-"""Coefficients evaluated at once, which bounds the memory."""
+"""Coefficients evaluated at once, to bound the memory."""
 
 Wave = tuple[Complex, Complex]
-"""Both polarizations of what goes along some paths [n, T, p], or of what is to come of it."""
+"""Both polarizations of the field along paths [n, T, p], or of its adjoint."""
 
 _COLUMNS: Final = [list(FIELDS).index(name) for name in ACTING]
 
 
-class Direct:
-    """Stored paths, evaluated for any candidate; Lambert's law and one polarization direction a port alone.
+class Pair(NamedTuple):
+    """A number for each polarization.
+
+    Attributes:
+        te: Transverse electric [n, J].
+        tm: Transverse magnetic [n, J].
+    """
+
+    te: Complex
+    tm: Complex
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Slabs at the interactions.
+
+    Attributes:
+        frequency: Carrier [Hz].
+        cosine: Cosine of the angle of incidence [J].
+        transmitted: Whether the wave is transmitted [J].
+        raw: Whether the reflection is taken without the loss to scattering [J].
+    """
+
+    frequency: float
+    cosine: NDArray[np.float64]
+    transmitted: NDArray[np.bool_]
+    raw: NDArray[np.bool_]
+
+    def coefficients(self, constants: NDArray[np.float64]) -> Pair:
+        """Evaluate the coefficients.
+
+        Args:
+            constants: Of each slab, in the order of `ACTING` [4, n, J].
+
+        Returns:
+            The coefficients.
+        """
+        eta, root, phase = self._wave(constants)
+        across, specular = phase**2, self._specular(constants[3])
+        pair = []
+        for weighted in (self.cosine, eta * self.cosine):
+            half = (weighted - root) / (weighted + root)  # eqs. 37a, 37b
+            square = half**2
+            through = np.where(self.transmitted, (1.0 - square) * phase, half * (1.0 - across))
+            pair.append(specular * through / (1.0 - square * across))  # eqs. 43a, 43b
+        return Pair(*pair)
+
+    def slopes(self, constants: NDArray[np.float64], bars: Pair) -> list[NDArray[np.float64]]:
+        """Derivatives of a real quantity by the constants, from those by the coefficients (reverse mode).
+
+        Args:
+            constants: Of each slab, in the order of `ACTING` [4, n, J].
+            bars: Numbers b such that a change dr of the coefficients changes the quantity by 2 Re(b dr).
+
+        Returns:
+            Derivatives by each constant of `ACTING`, 4 times [n, J].
+        """
+        eta, root, phase = self._wave(constants)
+        across, wavenumber = phase**2, 2.0 * np.pi * self.frequency / speed_of_light
+        by_eta, by_thickness, by_scattering = 0.0, 0.0, 0.0
+        rise = 0.5 / root  # of the root by eta
+        turn = -1j * wavenumber * phase  # of the phase factor by thickness times root
+        kept = 1.0 - np.where(self.transmitted | self.raw, 0.0, constants[3] ** 2)
+        for weighted, steep, bar in ((self.cosine, 0.0, bars.te), (eta * self.cosine, self.cosine, bars.tm)):
+            half = (weighted - root) / (weighted + root)
+            half_by_eta = 2.0 * (steep * root - weighted * rise) / (weighted + root) ** 2
+            square = half**2
+            bounced, weight = 1.0 - square * across, bar * np.sqrt(kept)
+            weight = weight / bounced**2
+            by_half = (1.0 - across) * np.where(self.transmitted, -2.0 * half * phase, 1.0 + square * across)
+            inward = np.where(self.transmitted, 1.0 + square * across, -2.0 * half * phase)
+            by_phase = (1.0 - square) * inward * turn
+            by_eta = by_eta + weight * (by_half * half_by_eta + by_phase * constants[2] * rise)
+            by_thickness = by_thickness + weight * by_phase * root
+            reflected = half * (1.0 - across) / bounced
+            by_scattering = by_scattering - bar * reflected * constants[3] / np.sqrt(kept)
+        lossy = -1j / (2.0 * np.pi * self.frequency * epsilon_0)
+        mirrored = np.where(self.transmitted | self.raw, 0.0, by_scattering)
+        return [2.0 * np.real(part) for part in (by_eta, by_eta * lossy, by_thickness, mirrored)]
+
+    def _wave(self, constants: NDArray[np.float64]) -> tuple[Complex, Complex, Complex]:
+        """The relative permittivity, the root that Snell's law gives, and the phase factor of one crossing."""
+        eta = constants[0] - 1j * constants[1] / (2.0 * np.pi * self.frequency * epsilon_0)  # eq. 9
+        root = np.sqrt(eta - (1.0 - self.cosine**2))
+        # e^{-jq}, q of eq. 44
+        phase = np.exp(-2j * np.pi * self.frequency / speed_of_light * constants[2] * root)
+        return eta, root, phase
+
+    def _specular(self, scattering: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(self.transmitted | self.raw, 1.0, np.sqrt(1.0 - scattering**2))
+
+
+class NumpyReplay:
+    """Stored paths, evaluated for any candidate; only Lambert's law and one polarization per port.
 
     Args:
         paths: The path program.
-        parameters: What the candidates' components stand for.
+        parameters: The parameters of a candidate.
     """
 
     def __init__(self, paths: Paths, parameters: Parameters) -> None:
@@ -87,7 +186,7 @@ class Direct:
             path.
         """
         parts = [self._sloped(block) for block in self._blocks(candidates)]
-        power, rise = (np.concatenate(each) for each in zip(*parts, strict=True))
+        power, rise = (np.concatenate(part) for part in zip(*parts, strict=True))
         loss = self._loss(power)
         per_power = np.where(np.isfinite(loss), -10.0 / np.log(10.0) * 10.0 ** (0.1 * loss), 0.0)
         return loss, rise * per_power[:, :, None]
@@ -103,11 +202,11 @@ class Direct:
         """
         constants = self._constants(candidates)
         faces, scattered = self._surfaces.coefficients(constants), self._scattered(constants[3])
-        found = np.empty((len(candidates), self.paths.num_paths))
+        powers = np.empty((len(candidates), self.paths.num_paths))
         for index, steps in self._groups:
             gain = self._gain(index, self._carried(index, steps, faces, scattered)[-1])
-            found[:, index] = self._power(gain)
-        return found
+            powers[:, index] = self._power(gain)
+        return powers
 
     def _blocks(self, candidates: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         rows = max(1, BLOCK // max(len(self._material), 1))
@@ -196,10 +295,13 @@ class Direct:
             strength = constants[3][:, self._diffuse]
             slopes[3][:, self._diffuse] += by_size / np.where(strength > 0.0, strength, 1.0)
         shape = (count, self.paths.num_links, len(self._base))
-        places = {column: place for place, column in enumerate(_COLUMNS)}
-        wanted = {column: (slopes[place] @ self._gathered).reshape(shape) for column, place in places.items()}
+        positions = {column: position for position, column in enumerate(_COLUMNS)}
+        by_column = {
+            column: (slopes[position] @ self._gathered).reshape(shape)
+            for column, position in positions.items()
+        }
         pairs = zip(self._rows.tolist(), self._columns.tolist(), strict=True)
-        return power, np.stack([wanted[column][:, :, row] for row, column in pairs], axis=-1)
+        return power, np.stack([by_column[column][:, :, row] for row, column in pairs], axis=-1)
 
     def _back(
         self,
@@ -212,7 +314,7 @@ class Direct:
         bars: Pair,
         by_size: NDArray[np.float64],
     ) -> None:
-        """Fill in what the powers of paths change by with coefficients, and with the logarithm of what they scatter."""
+        """Fill in derivatives of the powers of paths by coefficients, and by the logarithm of the scattered size."""
         paths, rx = self.paths, self._received(index)
         ahead = np.conj(gain) * self._scale[index] / paths.tx_field.shape[1]
         a_bar, b_bar = ((ahead * rx[..., k, :]).sum(axis=1) for k in range(2))
@@ -249,7 +351,7 @@ class Direct:
 def _powers(
     a: Complex, b: Complex, te: Complex, tm: Complex
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a mirror would reflect of waves, and what comes to it; 1 where that is nothing."""
+    """Power that a mirror would reflect, and incident power; 1 where it is zero."""
     kept, incident = np.abs(te * a) ** 2 + np.abs(tm * b) ** 2, np.abs(a) ** 2 + np.abs(b) ** 2
     return np.where(kept > 0.0, kept, 1.0), np.where(incident > 0.0, incident, 1.0)
 
@@ -257,7 +359,7 @@ def _powers(
 def _size(
     a: Complex, b: Complex, te: Complex, tm: Complex, amplitude: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Factor of a diffuse reflection, as strong as a mirror would reflect, times S sqrt(f_s dOmega)."""
+    """Amplitude of a diffuse reflection: that of a mirror, times S sqrt(f_s dOmega)."""
     incident = np.abs(a) ** 2 + np.abs(b) ** 2
     kept = np.abs(te * a) ** 2 + np.abs(tm * b) ** 2
     return amplitude * np.sqrt(kept / np.where(incident > 0.0, incident, 1.0))
@@ -271,5 +373,5 @@ def _by_kinds(paths: Paths) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]
         deep = depth > step
         kinds[deep, step] = paths.kind[paths.first[:-1][deep] + step]
     sequences, owner = np.unique(kinds, axis=0, return_inverse=True)
-    index = [np.flatnonzero(owner.reshape(-1) == each) for each in range(len(sequences))]
-    return [(some, paths.first[some] + np.arange(int(depth[some[0]]))[:, None]) for some in index]
+    index = [np.flatnonzero(owner.reshape(-1) == group) for group in range(len(sequences))]
+    return [(group, paths.first[group] + np.arange(int(depth[group[0]]))[:, None]) for group in index]

@@ -42,27 +42,27 @@ def test_a_whole_run_equals_the_textbook_loop():
     optimizer = GWO(LOWER, UPPER, seed=seed, population=population, iterations=iterations)
     draws = np.random.default_rng(seed)
     wolves = LOWER + draws.random((population, 2)) * (UPPER - LOWER)
-    seen: list[tuple[float, np.ndarray]] = []
+    evaluated: list[tuple[float, np.ndarray]] = []
     clipped = 0
     for t in range(1, iterations + 1):
         asked = optimizer.ask()
         assert asked == pytest.approx(wolves, abs=1e-12)
         optimizer.tell(asked, objective(asked))
-        seen += [(float(y), x) for x, y in zip(wolves, objective(wolves), strict=True)]
-        leaders = [x for _, x in sorted(seen, key=lambda pair: pair[0])[:3]]
+        evaluated += [(float(y), x) for x, y in zip(wolves, objective(wolves), strict=True)]
+        leaders = [x for _, x in sorted(evaluated, key=lambda pair: pair[0])[:3]]
         a = 2.0 - 2.0 * t / iterations
         r = draws.random((2, population, 3, 2))
         moved = np.empty_like(wolves)
         for i in range(population):
             for j in range(2):
-                places = []
+                guided = []
                 for k in range(3):
                     big_a, big_c = 2.0 * a * r[0, i, k, j] - a, 2.0 * r[1, i, k, j]
-                    places.append(leaders[k][j] - big_a * abs(big_c * leaders[k][j] - wolves[i, j]))
-                moved[i, j] = sum(places) / 3.0
+                    guided.append(leaders[k][j] - big_a * abs(big_c * leaders[k][j] - wolves[i, j]))
+                moved[i, j] = sum(guided) / 3.0
         wolves = np.minimum(np.maximum(moved, LOWER), UPPER)
         clipped += int((wolves != moved).sum())
-    assert clipped > 0  # else the run says nothing about clipping
+    assert clipped > 0  # otherwise the run would not test clipping
     assert optimizer.done
 
 
@@ -71,7 +71,7 @@ def test_leaders_are_the_best_distinct_points_of_the_whole_run():
     x = optimizer.ask()
     optimizer.tell(x, [3.0, 1.0, 2.0, 1.0])
     assert np.array_equal(optimizer.leaders, x[[1, 3, 2]])
-    optimizer.tell(x[1:2], [0.5])  # the same place again is no second leader
+    optimizer.tell(x[1:2], [0.5])  # the same point again is no second leader
     assert np.array_equal(optimizer.leaders, x[[1, 3, 2]])
     worse = optimizer.ask()
     optimizer.tell(worse, [9.0, 9.0, 9.0, 9.0])
@@ -109,16 +109,16 @@ def test_beats_random_search(name):
 
 
 @pytest.mark.parametrize(("centred", "moves_along"), [(True, True), (False, False)])
-def test_only_the_centred_variant_is_indifferent_to_the_origin(centred, moves_along):
-    """The canonical steps depend on where the coordinates have their origin."""
+def test_only_the_centred_variant_is_independent_of_the_origin(centred, moves_along):
+    """The steps of the canonical algorithm depend on the origin of the coordinates."""
     shift = np.array([100.0, -40.0])
-    here = GWO(LOWER, UPPER, seed=3, iterations=4, centred=centred)
-    there = GWO(LOWER + shift, UPPER + shift, seed=3, iterations=4, centred=centred)
+    original = GWO(LOWER, UPPER, seed=3, iterations=4, centred=centred)
+    shifted = GWO(LOWER + shift, UPPER + shift, seed=3, iterations=4, centred=centred)
     for _ in range(3):
-        x, moved = here.ask(), there.ask()
-        here.tell(x, objective(x))
-        there.tell(moved, objective(x))
-    assert np.allclose(here.ask() + shift, there.ask(), atol=1e-9) == moves_along
+        x, moved = original.ask(), shifted.ask()
+        original.tell(x, objective(x))
+        shifted.tell(moved, objective(x))
+    assert np.allclose(original.ask() + shift, shifted.ask(), atol=1e-9) == moves_along
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ from calibray.errors import InputError
 from calibray.optimizers import LeastSquares
 from calibray.optimizers import least_squares as module
 from calibray.optimizers.descent import descend
-from calibray.optimizers.least_squares import RECOMBINED, returns
-from calibray.optimizers.recombination import SPACE, recombined
+from calibray.optimizers.least_squares import COMBINATIONS, SPACE, recombine, returns
 from calibray.optimizers.sampling import design
 from problem_families.landscapes import blocks, hall, rosenbrock, tones, within
 
@@ -29,7 +28,7 @@ def scipy_search(landscape, start):
 
 
 @pytest.mark.parametrize("landscape", [rosenbrock(), tones(), hall(), blocks()], ids=lambda it: it.name)
-def test_the_landscapes_derivatives_are_exact(landscape):
+def test_derivatives_of_the_landscapes_equal_finite_differences(landscape):
     x = np.random.default_rng(0).uniform(landscape.lower, landscape.upper, (4, len(landscape.lower)))
     jacobian = landscape.model(x)[1]
     for column, step in enumerate(1e-6 * np.eye(x.shape[1])):
@@ -45,9 +44,9 @@ def test_rosenbrock_from_one_start():
 
 
 @pytest.mark.parametrize("landscape", [tones(), hall()], ids=lambda it: it.name)
-def test_each_start_ends_where_scipys_does_or_lower(landscape):
-    """From the same start, one search at a time; a different basin is allowed, a worse end in most is not."""
-    starts = np.random.default_rng(5).uniform(landscape.lower, landscape.upper, (12, 3))
+def test_a_search_from_one_start_ends_as_low_as_scipys(landscape):
+    """From the same start, one search at a time. Single searches may end in another basin, most may not end higher."""
+    starts = np.random.default_rng(5).uniform(landscape.lower, landscape.upper, (7, 3))
     differences = []
     for start in starts:
         reference = np.sqrt(
@@ -55,74 +54,79 @@ def test_each_start_ends_where_scipys_does_or_lower(landscape):
         )
         optimizer = LeastSquares(landscape.lower, landscape.upper, starts=1, x0=start, iterations=300)
         optimizer.tell(start[None], *landscape.evaluate(start[None]))
-        mine = landscape.run(optimizer).best.y
-        differences.append(mine - reference)
+        differences.append(landscape.run(optimizer).best.y - reference)
     assert np.median(differences) < 1e-8
 
 
 @pytest.mark.parametrize("landscape", [tones(), hall()], ids=lambda it: it.name)
-def test_the_end_is_a_minimum_by_scipys_judgement(landscape):
+def test_scipy_cannot_improve_the_end(landscape):
     optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=16))
     polished = scipy_search(landscape, optimizer.best.x)
     assert optimizer.best.y == pytest.approx(landscape.value(polished.x[None])[0], abs=1e-9)
     assert optimizer.best.x == pytest.approx(polished.x, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_finds_the_global_minimum_of_a_multimodal_problem(seed):
+@pytest.fixture(scope="module")
+def exhaustive() -> float:
+    """The global minimum of `tones` by brute force."""
     landscape = tones()
     axes = [
         np.linspace(a, b, n) for a, b, n in zip(landscape.lower, landscape.upper, (81, 81, 25), strict=True)
     ]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     values = np.concatenate([landscape.value(part) for part in np.array_split(grid, 60)])
-    exhaustive = min(scipy_search(landscape, x).cost for x in grid[np.argsort(values)[:10]])
-    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=seed))
-    assert optimizer.best.y == pytest.approx(np.sqrt(2.0 * exhaustive / 30), abs=1e-9)
-
-
-def test_one_start_would_not_find_it():
-    """The negative control of the test above."""
-    landscape = tones()
-    found = [
-        landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=1, seed=s)).best.y
-        for s in range(9)
-    ]
-    assert np.median(found) > landscape.minimum + 0.1
+    cost = min(scipy_search(landscape, x).cost for x in grid[np.argsort(values)[:10]])
+    return np.sqrt(2.0 * cost / 30)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_finds_the_global_minimum_of_the_district(seed):
-    landscape = hall()
+def test_the_global_minimum_of_a_multimodal_problem_is_found(seed, exhaustive):
+    landscape = tones()
     optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=seed))
+    assert optimizer.best.y == pytest.approx(exhaustive, abs=1e-9)
+
+
+def test_one_start_misses_the_global_minimum():
+    """The negative control of the test above."""
+    landscape = tones()
+    ends = [
+        landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=1, seed=s)).best.y
+        for s in range(9)
+    ]
+    assert np.median(ends) > landscape.minimum + 0.1
+
+
+def test_the_global_minimum_of_resonating_panes_is_found():
+    landscape = hall()
+    optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=0))
     assert optimizer.best.y == pytest.approx(landscape.minimum, abs=1e-4)
     assert optimizer.evaluations < 12_000
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_searches_that_cannot_catch_up_with_a_known_minimum_cost_little(seed):
-    """From a minimum that is known, others are given up sooner, and none that leads lower is."""
+@pytest.mark.parametrize("seed", range(2))
+def test_searches_that_cannot_catch_up_with_a_known_minimum_are_given_up_early(seed):
+    """With a smaller `catch_up` searches are given up sooner, and none that leads lower."""
     landscape = tones()
     known = landscape.run(LeastSquares(landscape.lower, landscape.upper, seed=5)).best
 
     def run(catch_up):
-        given = {"seed": seed, "starts": 8, "x0": known.x, "catch_up": catch_up}
-        return landscape.run(LeastSquares(landscape.lower, landscape.upper, **given))
+        settings = {"seed": seed, "starts": 8, "x0": known.x, "catch_up": catch_up}
+        return landscape.run(LeastSquares(landscape.lower, landscape.upper, **settings))
 
     patient, quick, at_once = run(100.0), run(10.0), run(0.0)
     assert at_once.evaluations < quick.evaluations < patient.evaluations
-    for each in (patient, quick, at_once):
-        assert each.best.y == pytest.approx(known.y, abs=1e-9)
+    for optimizer in (patient, quick, at_once):
+        assert optimizer.best.y == pytest.approx(known.y, abs=1e-9)
 
 
 @pytest.mark.parametrize("catch_up", [-1.0, np.inf, "10"])
-def test_how_far_a_search_may_lie_behind_is_checked(catch_up):
+def test_an_impossible_catch_up_is_refused(catch_up):
     with pytest.raises(InputError, match="catch_up"):
         LeastSquares([0.0], [1.0], catch_up=catch_up)
 
 
 def test_active_bounds():
-    """The minimum (1, 1) lies outside; the constrained one is on the face x0 = 0.5 at x1 = 0.25."""
+    """The minimum (1, 1) is outside; the constrained one is on the face x0 = 0.5 at x1 = 0.25."""
     landscape = within(rosenbrock(), [-2.0, -2.0], [0.5, 2.0])
     optimizer = landscape.run(LeastSquares(landscape.lower, landscape.upper, starts=8))
     assert optimizer.best.x == pytest.approx(np.array([0.5, 0.25]), abs=1e-7)
@@ -145,7 +149,7 @@ def test_a_parameter_without_influence_does_no_harm():
     assert optimizer.best.x[0] == pytest.approx(0.5, abs=1e-9)
 
 
-def test_starts_are_asked_together_and_drop_out():
+def test_starts_are_asked_in_one_batch_and_drop_out():
     landscape = tones()
     optimizer = LeastSquares(
         landscape.lower, landscape.upper, starts=32, x0=[[5.0, 2.0, 1.0], [6.0, 2.0, 1.0]]
@@ -159,10 +163,10 @@ def test_starts_are_asked_together_and_drop_out():
             assert x[:3] == pytest.approx(np.array([[5.0, 2.0, 1.0], [6.0, 2.0, 1.0], [5.0, 2.0, 0.5]]))
         optimizer.tell(x, *landscape.evaluate(x))
     assert sizes[0] == 35
-    again = np.flatnonzero(np.diff(sizes) > 0)[0] + 1  # where searches from combinations of minima begin
+    again = np.flatnonzero(np.diff(sizes) > 0)[0] + 1  # searches from combinations of minima begin
     assert sizes[:again] == sorted(sizes[:again], reverse=True)
     assert sizes[again - 1] < 5
-    assert max(sizes[again:]) <= RECOMBINED
+    assert max(sizes[again:]) <= COMBINATIONS
 
 
 def test_duplicate_starts_are_merged():
@@ -187,8 +191,8 @@ def test_impossible_starts_are_refused(x0, message):
         LeastSquares([-2.0, -2.0], [2.0, 2.0], x0=x0)
 
 
-def searched(count, wide):
-    """As many minima of equal width, the lowest of which lies in a basin so wide."""
+def evaluations_for(count, wide):
+    """Evaluations for `count` minima, the lowest in a basin of width `wide`, the others equally wide."""
     edges = np.concatenate([[0.0, wide], wide + (1.0 - wide) * np.linspace(0.0, 1.0, count)[1:]])
     centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     optimizer = LeastSquares([0.0], [1.0])
@@ -203,15 +207,15 @@ def searched(count, wide):
 
 
 def test_starts_end_when_the_best_minimum_keeps_coming_back():
-    """And no sooner: a basin that few searches end in has all of them."""
-    often = searched(5, 0.4)
-    seldom = searched(5, 0.01)
+    """And not before: if few searches end in the best basin, all starts are used."""
+    often = evaluations_for(5, 0.4)
+    seldom = evaluations_for(5, 0.01)
     assert often < 4 * 64
     assert seldom > 512
 
 
-def test_searches_are_counted_where_they_end():
-    """Every search that began stands somewhere, under its own name or another's."""
+def test_every_search_is_counted_at_the_minimum_where_it_ended():
+    """A merged search is counted by the one that it was merged with."""
     landscape = tones()
     width = np.subtract(landscape.upper, landscape.lower)
     ended = None
@@ -231,11 +235,11 @@ def test_searches_are_counted_where_they_end():
 
 
 LADDER = np.array([0.37, 0.62, 0.81])
-"""Where each coordinate of `ladder` has its best rung, between others that fit almost as well."""
+"""Coordinates of the best of many minima of `ladder` that fit almost as well."""
 
 
 def ladder(x):
-    """Coordinates that act apart, each with a row of nine minima; the best is 0, at `LADDER`."""
+    """Independent coordinates, each with nine minima in a row; the best minimum is 0, at `LADDER`."""
     phase = 9.0 * np.pi * (x - LADDER)
     r = np.concatenate([np.sin(phase), 0.5 * (x - LADDER)], axis=1)
     eye = np.eye(3)
@@ -243,7 +247,7 @@ def ladder(x):
     return r, np.concatenate(slope, axis=1)
 
 
-def on_the_ladder(seed, starts=32):
+def search_ladder(seed, starts=32):
     optimizer = LeastSquares(np.zeros(3), np.ones(3), seed=seed, starts=starts)
     while not optimizer.done:
         x = optimizer.ask()
@@ -253,40 +257,40 @@ def on_the_ladder(seed, starts=32):
 
 
 def test_combinations_of_minima_lead_to_the_best(monkeypatch):
-    """One of 729 minima; no start comes near it, but each of its coordinates is found by some."""
-    assert sum(on_the_ladder(seed).best.y < 1e-6 for seed in range(8)) >= 6
-    monkeypatch.setattr(module, "RECOMBINED", 0)
-    assert min(on_the_ladder(seed).best.y for seed in range(8)) > 1e-3
+    """No start comes near the best of 729 minima, but each of its coordinates is found by some."""
+    assert sum(search_ladder(seed).best.y < 1e-6 for seed in range(8)) >= 6
+    monkeypatch.setattr(module, "COMBINATIONS", 0)
+    assert min(search_ladder(seed).best.y for seed in range(8)) > 1e-3
 
 
 def test_minima_are_not_combined_where_the_best_keeps_coming_back(monkeypatch):
-    often = searched(5, 0.4)
-    monkeypatch.setattr(module, "RECOMBINED", 0)
-    assert searched(5, 0.4) == often
+    often = evaluations_for(5, 0.4)
+    monkeypatch.setattr(module, "COMBINATIONS", 0)
+    assert evaluations_for(5, 0.4) == often
 
 
-def test_two_searches_are_followed_by_none(monkeypatch):
-    """They end a fit that goes on from the minima of another."""
-    spent = on_the_ladder(0, starts=2).evaluations
-    monkeypatch.setattr(module, "RECOMBINED", 0)
-    assert on_the_ladder(0, starts=2).evaluations == spent
+def test_two_starts_are_too_few_for_combinations(monkeypatch):
+    """A fit that continues from the minima of another one has two starts."""
+    spent = search_ladder(0, starts=2).evaluations
+    monkeypatch.setattr(module, "COMBINATIONS", 0)
+    assert search_ladder(0, starts=2).evaluations == spent
 
 
-def test_the_next_rung_is_found_by_a_step_that_was_seen_elsewhere():
-    """And where the step would leave the box, or lead to what is known, it is not taken."""
+def test_a_step_between_two_minima_is_tried_from_the_best():
+    """Steps that leave the box or lead to a known minimum are left out."""
     minima = np.array([[0.8, 0.6], [0.1, 0.3], [0.1, 0.5]])
-    found = recombined(minima, 99)
-    for there in ([0.8, 0.4], [0.8, 0.8], [0.1, 0.6], [0.8, 0.3], [0.8, 0.5]):
-        assert np.linalg.norm(found - there, axis=1).min() < 1e-12
-    assert len(found) == 5
-    assert len(recombined(minima, 2)) == 2
-    assert ((found >= 0.0) & (found <= 1.0)).all()
-    assert recombined(minima[:1], 99).shape == (0, 2)
+    points = recombine(minima, 99)
+    for point in ([0.8, 0.4], [0.8, 0.8], [0.1, 0.6], [0.8, 0.3], [0.8, 0.5]):
+        assert np.linalg.norm(points - point, axis=1).min() < 1e-12
+    assert len(points) == 5
+    assert len(recombine(minima, 2)) == 2
+    assert ((points >= 0.0) & (points <= 1.0)).all()
+    assert recombine(minima[:1], 99).shape == (0, 2)
 
 
-def test_points_lie_apart_from_minima_and_one_another():
+def test_combinations_keep_a_distance_from_minima_and_from_each_other():
     minima = design("sobol", 16, 3, np.random.default_rng(1))
-    found = recombined(minima, 99)
-    assert len(found) > 10
-    apart = np.linalg.norm(np.concatenate([found, minima])[None] - found[:, None], axis=2)
-    assert np.sort(apart, axis=1)[:, 1].min() > SPACE
+    points = recombine(minima, 99)
+    assert len(points) > 10
+    distance = np.linalg.norm(np.concatenate([points, minima])[None] - points[:, None], axis=2)
+    assert np.sort(distance, axis=1)[:, 1].min() > SPACE

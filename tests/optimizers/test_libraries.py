@@ -1,4 +1,4 @@
-"""The optimizers of other libraries, and the Gaussian process of the value."""
+"""Optimizers of other libraries, and Bayesian optimization of the value."""
 
 import sys
 import threading
@@ -47,25 +47,24 @@ def test_the_gaussian_process_needs_fewer_evaluations_than_random_search():
 
 
 @pytest.mark.parametrize("method", LIBRARIES)
-def test_they_begin_at_the_best_point_told_before(method):
+def test_they_start_at_the_best_earlier_point(method):
     land = rosenbrock()
     optimizer = method(land.lower, land.upper, budget=20, seed=2)
-    known = np.array([[-1.5, 1.0], [0.8, 0.6]])
-    optimizer.tell(known, *land.evaluate(known))
+    earlier = np.array([[-1.5, 1.0], [0.8, 0.6]])
+    optimizer.tell(earlier, *land.evaluate(earlier))
     first = optimizer.ask()
     if method is CMAES:  # draws around it
-        assert np.linalg.norm(np.median(first, axis=0) - known[1]) < np.linalg.norm(
-            np.median(first, axis=0) - known[0]
-        )
+        far, near = np.linalg.norm(np.median(first, axis=0) - earlier, axis=1)
+        assert near < far
     else:
-        assert np.abs(first - known[1]).max(axis=1).min() < 1e-12
+        assert np.abs(first - earlier[1]).max(axis=1).min() < 1e-12
 
 
-def test_what_the_gaussian_process_was_told_before_replaces_its_design():
+def test_earlier_points_replace_the_design_of_the_gaussian_process():
     land = rosenbrock()
     optimizer = GaussianProcess(land.lower, land.upper, seed=2)
-    known = land.lower + np.random.default_rng(0).random((6, 2)) * 4.0
-    optimizer.tell(known, *land.evaluate(known))
+    earlier = land.lower + np.random.default_rng(0).random((6, 2)) * 4.0
+    optimizer.tell(earlier, *land.evaluate(earlier))
     assert len(optimizer.ask()) == 1
 
 
@@ -81,21 +80,21 @@ def test_the_scale_of_the_parameters_does_not_matter(method):
     near, far = (method(land.lower, land.upper, budget=24, seed=3) for land in (near, far))
     while not near.done:
         x = near.ask()
-        told = rosenbrock().evaluate(x)
-        near.tell(x, *told)
-        far.tell(far.ask(), *told)
+        evaluation = rosenbrock().evaluate(x)
+        near.tell(x, *evaluation)
+        far.tell(far.ask(), *evaluation)
         assert np.array_equal(far.best.x, 0.5 * LARGE * near.best.x)
 
 
 @pytest.mark.parametrize("method", BUDGETED)
-def test_numpys_global_generator_is_left_alone(method):
+def test_numpys_global_generator_is_not_used(method):
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     run(method, rosenbrock(), budget=30)
     assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
 
 
 @pytest.mark.parametrize("method", [DFOLS, DifferentialEvolution])
-def test_a_run_that_is_dropped_takes_its_thread_along(method):
+def test_the_thread_of_a_dropped_run_ends(method):
     before = threading.active_count()
     optimizer = method([0.0, 0.0], [1.0, 1.0])
     optimizer.ask()
@@ -104,7 +103,7 @@ def test_a_run_that_is_dropped_takes_its_thread_along(method):
     assert threading.active_count() == before
 
 
-def test_an_error_of_a_library_arrives_where_it_was_asked():
+def test_an_error_of_a_library_reaches_the_caller():
     def minimise(evaluate):
         evaluate(np.zeros((1, 1)))
         raise ZeroDivisionError("in the library")
@@ -115,7 +114,7 @@ def test_an_error_of_a_library_arrives_where_it_was_asked():
         search.send(Evaluations(np.zeros((1, 1)), np.zeros(1)))
 
 
-def test_a_library_that_swallows_every_exception_is_ended_too():
+def test_the_thread_ends_even_if_the_library_swallows_every_exception():
     def minimise(evaluate):
         for _ in range(3):
             try:
@@ -131,7 +130,7 @@ def test_a_library_that_swallows_every_exception_is_ended_too():
 
 
 @pytest.mark.parametrize(("method", "module", "package"), [(CMAES, "cma", "cma"), (DFOLS, "dfols", "DFO-LS")])
-def test_a_missing_library_is_named_with_its_remedy(method, module, package, monkeypatch):
+def test_a_missing_library_is_named_with_the_command_that_installs_it(method, module, package, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(
         InputError, match=rf"{package} is not installed .*pip install 'calibray\[optimizers\]'"
@@ -139,10 +138,10 @@ def test_a_missing_library_is_named_with_its_remedy(method, module, package, mon
         method([0.0], [1.0])
 
 
-def test_the_logarithm_of_the_expected_improvement_is_exact_far_out():
+def test_the_logarithm_of_the_expected_improvement_is_accurate_in_the_tail():
     z = np.array([-12.0, -6.0, -1.5, -1.0, 0.3, 4.0])
     t = np.linspace(0.0, 1.0, 200_001)[1:-1]
-    for each in z:  # the integral of (z - u)+ phi(u), by quadrature over u = z - s / (1 - s)
+    for value in z:  # the integral of (z - u)+ phi(u), by quadrature over u = z - t / (1 - t)
         gain = t / (1.0 - t)
-        integral = np.trapezoid(gain * norm.pdf(each - gain) / (1.0 - t) ** 2, t)
-        assert log_shape(np.array([each]))[0] == pytest.approx(np.log(integral), abs=1e-6)
+        integral = np.trapezoid(gain * norm.pdf(value - gain) / (1.0 - t) ** 2, t)
+        assert log_shape(np.array([value]))[0] == pytest.approx(np.log(integral), abs=1e-6)

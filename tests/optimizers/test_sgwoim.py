@@ -69,11 +69,11 @@ def test_a_whole_run_equals_algorithm_1():
         moved = np.empty_like(wolves)
         for i in range(population):
             for j in range(2):
-                places = []
+                guided = []
                 for k in range(3):
                     big_a, big_c = 2.0 * a * r[0, i, k, j] - a, 2.0 * r[1, i, k, j]
-                    places.append(leaders[k][j] - big_a * abs(big_c * leaders[k][j] - wolves[i, j]))
-                moved[i, j] = (1.0 - w) * sum(places) / 3.0 + w * memory[i, j]
+                    guided.append(leaders[k][j] - big_a * abs(big_c * leaders[k][j] - wolves[i, j]))
+                moved[i, j] = (1.0 - w) * sum(guided) / 3.0 + w * memory[i, j]
         wolves = np.minimum(np.maximum(moved, LOWER), UPPER)
         clipped += int((wolves != moved).sum())
     assert optimizer.done
@@ -127,18 +127,18 @@ def test_takes_225_evaluations_at_the_papers_settings():
 
 @pytest.mark.parametrize("kernel", ["cubic", "gaussian"])
 def test_predictions_enter_neither_leaders_nor_memory_nor_best(kernel):
-    """Every value that the optimizer holds is one that was told."""
+    """Every value that the optimizer holds was told to it."""
     landscape = tones()
     optimizer = SGWOIM(landscape.lower, landscape.upper, seed=2, kernel=kernel)
-    told = {}
+    values = {}
     while not optimizer.done:
         x = optimizer.ask()
         y = landscape.value(x)
         optimizer.tell(x, y)
-        told |= {tuple(point): value for point, value in zip(x, y, strict=True)}
-        assert told[tuple(optimizer.best.x)] == optimizer.best.y == min(told.values())
-        assert [told[tuple(x)] for x in optimizer.leaders] == sorted(told.values())[:3]
-    assert [told[tuple(x)] for x in optimizer.memory.x] == list(optimizer.memory.y)
+        values |= {tuple(point): value for point, value in zip(x, y, strict=True)}
+        assert values[tuple(optimizer.best.x)] == optimizer.best.y == min(values.values())
+        assert [values[tuple(x)] for x in optimizer.leaders] == sorted(values.values())[:3]
+    assert [values[tuple(x)] for x in optimizer.memory.x] == list(optimizer.memory.y)
 
 
 def test_screened_wolves_move_but_keep_their_memory():
@@ -154,7 +154,7 @@ def test_screened_wolves_move_but_keep_their_memory():
     assert {tuple(point) for point in optimizer.memory.x[changed]} == {tuple(point) for point in before}
 
 
-def test_warm_start_feeds_leaders_and_surrogate_but_no_memory():
+def test_earlier_evaluations_become_leaders_but_no_memory():
     optimizer = SGWOIM(LOWER, UPPER, seed=1)
     optimizer.tell([[1.2, 8.3]], [0.0])
     x = optimizer.ask()

@@ -1,4 +1,4 @@
-"""The vector surrogate: what it finds within few evaluations, and how it behaves as an optimizer."""
+"""The vector surrogate: it comes close to the minimum in few evaluations, and its steps are as documented."""
 
 from dataclasses import replace
 
@@ -6,53 +6,32 @@ import numpy as np
 import pytest
 
 from calibray.errors import InputError
-from calibray.optimizers import SGWOIM, LatinHypercube, VectorSurrogate
-from calibray.optimizers.multifidelity.kriging import fit
-from calibray.optimizers.multifidelity.vector_surrogate import (
-    expected_improvement,
-    mean_square,
-    predicted_minima,
-)
-from problem_families.landscapes import Landscape, blocks, rosenbrock, street
+from calibray.optimizers import LatinHypercube, VectorSurrogate
+from calibray.optimizers.kriging import fit
+from calibray.optimizers.vector_surrogate import improvement, mean_square, predicted_minima
+from problem_families.landscapes import rosenbrock, street
 
 STREET = street()
 
 
-def excess(method, seeds: int, landscape: Landscape = STREET, **settings) -> np.ndarray:
-    """Excess of the best evaluation so far over the global minimum [seeds, evaluations]."""
-    courses = []
-    for seed in range(seeds):
-        optimizer, told = method(landscape.lower, landscape.upper, seed=seed, **settings), []
-        while not optimizer.done:
-            x = optimizer.ask()
-            y, residuals, _ = landscape.evaluate(x)
-            optimizer.tell(x, y, residuals)
-            told += y.tolist()
-        courses.append(np.minimum.accumulate(told) - landscape.minimum)
-    return np.array(courses)
+def excess(method, seed: int, **settings) -> float:
+    """Excess of the best evaluation over the global minimum."""
+    optimizer = method(STREET.lower, STREET.upper, seed=seed, **settings)
+    return STREET.run(optimizer).best.y - STREET.minimum
 
 
-def test_30_evaluations_beat_the_papers_method_at_225_and_60_come_close_to_the_global_minimum():
-    mine = excess(VectorSurrogate, seeds=3, budget=60)
-    at_30, at_60 = mine[:, 29], mine[:, 59]
-    assert np.median(at_30) < np.median(excess(SGWOIM, seeds=5)[:, -1])
-    assert np.median(at_30) < 0.2 * np.median(excess(LatinHypercube, seeds=5, budget=30)[:, -1])
-    assert at_30.max() < 0.1
-    assert np.median(at_60) < 0.02
-    # Rounding changes the course of a seed: 0.053 dB was seen.
-    assert at_60.max() < 0.06
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sixty_evaluations_come_close_to_the_global_minimum(seed):
+    modelled = excess(VectorSurrogate, seed, budget=60)
+    assert modelled < 0.06  # dB; rounding changes the course of a run
+    assert modelled < 0.5 * excess(LatinHypercube, seed, budget=60)
 
 
-def test_60_evaluations_of_eight_parameters_beat_the_papers_method_at_225():
-    mine = excess(VectorSurrogate, seeds=2, landscape=blocks(), budget=60)
-    assert mine[:, -1].mean() < np.median(excess(SGWOIM, seeds=5, landscape=blocks())[:, -1])
+def test_batches_of_four_come_close_too():
+    assert excess(VectorSurrogate, 0, budget=48, batch=4) < 0.1
 
 
-def test_a_batch_of_four_costs_little():
-    assert np.median(excess(VectorSurrogate, seeds=3, budget=60, batch=4)[:, -1]) < 0.03
-
-
-def test_a_logarithmic_scale_is_seen_by_the_model_only():
+def test_a_logarithmic_scale_applies_to_the_model_only():
     optimizer = VectorSurrogate(STREET.lower, STREET.upper, logarithmic=[True, False, True], initial=40)
     x = optimizer.ask()
     share = np.mean(x < np.sqrt(STREET.lower * STREET.upper), axis=0)
@@ -90,7 +69,7 @@ def test_budget_batches_and_initial_design():
     assert VectorSurrogate(STREET.lower, STREET.upper).budget == 60
 
 
-def test_points_told_before_count_as_initial_design():
+def test_earlier_points_count_as_initial_design():
     x = np.random.default_rng(0).uniform(STREET.lower, STREET.upper, (20, 3))
     warm = VectorSurrogate(STREET.lower, STREET.upper, budget=10)
     warm.tell(x, *STREET.evaluate(x)[:2])
@@ -101,16 +80,16 @@ def test_points_told_before_count_as_initial_design():
     clumped = VectorSurrogate(STREET.lower, STREET.upper)
     near = x[0] + 0.01 * (x[:3] - x[0])
     clumped.tell(near, *STREET.evaluate(near)[:2])
-    assert len(clumped.ask()) == 7  # they say no more than one point does
+    assert len(clumped.ask()) == 7  # clumped points count as one
     flat = VectorSurrogate(STREET.lower, STREET.upper, budget=12)
-    x[:, 1] = 4.0  # these points say nothing about the second parameter
+    x[:, 1] = 4.0  # these points do not vary the second parameter
     flat.tell(x, *STREET.evaluate(x)[:2])
     flat.ask()
-    assert flat.trust is None  # so there is no model yet
+    assert flat.trust is None  # so no model can be fitted yet
     assert STREET.run(flat).evaluations == 32
 
 
-def test_stops_when_little_is_to_be_gained():
+def test_a_tolerance_ends_the_search_early():
     def evaluations(**settings):
         optimizer = bent(5, VectorSurrogate(np.zeros(5), np.ones(5), **settings))
         assert optimizer.best.y < 0.01
@@ -120,15 +99,15 @@ def test_stops_when_little_is_to_be_gained():
     assert evaluations() == 100
 
 
-def test_noisy_answers_are_survived():
-    """The best value told is as lucky as it is good; the point itself must be near the planted one."""
-    optimizer = bent(3, VectorSurrogate(np.zeros(3), np.ones(3), noisy=True, seed=2), noise=0.02)
+def test_a_noisy_engine_is_smoothed():
+    """The best noisy value is partly luck, so the point is compared with the planted one."""
+    optimizer = bent(3, VectorSurrogate(np.zeros(3), np.ones(3), noisy=True, seed=2, budget=40), noise=0.02)
     assert optimizer.best.x == pytest.approx(np.linspace(0.2, 0.8, 3), abs=0.03)
 
 
-def test_trust_tells_a_good_model_from_a_hopeless_one():
+def test_trust_is_high_for_a_good_model_and_low_for_a_useless_one():
     def shuffled(x):
-        """Residuals without rhyme or reason in x."""
+        """Residuals that are random in x."""
         draws = [np.random.default_rng(int(1e6 * row.sum())).standard_normal(40) for row in x]
         return np.array(draws), np.zeros((len(x), 40, 3))
 
@@ -148,14 +127,14 @@ def test_moments_of_the_mean_square_against_monte_carlo():
     model = fit(points, residuals)
     x = np.vstack([rng.random((5, 2)), [[1.5, -0.5]]])
     mean, share = model.predict(x)
-    scatter = rng.standard_normal((20_000, 1, len(model.root))) @ model.root * np.sqrt(share[:, None])
-    sampled = np.mean((mean + scatter) ** 2, axis=-1)
+    errors = rng.standard_normal((20_000, 1, len(model.root))) @ model.root * np.sqrt(share[:, None])
+    sampled = np.mean((mean + errors) ** 2, axis=-1)
     centre, spread = mean_square(model, x)
     assert centre == pytest.approx(sampled.mean(axis=0), rel=0.03)
     assert spread == pytest.approx(sampled.std(axis=0), rel=0.05)
 
 
-def test_expected_improvement_of_one_residual_is_that_of_the_square_of_a_normal_variable():
+def test_expected_improvement_of_one_residual_equals_its_integral():
     points = np.random.default_rng(3).random((12, 2))
     model = fit(points, np.sin(3.0 * points.sum(axis=1, keepdims=True)))
     x = np.array([[0.5, 0.5], [0.1, 0.9], [1.6, 1.2], [-1.0, -1.0]])
@@ -167,17 +146,19 @@ def test_expected_improvement_of_one_residual_is_that_of_the_square_of_a_normal_
         density = np.exp(-0.5 * ((r - centre) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
         expected.append(np.trapezoid((best**2 - r**2) * density, r))
     normal = np.random.default_rng(4).standard_normal((200_000, len(model.root)))
-    assert expected_improvement(model, x, best, normal) == pytest.approx(expected, rel=0.03, abs=1e-6)
+    assert improvement(mean, share, normal @ model.root, best) == pytest.approx(expected, rel=0.03, abs=1e-6)
     assert max(expected) > 0.02
 
 
-def test_nothing_is_to_be_gained_where_the_model_is_certain_of_worse():
+def test_expected_improvement_is_zero_at_evaluated_points():
     points = np.random.default_rng(3).random((12, 2))
     model = fit(points, np.sin(3.0 * points))
     y = np.sqrt(np.mean(model.residuals**2, axis=1))
     normal = np.random.default_rng(4).standard_normal((256, len(model.root)))
-    improvement = expected_improvement(model, points, 0.99 * y.min(), normal)
-    assert improvement == pytest.approx(np.zeros(12), abs=1e-4)
+    mean, share = model.predict(points)
+    assert improvement(mean, share, normal @ model.root, 0.99 * y.min()) == pytest.approx(
+        np.zeros(12), abs=1e-4
+    )
 
 
 def test_predicted_minima_are_minima_of_the_model():

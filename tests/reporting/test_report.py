@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import shown
-from calibray.comparison import paper_tables as demo
-from calibray.comparison import tables as comparison
+from calibray.comparison import comparison
 from calibray.reporting import doctor_table as diagnosis
 from calibray.reporting import ledger_table as ledger
 from calibray.reporting import result_tables
@@ -56,7 +55,7 @@ def test_a_ledger_is_printed_as_ever():
 
 
 def test_the_demo_the_comparison_and_the_doctor_are_printed_as_ever():
-    assert render(*demo.tables(shown.demo())) == golden("demo")
+    assert render(*shown.demo().tables()) == golden("demo")
     assert render(comparison.table(shown.comparison())) == golden("comparison")
     assert markdown.render(comparison.table(shown.comparison())) == golden("comparison-markdown")
     assert render(diagnosis.table(shown.diagnosis())) == golden("doctor")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,49 +47,6 @@ class Exact(Calls):
         moved = [(candidates + move, candidates - move) for move in 1e-5 * np.eye(3)]
         slopes = [(self.path_loss(there) - self.path_loss(here)) / 2e-5 for there, here in moved]
         return self.path_loss(candidates), np.stack(slopes, axis=2)
-
-
-@pytest.fixture(scope="module")
-def process() -> discrepancy.Discrepancy:
-    """A process through six answers of two links, the response of which is a plane's."""
-    unit = np.random.default_rng(2).random((6, 2))
-    seen = Seen(unit, 2.0 * (unit - 0.5))
-    truth = np.stack([np.sin(4 * unit[:, 0]) + unit[:, 1], np.cos(3 * unit[:, 1])], axis=1)
-    return discrepancy.fit(seen, truth, 1.0)
-
-
-def looked(unit: np.ndarray) -> Seen:
-    return Seen(unit, 2.0 * (unit - 0.5))
-
-
-def test_functions_pass_through_what_was_answered_and_differ_elsewhere_as_the_process_says(process):
-    random, unit = np.random.default_rng(0), np.random.default_rng(1).random((40, 2))
-    functions = [drawn(process, random) for _ in range(200)]
-    for function in functions[:5]:
-        assert function.values(process.seen) == pytest.approx(process.remains, abs=2e-2)
-    values = np.array([function.values(looked(unit)) for function in functions])
-    mean, share = process.predict(looked(unit))
-    expected = np.sqrt(np.outer(share, np.sum(process.root**2, axis=0)))
-    apart = np.sqrt(np.mean((values - mean) ** 2, axis=0))
-    assert np.median(apart / expected) == pytest.approx(1.0, abs=0.15)
-    assert np.quantile(apart / expected, (0.05, 0.95)) == pytest.approx([1.0, 1.0], abs=0.4)
-    # Without deviations the mean is left.
-    assert drawn(process, random, 0.0).values(looked(unit)) == pytest.approx(mean, abs=1e-9)
-
-
-def test_their_slopes_are_those_of_their_values(process):
-    function, unit = drawn(process, np.random.default_rng(4)), np.array([[0.3, 0.6], [0.8, 0.1]])
-    slopes = function.slopes(looked(unit), np.broadcast_to(2.0 * np.eye(2), (2, 2, 2)))
-    for k, move in enumerate(1e-6 * np.eye(2)):
-        difference = function.values(looked(unit + move)) - function.values(looked(unit - move))
-        assert slopes[:, :, k] == pytest.approx(difference / 2e-6, rel=1e-4, abs=1e-5)
-
-
-def test_a_process_that_is_too_sure_is_surprised(process):
-    points = np.arange(6)
-    surer = discrepancy.solve(process.seen, process.remains, process.hyper - np.log([1e4] * 3 + [1] * 3), 1.0)
-    bent = replace(surer, whitened=surer.whitened * 0.1)
-    assert surprise(bent, points) > 2.0 > surprise(process, points)
 
 
 @pytest.fixture(scope="module")

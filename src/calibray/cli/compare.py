@@ -1,4 +1,4 @@
-"""`calibray compare`: methods side by side."""
+"""`calibray compare`: methods at equal budgets."""
 
 from __future__ import annotations
 
@@ -20,49 +20,47 @@ def compare(
     ],
     methods: Annotated[
         str,
-        typer.Option(
-            metavar="NAMES", help="Methods with commas between; METHOD@CALLS has a budget of its own."
-        ),
+        typer.Option(metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets another budget."),
     ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares",
     seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, from seeds 0 to N - 1.")] = 25,
     budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls of a run.")] = 225,
-    workers: Annotated[int, typer.Option(metavar="N", help="Processes that run at once.")] = 1,
+    workers: Annotated[int, typer.Option(metavar="N", help="Number of processes.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Run methods from many seeds on a study's stored paths at equal budgets."""
     import os
 
-    # The matrices are small: threads cost more than they give, and the runs are what is spread over cores.
-    # The variables are read when NumPy is loaded, here and in the workers.
+    # The matrices are small, so BLAS threads cost more than they gain; runs are distributed over cores instead.
+    # NumPy reads the variables when it is imported, here and in the workers.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
     from functools import partial
 
     from calibray.cli.progress_bars import progress_bars
-    from calibray.comparison.comparison import compare as run_all
+    from calibray.comparison.compare import compare as run_all
+    from calibray.comparison.compare import parse_methods
+    from calibray.comparison.comparison import optimum_text, table
     from calibray.comparison.comparison_files import FILES, write
-    from calibray.comparison.contestant import Contender
-    from calibray.comparison.problems import study_arena
-    from calibray.comparison.tables import optimum, table
+    from calibray.comparison.problem import study_problem
     from calibray.study import Study
     from calibray.support.output_files import check_outputs
     from calibray.tables.text import render
 
     names = [name.strip() for name in methods.split(",") if name.strip()]
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
-    contenders = [Contender.parse(name, budget) for name in dict.fromkeys(names)]
-    calls = seeds * sum(contender.budget for contender in contenders)
+    parsed = parse_methods(names, budget)
+    calls = seeds * sum(method.budget for method in parsed)
     typer.echo(
-        f"{seeds * len(contenders):,} runs of {calls:,} RT calls together, less those kept in {out}", err=True
+        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in all, minus those kept in {out}", err=True
     )
     with progress_bars(log()) as progress:
         finished = run_all(
-            partial(study_arena, study_file),
+            partial(study_problem, study_file),
             names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
         )  # fmt: skip
     write(finished, out)
-    typer.echo(render(table(finished), optimum(finished)))
+    typer.echo(render(table(finished), optimum_text(finished)))
     for name, seed, failure in finished.failures():
         typer.echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
     typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)

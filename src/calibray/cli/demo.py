@@ -24,19 +24,18 @@ def demo(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run the paper's experiment in the embedded district, and space mapping and auto beside it: tables and figures."""
+    """Run the paper's experiment in the demo district, with space mapping and auto: tables, figures and a report."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.comparison.demo_files import FIGURES, write
-        from calibray.comparison.experiment import run_demo
-        from calibray.comparison.paper_tables import tables
+        from calibray.comparison.demo import FILES, run_demo, write_demo
         from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
 
-        check_outputs(out, ["result.json", *FIGURES], (), overwrite)
+        check_outputs(out, FILES, (), overwrite)
         finished = run_demo(engine, seed, progress)
         progress("writing", 0, None)
-        write(finished, out)
-    typer.echo(render(*tables(finished)) + "\n")
-    typer.echo(f"Written to {out}: result.json, {', '.join(FIGURES)}, and a folder for each method", err=True)
+        page = write_demo(finished, out)
+    typer.echo(render(*finished.tables()) + "\n")
+    typer.echo(f"Written to {out}: {', '.join(FILES)}, and a folder for each method", err=True)
+    typer.echo(f"Report: {page}")

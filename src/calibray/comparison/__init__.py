@@ -1,1 +1,1 @@
-"""Comparison: methods side by side from many seeds at equal budgets."""
+"""Methods compared at equal budgets, and the paper's experiment."""

@@ -1,42 +1,37 @@
-"""Methods side by side at equal budgets: every method from many seeds on one problem, best so far by RT call.
+"""The result of a comparison: excess of every method over RT calls, as numbers and as tables.
 
-An excess is what the best objective so far lies above the global optimum of the same data. The optimum is that of
-least squares from very many starts, or of any run that found a lower one.
+The excess is the best objective so far minus the global optimum of the same data. The optimum is that of least squares
+from very many starts, or of any run that went lower.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray import optimizers
-from calibray.comparison.contestant import MOST, Contender, code, recorded, run_contender
-from calibray.comparison.problems import Arena
-from calibray.comparison.run_log import MethodRun, Runs
-from calibray.comparison.tables import summary
-from calibray.errors import InputError
-from calibray.optimizers import METHODS, Optimizer
-from calibray.support.messages import did_you_mean
-from calibray.support.output_files import check_folder
-from calibray.support.progress import Progress
-from calibray.tables import display as glance
+from calibray.comparison.method_runs import BudgetedMethod, MethodRun
+from calibray.optimizers import METHODS, label
+from calibray.tables import Column, Table, display, numbers
 
-CALLS: Final = (30, 60, 225)  # where the excess is tabulated, beside the end
-EXCESSES_DB: Final = (0.05, 0.02, 0.01)  # whose first RT call is tabulated
-ROUNDING_DB: Final = 1e-7  # below which objectives are taken for equal
-OPTIMUM: Final = "optimum"  # the run that finds it, among the runs kept
-REFERENCE: Final = "least-squares"  # which finds it
-OPTIMUM_STARTS: Final = {False: 2048, True: 64}  # its local searches on small and on large path programs
+CALLS: Final = (30, 60, 225)
+"""RT calls after which the excess is tabulated, besides the end."""
 
-Open = Callable[[], Arena]
+EXCESSES_DB: Final = (0.05, 0.02, 0.01)
+"""Excesses whose first RT call is tabulated [dB]."""
+
+COLUMNS: Final = (
+    Column("method"), Column("uses"), numbers("RT calls"),
+    numbers("excess at 30", "dB"), numbers("at 60", "dB"), numbers("at 225", "dB"), numbers("at the end", "dB"),
+    numbers("quartiles", "dB"), numbers("worst", "dB"),
+    numbers("calls to 0.05 dB"), numbers("to 0.02 dB"), numbers("to 0.01 dB"), numbers("failed"), numbers("time", "s"),
+)  # fmt: skip
+
+SHORT: Final = ("method", "RT calls", "at the end", "quartiles", "worst", "failed")
+"""Columns of the short table that Python and notebooks display."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,105 +40,51 @@ class Comparison:
 
     Attributes:
         name: The problem.
-        contenders: The methods, in the order asked for.
-        runs: Their runs by contender name, one for each seed.
+        methods: The methods, in the order requested.
+        runs: Their runs by name, one for each seed.
         optimum: Lowest objective known, [dB].
-        found_by: What found it.
+        found_by: The search that found it.
     """
 
     name: str
-    contenders: tuple[Contender, ...]
+    methods: tuple[BudgetedMethod, ...]
     runs: dict[str, tuple[MethodRun, ...]]
     optimum: float
     found_by: str
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
-        """Excess of a contender's runs after some RT calls.
-
-        A run that ended or failed before stays where it was.
+        """Excess of a method's runs after a number of RT calls; a run that ended earlier keeps its last value.
 
         Args:
-            name: The contender.
+            name: The method.
             calls: Number of RT calls.
 
         Returns:
-            Excess [seeds], [dB]; +inf before anything was found.
+            Excess [seeds], [dB]; +inf before the first evaluation.
         """
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
     def quartiles(self, name: str, calls: int) -> tuple[float, float, float]:
-        """Quartiles of `excess`.
-
-        Args:
-            name: The contender.
-            calls: Number of RT calls.
-
-        Returns:
-            The lower quartile, the median and the upper one, [dB].
-        """
+        """Lower quartile, median and upper quartile of `excess`, [dB]."""
         excess = self.excess(name, calls)
         return quantile(excess, 0.25), quantile(excess, 0.5), quantile(excess, 0.75)
 
     def calls_to(self, name: str, excess_db: float) -> NDArray[np.float64]:
-        """RT calls after which a contender's runs were within some excess.
-
-        Args:
-            name: The contender.
-            excess_db: The excess [dB].
-
-        Returns:
-            RT calls [seeds]; +inf for a run that never was.
-        """
+        """RT calls until a method's runs reached an excess [seeds]; +inf for a run that never did."""
         return np.array([run.first(self.optimum + excess_db) for run in self.runs[name]])
 
     def table(self) -> pd.DataFrame:
-        """One row per method: excesses at some RT calls, and RT calls to some excesses.
+        """One row per method: excesses after some RT calls, and RT calls to some excesses.
 
         Returns:
             Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to
-            an excess over all runs, empty where half of them or more never had it, and how many had; failed runs;
-            median seconds a run.
+            an excess over all runs (empty if half of them or more never reached it) and how many reached it; failed
+            runs; median seconds per run.
         """
-        return pd.DataFrame([self._row(contender) for contender in self.contenders])
-
-    def __repr__(self) -> str:
-        return glance.text(*summary(self))
-
-    def _repr_html_(self) -> str:
-        return glance.html(*summary(self))
-
-    def _row(self, contender: Contender) -> dict[str, Any]:
-        runs = self.runs[contender.name]
-        row: dict[str, Any] = {
-            "method": contender.name,
-            "uses": "+".join(
-                name for name in ("value", "residuals", "jacobian") if name in METHODS[contender.method].uses
-            ),
-            "runs": len(runs),
-            "failed": sum(bool(run.failure) for run in runs),
-            "rt_calls": float(np.median([run.evaluations for run in runs])),
-        }
-        for calls in (*CALLS, None):
-            place = "end" if calls is None else str(calls)
-            known = calls is None or contender.endless or calls <= contender.budget
-            excess = self.excess(contender.name, 2**62 if calls is None else calls)
-            for label, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
-                row[f"{label}_excess_db_{place}"] = quantile(excess, share) if known else np.nan
-        for level in EXCESSES_DB:
-            calls_to = self.calls_to(contender.name, level)
-            middle = quantile(calls_to, 0.5)
-            row[f"calls_to_{level:g}_db"] = middle if np.isfinite(middle) else np.nan
-            row[f"reached_{level:g}_db"] = int(np.isfinite(calls_to).sum())
-        row["seconds"] = float(np.median([run.seconds for run in runs]))
-        row["optimum_db"], row["optimum_by"] = self.optimum, self.found_by
-        return row
+        return pd.DataFrame([self._row(method) for method in self.methods])
 
     def failures(self) -> list[tuple[str, int, str]]:
-        """Runs that ended in an error.
-
-        Returns:
-            Contender, seed and message of each.
-        """
+        """Runs that ended in an error: method, seed and message of each."""
         return [
             (name, run.seed, run.failure) for name, runs in self.runs.items() for run in runs if run.failure
         ]
@@ -169,16 +110,47 @@ class Comparison:
         ]
         return pd.concat(parts, ignore_index=True)
 
+    def __repr__(self) -> str:
+        return display.text(*_summary(self))
+
+    def _repr_html_(self) -> str:
+        return display.html(*_summary(self))
+
+    def _row(self, method: BudgetedMethod) -> dict[str, Any]:
+        runs = self.runs[method.name]
+        uses = METHODS[method.method].uses
+        row: dict[str, Any] = {
+            "method": method.name,
+            "uses": "+".join(name for name in ("value", "residuals", "jacobian") if name in uses),
+            "runs": len(runs),
+            "failed": sum(bool(run.failure) for run in runs),
+            "rt_calls": float(np.median([run.evaluations for run in runs])),
+        }
+        for calls in (*CALLS, None):
+            column = "end" if calls is None else str(calls)
+            reached = calls is None or method.stops_by_itself or calls <= method.budget
+            excess = self.excess(method.name, 2**62 if calls is None else calls)
+            for statistic, share in (("median", 0.5), ("q25", 0.25), ("q75", 0.75), ("worst", 1.0)):
+                row[f"{statistic}_excess_db_{column}"] = quantile(excess, share) if reached else np.nan
+        for level in EXCESSES_DB:
+            calls_to = self.calls_to(method.name, level)
+            median = quantile(calls_to, 0.5)
+            row[f"calls_to_{level:g}_db"] = median if np.isfinite(median) else np.nan
+            row[f"reached_{level:g}_db"] = int(np.isfinite(calls_to).sum())
+        row["seconds"] = float(np.median([run.seconds for run in runs]))
+        row["optimum_db"], row["optimum_by"] = self.optimum, self.found_by
+        return row
+
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile that may be infinite.
+    """A quantile of values that may be infinite.
 
     Args:
         values: Numbers [n], some of them +inf.
         share: Between 0 and 1.
 
     Returns:
-        Linear interpolation between order statistics, +inf as soon as an infinite one takes part.
+        Linear interpolation between order statistics; +inf if an infinite one takes part.
 
     Example:
         >>> import numpy as np
@@ -186,113 +158,60 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
         (3.0, inf)
     """
     ordered = np.sort(values)
-    place = share * (len(ordered) - 1)
-    low, high = ordered[int(np.floor(place))], ordered[int(np.ceil(place))]
-    return float(low) if low == high else float(low + (place % 1.0) * (high - low))
+    position = share * (len(ordered) - 1)
+    low, high = ordered[int(np.floor(position))], ordered[int(np.ceil(position))]
+    return float(low) if low == high else float(low + (position % 1.0) * (high - low))
 
 
-def compare(
-    open_arena: Open,
-    methods: Sequence[str],
-    *,
-    seeds: int = 25,
-    budget: int = 225,
-    out: str | Path,
-    workers: int = 1,
-    progress: Progress | None = None,
-) -> Comparison:
-    """Run methods from seeds 0, 1, ... on one problem at equal budgets of RT calls.
-
-    Every finished run is appended to `runs.jsonl` in `out` at once; what is found there of the same problem, code of
-    the optimizers, method, budget and seed is not run again.
+def table(comparison: Comparison) -> Table:
+    """The table of a comparison.
 
     Args:
-        open_arena: Makes the problem; picklable if there are several workers, each of which calls it once.
-        methods: Methods, each with the budget or one of its own as in "gwo@600".
-        seeds: Number of runs of each method.
-        budget: RT calls of a run.
-        out: Folder that keeps the runs.
-        workers: Processes that run at once.
-        progress: Called after every run.
+        comparison: The comparison.
 
     Returns:
-        The comparison.
-
-    Raises:
-        InputError: A method, a number or the folder cannot be used.
+        One row per method: median excesses, and RT calls to an excess with the number of runs that reached it.
     """
-    for name, value in (("seeds", seeds), ("workers", workers)):
-        if not 1 <= value <= MOST[name]:
-            raise InputError(f"{name} = {value}; it must be 1 to {MOST[name]:,}")
-    contenders = tuple(Contender.parse(name, budget) for name in dict.fromkeys(methods))
-    if not contenders:
-        raise InputError(f"methods: none is named; {did_you_mean('', METHODS)}")
-    check_folder(out)
-    arena = open_arena()
-    for contender in contenders:
-        contender.optimizer(arena, 0)  # refuses what is not installed or does not fit before anything is run
-    store = Runs(Path(out) / "runs.jsonl", f"{arena.fingerprint}-{code()}")
-    tasks = [(contender, seed) for seed in range(seeds) for contender in contenders]
-    missing = [(each, seed) for each, seed in tasks if store.find(*each.key(seed)) is None]
-    done = len(tasks) - len(missing)
-    for run in _finished(open_arena, arena, missing, workers):
-        store.add(run)
-        done += 1
-        if progress is not None:
-            progress("comparing", done, len(tasks))
-    best = store.find(OPTIMUM, 0, 0)
-    if best is None:
-        best = store.add(_optimum(arena))
-    found = {
-        contender.name: [store.find(*contender.key(seed)) for seed in range(seeds)]
-        for contender in contenders
-    }
-    runs = {name: tuple(run for run in each if run is not None) for name, each in found.items()}
-    return Comparison(arena.name, contenders, runs, *_lowest(arena.minimum, best, runs))
+    records = comparison.table().to_dict("records")
+    rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
+    return Table("", COLUMNS, rows)
 
 
-def _optimum(arena: Arena) -> MethodRun:
-    """Least squares from so many starts that its answer passes for the global optimum."""
-    starts = OPTIMUM_STARTS[arena.large]
-
-    def make() -> Optimizer:
-        return optimizers.make(REFERENCE, arena.lower, arena.upper, 2**31, start=arena.start, starts=starts)
-
-    return recorded(arena, (OPTIMUM, 0, 0), make)
+def optimum_text(comparison: Comparison) -> str:
+    """The optimum from which excesses are counted, as a line of text."""
+    return f"Optimum {comparison.optimum:.6g} dB, found by {comparison.found_by}"
 
 
-def _lowest(known: float, best: MethodRun, runs: dict[str, tuple[MethodRun, ...]]) -> tuple[float, str]:
-    """The lowest objective of all searches, and the first of them that came there within rounding."""
-    found = [(best.at(best.evaluations), "many-start least squares"), (known, "earlier searches")]
-    found += [
-        (run.at(run.evaluations), f"{name}, seed {run.seed}") for name, each in runs.items() for run in each
-    ]
-    optimum = min(objective for objective, _ in found)
-    return optimum, next(by for objective, by in found if objective <= optimum + ROUNDING_DB)
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    def number(key: str) -> str:
+        value = row[key]
+        return "-" if pd.isna(value) else f"{value:.4f}" if np.isfinite(value) else "none"
+
+    def calls(level: str) -> str:
+        value, count = row[f"calls_to_{level}_db"], row[f"reached_{level}_db"]
+        return f"{'-' if pd.isna(value) else f'{value:.0f}'} ({count}/{row['runs']})"
+
+    return (
+        label(str(row["method"])),
+        str(row["uses"]),
+        f"{row['rt_calls']:.0f}",
+        *(number(f"median_excess_db_{column}") for column in ("30", "60", "225", "end")),
+        f"{number('q25_excess_db_end')} to {number('q75_excess_db_end')}",
+        number("worst_excess_db_end"),
+        *(calls(level) for level in ("0.05", "0.02", "0.01")),
+        str(row["failed"]),
+        f"{row['seconds']:.2f}",
+    )
 
 
-def _finished(
-    open_arena: Open, arena: Arena, tasks: list[tuple[Contender, int]], workers: int
-) -> Iterator[MethodRun]:
-    """The runs, as they finish."""
-    if workers == 1 or len(tasks) < 2:
-        yield from (run_contender(arena, contender, seed) for contender, seed in tasks)
-        return
-    with ProcessPoolExecutor(
-        min(workers, len(tasks)), mp_context=get_context("spawn"), initializer=_start, initargs=(open_arena,)
-    ) as pool:
-        futures = [pool.submit(_work, contender, seed) for contender, seed in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _start(open_arena: Open) -> None:
-    global _opened
-    _opened = open_arena()
-
-
-def _work(contender: Contender, seed: int) -> MethodRun:
-    return run_contender(_opened, contender, seed)
+def _summary(comparison: Comparison) -> tuple[Table | str, ...]:
+    """The problem's name, a short table, and the optimum."""
+    whole = table(comparison)
+    columns = [k for k, column in enumerate(whole.columns) if column.name in SHORT]
+    short = Table(
+        "",
+        tuple(whole.columns[k] for k in columns),
+        tuple(tuple(row[k] for k in columns) for row in whole.rows),
+    )
+    heading = f"Methods on {comparison.name}, excess over the optimum with all RT calls spent"
+    return heading, short, optimum_text(comparison)

@@ -1,23 +1,22 @@
-"""What a comparison of methods writes: its tables, and a figure of the excess over RT calls."""
+"""The files of a comparison: its tables, and a figure of the excess over RT calls."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibray.optimizers.labels import label
+from calibray.comparison.comparison import Comparison
+from calibray.optimizers import label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
 from calibray.support.output_files import write_table
 
-if TYPE_CHECKING:
-    from calibray.comparison.comparison import Comparison
-
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
-FLOOR_DB: Final = 1e-4  # drawn in place of less
+FLOOR_DB: Final = 1e-4
+"""Smallest excess drawn [dB]; lower ones are drawn there."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -43,16 +42,16 @@ def figure(comparison: Comparison) -> Figure:
         The figure.
     """
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
-    last = max(contender.budget for contender in comparison.contenders)
-    colors = iter(PALETTE * (1 + len(comparison.contenders) // len(PALETTE)))
+    last = max(method.budget for method in comparison.methods)
+    colors = iter(PALETTE * (1 + len(comparison.methods) // len(PALETTE)))
     calls = np.arange(1, last + 1)
-    for contender in comparison.contenders:
-        shown = calls if contender.endless else calls[: contender.budget]
-        quartiles = [comparison.quartiles(contender.name, int(call)) for call in shown]
+    for method in comparison.methods:
+        shown = calls if method.stops_by_itself else calls[: method.budget]
+        quartiles = [comparison.quartiles(method.name, int(call)) for call in shown]
         low, middle, high = np.maximum(quartiles, FLOOR_DB).T
-        color = COLORS.get(contender.method) or next(colors)
-        dashed = "--" if contender.endless or contender.name != contender.method else "-"
-        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(contender.name))
+        color = COLORS.get(method.method) or next(colors)
+        dashed = "--" if method.stops_by_itself or method.name != method.method else "-"
+        axes.step(shown, middle, where="post", color=color, ls=dashed, lw=1.4, label=label(method.name))
         axes.fill_between(shown, low, high, step="post", color=color, alpha=0.13, lw=0)
     logarithmic(axes, "y")
     axes.set_xlim(0, last)

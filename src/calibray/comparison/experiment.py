@@ -1,36 +1,20 @@
-"""The paper's experiment: the embedded district calibrated by GWO and SGWO-IM, and beside them by what Calibray adds.
-
-Space mapping runs on the ray tracer itself, anew for every candidate, with a trace of fewer interactions as its cheap
-model: this is how an engine is calibrated that can only be called. `auto` runs on stored paths.
-"""
+"""The result of the paper's experiment: our figures and the paper's in the same tables."""
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from calibray import engines
-from calibray.calibration.calibrate import calibrate
+from calibray.optimizers import label
 from calibray.calibration.result import Result
-from calibray.comparison.paper_tables import summary
-from calibray.optimizers.labels import label
-from calibray.scenarios import demo_study_path
-from calibray.study import Setup, Study
-from calibray.support.progress import Progress, with_stage
-from calibray.tables import display as glance
+from calibray.result.wording import interval_text
+from calibray.tables import Column, Table, display, numbers
 
 METHODS: Final = ("gwo", "sgwo-im")
+"""The paper's methods."""
+
 MAPPING: Final = "space-mapping"
 AUTO: Final = "auto"
-
-MAPPED: Final = 8
-"""RT calls of space mapping, each a trace."""
-
-CHEAP_DEPTH: Final = 2
-"""Interactions of a path in its cheap model; the study has twice as many."""
 
 PAPER: Final = {
     "gwo": {
@@ -50,7 +34,7 @@ PAPER: Final = {
         "soil": 4.21,
     },
 }
-"""What the paper reports for its own site (its tables III and IV, and section IV-B)."""
+"""The paper's results at its own site (its tables III and IV, and section IV-B)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,11 +42,11 @@ class Demo:
     """The finished experiment.
 
     Attributes:
-        results: Results by method, `auto` last; space mapping traces anew for every candidate.
-        optimum_db: RMSE of the global optimum, [dB]: what `auto` found on stored paths.
+        results: Results by method, `auto` last; space mapping runs on the engine "retrace".
+        optimum_db: RMSE of the global optimum, [dB], found by `auto` on stored paths.
         truth: Planted mean permittivities by material.
-        engine: The engine that ran.
-        trace_seconds: Time to load and trace the district, which replay pays once, [s].
+        engine: The engine of the paper's methods.
+        trace_seconds: Time to load and trace the district, which replay spends once, [s].
     """
 
     results: dict[str, Result]
@@ -71,19 +55,18 @@ class Demo:
     engine: str
     trace_seconds: float
 
-    @property
-    def paper(self) -> Mapping[str, Mapping[str, float]]:
-        """What the paper reports for its own site, by method."""
-        return PAPER
-
     def __repr__(self) -> str:
-        return glance.text(*summary(self))
+        return display.text(self._heading, permittivity(self), accuracy(self))
 
     def _repr_html_(self) -> str:
-        return glance.html(*summary(self))
+        return display.html(self._heading, permittivity(self), accuracy(self))
+
+    @property
+    def _heading(self) -> str:
+        return f"The paper's experiment, engine {self.engine}"
 
     def content(self) -> dict[str, Any]:
-        """The experiment as plain values, the paper's figures beside."""
+        """The experiment as plain values, with the paper's results."""
         return {
             "engine": self.engine,
             "optimum_db": self.optimum_db,
@@ -96,53 +79,77 @@ class Demo:
             },
         }
 
-
-def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment.
-
-    Args:
-        engine: "replay" (trace once), or "retrace" to pay for every RT call as the paper does.
-        seed: Seed of the methods.
-        progress: Called as the work goes on, with the method's name in front.
-
-    Returns:
-        The experiment.
-
-    Raises:
-        InputError: The engine is unknown, or the seed is impossible.
-    """
-    study = Study.load(demo_study_path())
-    started = time.perf_counter()
-    setup = Setup.open(study)
-    setup.replace(seed=seed, engine=engine)  # what cannot be used is refused before anything is traced
-    replay = engines.make(setup, "replay", progress)
-    trace_seconds = time.perf_counter() - started
-    chosen = replay if engine == "replay" else engines.make(setup, engine)
-    results = {
-        method: calibrate(setup, method, seed, engine=chosen, progress=with_stage(progress, label(method)))
-        for method in METHODS
-    }
-    results[MAPPING] = _mapped(setup, seed, with_stage(progress, label(MAPPING)))
-    results[AUTO] = calibrate(setup, AUTO, seed, engine=replay, progress=with_stage(progress, label(AUTO)))
-    truth = json.loads(demo_study_path().with_name("truth.json").read_text(encoding="utf-8"))["materials"]
-    return Demo(
-        results=results,
-        optimum_db=results[AUTO].rmse_db,
-        truth={name: entry["relative_permittivity_mean"] for name, entry in truth.items()},
-        engine=engine,
-        trace_seconds=trace_seconds,
-    )
+    def tables(self) -> tuple[Table, ...]:
+        """Cost, permittivities, RMSE, and the intervals and verdicts of `auto`."""
+        return cost(self), permittivity(self), accuracy(self), trust(self.results[AUTO])
 
 
-def _mapped(setup: Setup, seed: int, progress: Progress | None) -> Result:
-    """Space mapping on the engine "retrace", by way of a replay of fewer interactions."""
-    content = setup.study.content()
-    method = {"name": MAPPING, "seed": seed, "options": {"budget": MAPPED}}
-    dear, cheap = (
-        Setup.open(Study.from_content(content | changed, setup.study.path), setup.factory)
-        for changed in (
-            {"method": method, "engine": {"name": "retrace"}},
-            {"trace": content["trace"] | {"max_depth": CHEAP_DEPTH}},
+def cost(demo: Demo) -> Table:
+    """RT calls and time of every method, with the paper's."""
+    columns = (
+        Column("method"), numbers("RT calls"), numbers("time", "s"),
+        numbers("paper: calls"), numbers("paper: time", "s"),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            label(method),
+            str(result.rt_calls),
+            f"{result.cost.seconds:.2f}",
+            *_paper(method, "rt_calls", "seconds"),
         )
+        for method, result in demo.results.items()
     )
-    return calibrate(dear, cheap_model=cheap, progress=progress)
+    return Table("Cost", columns, rows)
+
+
+def permittivity(demo: Demo) -> Table:
+    """Permittivities of every method, the planted ones, and the paper's at its own site."""
+    columns = (
+        Column("material"),
+        Column("before"),
+        *(Column(label(method)) for method in demo.results),
+        Column("planted mean"),
+        *(Column(f"paper: {label(method)}") for method in PAPER),
+    )
+    first = next(iter(demo.results.values()))
+    rows = []
+    for parameter, before in first.fit.initial_parameters.items():
+        material = parameter.split(".")[0]
+        calibrated = (result.parameters[parameter] for result in demo.results.values())
+        reported = (figures[material] for figures in PAPER.values())
+        values = (before, *calibrated, demo.truth[material], *reported)
+        rows.append((material, *(f"{value:.2f}" for value in values)))
+    return Table("Relative permittivity", columns, tuple(rows))
+
+
+def accuracy(demo: Demo) -> Table:
+    """RMSE before and after calibration, and its excess over the global optimum."""
+    columns = (
+        Column("method"), numbers("before"), numbers("after"), numbers("excess"), numbers("paper: after")
+    )  # fmt: skip
+    rows = tuple(
+        (
+            label(method),
+            f"{result.initial_rmse_db:.2f}",
+            f"{result.rmse_db:.3f}",
+            f"{result.rmse_db - demo.optimum_db:.4f}",
+            *_paper(method, "rmse_db"),
+        )
+        for method, result in demo.results.items()
+    )
+    return Table("RMSE [dB]", columns, rows)
+
+
+def trust(result: Result) -> Table:
+    """Intervals and verdicts of the parameters of `auto`."""
+    columns = (Column("parameter"), numbers("value"), numbers("95 % interval"), Column("verdict"))
+    rows = tuple(
+        (name, f"{result.parameters[name]:.2f}", interval_text(interval), interval.label)
+        for name, interval in result.intervals.items()
+    )
+    return Table("How far to trust auto's answer", columns, rows)
+
+
+def _paper(method: str, *keys: str) -> tuple[str, ...]:
+    figures = PAPER.get(method, {})
+    return tuple(f"{figures[key]:g}" if key in figures else "-" for key in keys)

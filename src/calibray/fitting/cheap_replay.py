@@ -27,9 +27,6 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.study import Setup
 from calibray.support.progress import Progress
 
-HELPED: Final = ("space-mapping", "sgwo-im-screened")
-"""The methods that take a cheap model."""
-
 SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity": 0.2}
 """Standard deviation of the logarithm of a constant around what the study says."""
 
@@ -214,7 +211,7 @@ def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None 
     """
     setup = problem.setup
     section = setup.study.method
-    wanted = section.name in (AUTO, *HELPED) and section.model == "replay"
+    wanted = section.name in (AUTO, "space-mapping") and section.model == "replay"
     if not wanted or not setup.study.engine.expensive or problem.observable is not PATH_LOSS:
         return Aid()
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from calibray.engines.protocol import Differentiable
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.optimizers import METHODS, Optimizer
-from calibray.optimizers.multifidelity.cheap_model import CheapModel, value_of
+from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.parameters import Parameters
 from calibray.study import Setup, Study
 from calibray.support.messages import did_you_mean
@@ -92,8 +91,7 @@ def _make(
             section.seed,
             start=parameters.to_search(parameters.start),
             starts=None if interactions is None else local_searches(interactions),
-            screen=None if model is None else partial(value_of, model),
-            model=model,
+            cheap_model=model,
             options=section.options,
         )
     except InputError as error:

@@ -1,8 +1,8 @@
-"""Ask/tell optimizers over a box: NumPy arrays in and out, seeded, and ignorant of radio.
+"""Ask/tell optimizers over a box: NumPy arrays in and out, seeded, independent of radio.
 
-Every class is an `Optimizer`, and declares what it uses, how it keeps to a budget and whether it takes starting points;
-`METHODS` lists them by the names that a study file uses, and `make` makes one. A library that is not installed is only
-missed when its class is constructed.
+Every class is an `Optimizer` and states what it uses, how it keeps to a budget and whether it takes starting points.
+`METHODS` lists them by the names of a study file, and `make` makes one. Optional libraries are imported only when their
+class is constructed.
 """
 
 from calibray.optimizers.cma_es import CMAES
@@ -12,13 +12,12 @@ from calibray.optimizers.evaluations import Best
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
-from calibray.optimizers.methods import METHODS, make, method
+from calibray.optimizers.methods import METHODS, label, make, method
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
-from calibray.optimizers.multifidelity.vector_surrogate import VectorSurrogate
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
-from calibray.optimizers.screened import ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.vector_surrogate import VectorSurrogate
 
 __all__ = [
     "CMAES",
@@ -33,10 +32,10 @@ __all__ = [
     "LeastSquares",
     "Optimizer",
     "RandomSearch",
-    "ScreenedSGWOIM",
     "Sobol",
     "SpaceMapping",
     "VectorSurrogate",
+    "label",
     "make",
     "method",
 ]

@@ -1,4 +1,4 @@
-"""Checks of the numbers that optimizers are constructed with."""
+"""Checks of constructor arguments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
 
     Args:
         name: The argument's name, for the message.
-        value: What was given.
+        value: Its value.
         at_least: Smallest allowed value.
         at_most: Largest allowed value.
 
@@ -39,7 +39,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
 
     Args:
         name: The argument's name, for the message.
-        value: What was given.
+        value: Its value.
         at_least: Smallest allowed value.
         at_most: Largest allowed value.
 
@@ -56,21 +56,21 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
     return number
 
 
-def choice(name: str, value: str, known: Iterable[str]) -> str:
-    """Check a name against those known.
+def choice(name: str, value: str, allowed: Iterable[str]) -> str:
+    """Check a name.
 
     Args:
         name: The argument's name, for the message.
-        value: What was given.
-        known: The allowed names.
+        value: Its value.
+        allowed: The allowed values.
 
     Returns:
         The value.
 
     Raises:
-        InputError: It is none of the known names.
+        InputError: The value is not allowed.
     """
-    names = sorted(known)
+    names = sorted(allowed)
     if value not in names:
         raise InputError(f"{name} = {value!r}; choose one of {', '.join(names)}")
     return value

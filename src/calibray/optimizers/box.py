@@ -1,4 +1,4 @@
-"""The box that is searched, and its map to and from the unit cube."""
+"""The search box, and its map to and from the unit cube."""
 
 from __future__ import annotations
 
@@ -72,34 +72,13 @@ class Box:
         return 0.5 * (self.lower + self.upper)
 
     def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move points outside of the box to its nearest face.
-
-        Args:
-            x: Points [..., d].
-
-        Returns:
-            Points inside the box [..., d].
-        """
+        """Move points outside the box to its nearest face [..., d]."""
         return np.clip(x, self.lower, self.upper)
 
     def to_unit(self, x: ArrayLike) -> NDArray[np.float64]:
-        """Map the box onto the unit cube.
-
-        Args:
-            x: Points [..., d].
-
-        Returns:
-            The points in coordinates that run from 0 at `lower` to 1 at `upper` [..., d].
-        """
+        """Map the box onto the unit cube: 0 at `lower`, 1 at `upper` [..., d]."""
         return (np.asarray(x, dtype=float) - self.lower) / self.width
 
     def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Map the unit cube onto the box, never past its faces by rounding.
-
-        Args:
-            unit: Points of the unit cube [..., d].
-
-        Returns:
-            Points of the box [..., d].
-        """
+        """Map the unit cube onto the box, never past its faces by rounding [..., d]."""
         return self.clip(self.lower + unit * self.width)

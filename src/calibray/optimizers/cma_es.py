@@ -1,8 +1,8 @@
 """CMA-ES, the covariance matrix adaptation evolution strategy, by its author's library.
 
-N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, in the package `cma`. It works in
-the unit cube, where it starts in the middle (or at the best point told before) with a step of 0.3, and
-starts again from a random point whenever it has converged before its budget is used.
+N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, in the package `cma`. It searches the unit cube,
+starts in the middle (or at the best point told before) with a step of 0.3, and restarts from a random point when it
+converges before its budget is used.
 """
 
 from __future__ import annotations
@@ -16,24 +16,23 @@ from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.library_adapter import library, limited
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.schedule import AS_GIVEN, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
 
 STEP = 0.3
-"""Of the unit cube, initial standard deviation."""
+"""Initial standard deviation in the unit cube."""
 
 
 @final
 class CMAES(Optimizer):
-    """Covariance matrix adaptation. Uses the value alone; budget as given. Needs `calibray[optimizers]`.
+    """Covariance matrix adaptation. Uses the value alone; budget as set. Needs `calibray[optimizers]`.
 
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the one random generator.
+        seed: Seed of the random generator.
         budget: Number of evaluations.
-        population: Candidates a generation, 4 + 3 ln d if None.
+        population: Candidates per generation, 4 + 3 ln d if None.
 
     Raises:
         InputError: An argument is out of range, or `cma` is not installed.
@@ -60,11 +59,6 @@ class CMAES(Optimizer):
         self._cma = library("cma", "cma")
         self._session = Session(self.box, self.uses, self._search)
 
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self._budget
-
     def _search(self, archive: Archive) -> Search:
         return limited(self._generations(archive), self._budget)
 
@@ -79,11 +73,11 @@ class CMAES(Optimizer):
             "verbose": -9,
         }
         if d == 1:
-            options["maxstd_boundrange"] = np.inf  # whose limit fails in one dimension, as of cma 4.5
+            options["maxstd_boundrange"] = np.inf  # its limit fails in one dimension, as of cma 4.5
         while True:
             strategy = self._cma.CMAEvolutionStrategy(start, STEP, options)
             while not strategy.stop():
                 unit = np.array(strategy.ask())
-                told = yield self.box.from_unit(unit)
-                strategy.tell(list(unit), list(archive.imputed(told).y))
+                answers = yield self.box.from_unit(unit)
+                strategy.tell(list(unit), list(archive.imputed(answers).y))
             start = self._rng.random(d)

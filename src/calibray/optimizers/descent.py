@@ -1,17 +1,17 @@
-"""Descent of many starts at once by projected Levenberg-Marquardt, for least squares in the unit cube.
+"""Projected Levenberg-Marquardt from many starts at once, for least squares in the unit cube.
 
-The step of a start minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and
-g = J^T r, subject to the box: components that would leave it are set on the face one group after the other
-and the rest is solved again. The damping mu follows the gain ratio after H. B. Nielsen (Damping Parameter in
-Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark).
+A step minimises the damped quadratic model g.p + p.(H + mu I) p / 2 with H = J^T J and g = J^T r within the cube.
+Components that would leave the cube are fixed on its face, group after group, and the rest is solved again. The damping
+mu follows the gain ratio after H. B. Nielsen (Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical
+University of Denmark).
 
-`descend` is a generator, so whoever holds it decides how points are evaluated: `least_squares.py` asks the
-engine, `vector_surrogate.py` its model.
+`descend` is a generator, so its caller decides how points are evaluated: `least_squares.py` asks the engine,
+`descend_all` calls a model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 INITIAL_DAMPING = 1e-3
-"""Of the largest diagonal element of H."""
+"""Initial mu, as a share of the largest diagonal element of H."""
 
 MERGE_DISTANCE = 1e-3
-"""Of the unit cube, below which two starts are taken to approach the same minimum."""
+"""Distance in the unit cube below which two searches approach the same minimum."""
 
 Residuals = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite has failed."""
+"""Residuals [s, m] and their Jacobian by unit coordinates [s, m, d]; a row that is not finite is a failure."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Starts:
     """Local searches in progress, with the quadratic model of each.
 
     Attributes:
-        unit: Where they stand, in the unit cube [s, d].
+        unit: Their points in the unit cube [s, d].
         cost: Half the mean square of the residuals there [s].
         gradient: Its gradient g [s, d].
         curvature: Its Gauss-Newton matrix H [s, d, d].
         damping: mu [s].
         growth: Factor on the damping at the next rejection [s].
-        searches: How many searches each stands for: itself, and those that were merged with it [s].
+        searches: Number of searches merged into each one, itself included [s].
     """
 
     unit: NDArray[np.float64]
@@ -51,27 +51,12 @@ class Starts:
     searches: NDArray[np.int64]
 
     def rows(self, keep: NDArray[np.bool_]) -> Starts:
-        """The searches that go on.
-
-        Args:
-            keep: Which of them [s].
-
-        Returns:
-            Those searches.
-        """
+        """The searches where `keep` is True [s]."""
         return Starts(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
-    """Form the models at evaluated points.
-
-    Args:
-        unit: The points in the unit cube [s, d].
-        evaluated: Their residuals and Jacobian.
-
-    Returns:
-        The searches; one whose evaluation failed has infinite cost.
-    """
+    """Form the models at evaluated points of the unit cube [s, d]; a failed evaluation has infinite cost."""
     r, j = evaluated
     failed = np.asarray(~np.isfinite(r).all(axis=1))
     r, j = np.where(failed[:, None], 0.0, r), np.where(failed[:, None, None], 0.0, j)
@@ -90,14 +75,7 @@ def begin(unit: NDArray[np.float64], evaluated: Residuals) -> Starts:
 
 
 def damped_steps(starts: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The step of every search inside the box, and the decrease of cost that its model predicts.
-
-    Args:
-        starts: The searches.
-
-    Returns:
-        Steps in the unit cube [s, d] and predicted decreases [s].
-    """
+    """Steps inside the unit cube [s, d], and the decreases of cost that the models predict [s]."""
     count, dimension = starts.unit.shape
     # The floor keeps the matrix regular where two parameters act alike and damping has faded.
     floor = 1e-13 * np.trace(starts.curvature, axis1=1, axis2=2)
@@ -131,16 +109,7 @@ def _decrease(starts: Starts, step: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> Starts:
-    """Accept or reject the trial points.
-
-    Args:
-        starts: The searches before the step.
-        trial: The models at their trial points.
-        predicted: Decrease of cost that was predicted [s].
-
-    Returns:
-        The searches after it, with their new damping.
-    """
+    """Accept or reject trial points by the decrease of cost that was predicted [s], and update the damping."""
     ratio = (starts.cost - trial.cost) / predicted
     better = ratio > 1e-4
     gain = np.where(better, ratio, 0.0)
@@ -157,22 +126,23 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 
 
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
-    """Find searches that come close to a better one, and would only find the same minimum.
+    """Find searches that come close to a better one and would only reach the same minimum.
 
     Args:
         starts: The searches that move.
         settled: Those that have ended.
 
     Returns:
-        Both, the better ones standing for the others as well; and True for each moving search that can be dropped [s].
+        Both, with the merged searches counted in `searches` of the better ones; and True for each moving search that
+        can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
-    apart = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
-    near = (apart < MERGE_DISTANCE) & (rank[None] < rank[number:, None])
+    distance = cdist(starts.unit, np.concatenate([settled.unit, starts.unit]))
+    near = (distance < MERGE_DISTANCE) & (rank[None] < rank[number:, None])
     merged = np.asarray(near.any(axis=1))
     searches = np.concatenate([settled.searches, starts.searches])
-    target = np.where(near, apart, np.inf).argmin(axis=1) if merged.any() else rank[:0]
+    target = np.where(near, distance, np.inf).argmin(axis=1) if merged.any() else rank[:0]
     for row in sorted(np.flatnonzero(merged), key=lambda row: -rank[number + row]):  # the worst first
         searches[target[row]] += searches[number + row]
     return replace(starts, searches=searches[number:]), replace(settled, searches=searches[:number]), merged
@@ -183,39 +153,39 @@ def descend(
     iterations: int,
     tolerance: float,
     catch_up: float = 1e30,
-    known: Starts | None = None,
+    earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
     """Advance all starts until each has converged, merged with a better one, or been given up.
 
     Args:
-        unit: Where to start, in the unit cube [s, d].
+        unit: Starting points in the unit cube [s, d].
         iterations: Largest number of steps.
         tolerance: A search has converged when its model predicts less than this relative decrease of the
             cost, or a step shorter than this.
         catch_up: A search is given up when it lies more than this many of its predicted decreases behind
             the best one.
-        known: Where earlier searches ended, so that these need not end there again.
-        followed: How many of the starts are followed, those of the lowest cost; all if None.
+        earlier: Ends of earlier searches; new ones that come close to them are merged.
+        followed: Number of starts that are followed, those of the lowest cost; all if None.
 
     Yields:
         Points to evaluate [s, d].
 
     Returns:
-        What is known, the searches that converged or were still moving at the end, then those that were given up: they
-        stand so near a minimum of their own that they could not catch up any more.
+        The earlier searches, those that converged or were still moving at the end, then those that were given up. The
+        latter are so near another minimum that they could not catch up.
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
     if followed is not None:
         starts = starts.rows(starts.cost.argsort(kind="stable").argsort() < followed)
     behind = starts.rows(np.zeros(len(starts.cost), dtype=bool))
-    settled = behind if known is None else known
+    settled = behind if earlier is None else earlier
     for _ in range(iterations):
         step, predicted = damped_steps(starts)
-        still = (predicted <= tolerance * starts.cost) | (np.abs(step).max(axis=1) <= tolerance)
-        settled = joined(settled, starts.rows(still))
-        starts, step, predicted = starts.rows(~still), step[~still], predicted[~still]
+        converged = (predicted <= tolerance * starts.cost) | (np.abs(step).max(axis=1) <= tolerance)
+        settled = joined(settled, starts.rows(converged))
+        starts, step, predicted = starts.rows(~converged), step[~converged], predicted[~converged]
         lowest = min(starts.cost.min(initial=np.inf), settled.cost.min(initial=np.inf))
         hopeless = starts.cost - catch_up * predicted > lowest
         starts, settled, merged = merge(starts, settled)
@@ -229,18 +199,44 @@ def descend(
     return joined(joined(settled, starts), behind)
 
 
-def distinct(starts: Starts, apart: float) -> Starts:
-    """Of searches that ended near one another the best ones.
+def descend_all(
+    unit: NDArray[np.float64],
+    evaluate: Callable[[NDArray[np.float64]], Residuals],
+    iterations: int,
+    tolerance: float,
+) -> Starts:
+    """Descend on a model.
+
+    Args:
+        unit: Starting points in the unit cube [s, d].
+        evaluate: Points [s, d] to residuals and their Jacobian.
+        iterations: Largest number of steps.
+        tolerance: As in `descend`.
+
+    Returns:
+        The ends of the searches.
+    """
+    descent = descend(unit, iterations, tolerance)
+    points = next(descent)
+    while True:
+        try:
+            points = descent.send(evaluate(points))
+        except StopIteration as end:
+            return end.value
+
+
+def distinct(starts: Starts, separation: float) -> Starts:
+    """Keep the best one of searches that ended near one another.
 
     Args:
         starts: The searches.
-        apart: Distance in the unit cube below which two are taken for one.
+        separation: Distance in the unit cube below which two ends are the same minimum.
 
     Returns:
-        The rest, the lowest cost first.
+        The distinct ones, the lowest cost first.
     """
     order = np.argsort(starts.cost, kind="stable")
-    near = cdist(starts.unit[order], starts.unit[order]) < apart
+    near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)
     for row in range(len(order)):
         kept[row] = not (near[row] & kept).any()
@@ -248,14 +244,6 @@ def distinct(starts: Starts, apart: float) -> Starts:
 
 
 def joined(first: Starts, second: Starts) -> Starts:
-    """Put searches one after the other.
-
-    Args:
-        first: Some searches.
-        second: More of them.
-
-    Returns:
-        All of them.
-    """
+    """Concatenate searches."""
     names = [field.name for field in fields(Starts)]
     return Starts(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))

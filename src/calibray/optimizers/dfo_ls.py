@@ -3,8 +3,8 @@
 C. Cartis, J. Fiala, B. Marteau, L. Roberts, "Improving the Flexibility and Robustness of Model-Based
 Derivative-Free Optimization Solvers", ACM Trans. Math. Softw. 45 (2019) 32, in the package `DFO-LS`. It
 fits a linear model to every residual in a trust region, one evaluation at a time. It is a local method: it
-starts in the middle of the unit cube (or at the best point told before), and again from random points
-whenever it has converged before its budget is used.
+starts in the middle of the unit cube (or at the best point told before), and restarts from random points
+when it converges before its budget is used.
 """
 
 from __future__ import annotations
@@ -20,24 +20,23 @@ from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import Archive, Objective, root_mean_square
 from calibray.optimizers.library_adapter import Evaluate, inverted, library, limited
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.schedule import AS_GIVEN, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
 
 
 @final
 class DFOLS(Optimizer):
-    """Derivative-free least squares. Uses residuals; budget as given. Needs `calibray[optimizers]`.
+    """Derivative-free least squares. Uses residuals; budget as set. Needs `calibray[optimizers]`.
 
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the random points that it starts again from.
+        seed: Seed of the random points of restarts.
         budget: Number of evaluations.
         radius: First trust region, as a share of the box.
         tolerance: Trust region at which a start has converged, as a share of the box.
-        objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
-            must rise with their mean square, which is what is minimised; both are checked.
+        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
+            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.
@@ -66,13 +65,8 @@ class DFOLS(Optimizer):
         self._dfols = library("dfols", "DFO-LS")
         self._session = Session(self.box, self.uses, self._search, objective)
 
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self._budget
-
     def _search(self, archive: Archive) -> Search:
-        # The thread knows nothing of this object, so that it ends when this object is dropped.
+        # The thread holds no reference to this object, so it ends when this object is dropped.
         solve, radii = self._dfols.solve, (self.radius, self.tolerance)
         minimise = partial(_minimise, solve, radii, self._budget, archive, self._rng)
         return limited(inverted(minimise), self._budget)
@@ -86,7 +80,7 @@ def _minimise(
     rng: np.random.Generator,
     evaluate: Evaluate,
 ) -> None:
-    """Minimise from one start after the other, for ever."""
+    """Minimise from one start after the other without end."""
     box = archive.box
     d = box.dimension
 
@@ -102,7 +96,7 @@ def _minimise(
             bounds=(np.zeros(d), np.ones(d)),
             rhobeg=radii[0],
             rhoend=radii[1],
-            maxfun=budget + d + 2,  # the budget is kept outside, and DFO-LS warns of a small one
+            maxfun=budget + d + 2,  # `limited` keeps the budget, and DFO-LS warns of a small one
             do_logging=False,
             # Coordinate directions: the random ones come from NumPy's global generator.
             user_params={"init.random_initial_directions": False},

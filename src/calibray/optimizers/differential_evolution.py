@@ -1,7 +1,7 @@
 """Differential evolution by SciPy, one generation a batch (R. Storn, K. Price, J. Global Optim. 11 (1997) 341).
 
-Without SciPy's final polish, which would need derivatives; started again with another population whenever
-it has converged before its budget is used.
+Without SciPy's final polish, which would need derivatives. It restarts with another population when it converges before
+its budget is used.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.library_adapter import Evaluate, inverted, limited
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.schedule import AS_GIVEN, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
 
 
 @final
 class DifferentialEvolution(Optimizer):
-    """Differential evolution. Uses the value alone; budget as given.
+    """Differential evolution. Uses the value alone; budget as set.
 
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the one random generator.
+        seed: Seed of the random generator.
         budget: Number of evaluations.
-        population: Candidates a generation as a multiple of d; SciPy makes it at least 5 in all.
+        population: Candidates per generation as a multiple of d; SciPy uses at least 5 in all.
 
     Raises:
         InputError: An argument is out of range.
@@ -59,19 +58,14 @@ class DifferentialEvolution(Optimizer):
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
 
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self._budget
-
     def _search(self, archive: Archive) -> Search:
-        # The thread knows nothing of this object, so that it ends when this object is dropped.
+        # The thread holds no reference to this object, so it ends when this object is dropped.
         minimise = partial(_minimise, self.population, archive, self._rng)
         return limited(inverted(minimise), self._budget)
 
 
 def _minimise(population: int, archive: Archive, rng: np.random.Generator, evaluate: Evaluate) -> None:
-    """Minimise with one population after the other, for ever."""
+    """Minimise with one population after the other without end."""
     box = archive.box
 
     def objective(x: NDArray[np.float64]) -> NDArray[np.float64]:  # [d, n], SciPy's vectorized form

@@ -12,13 +12,13 @@ from calibray.errors import InputError
 from calibray.optimizers.box import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""The value [n] that belongs to residuals [n, m]; it rises with their mean square."""
+"""Residuals [n, m] to the value [n], which rises with their mean square."""
 
 OBJECTIVE_TOLERANCE = 1e-4
-"""Largest relative difference of a value from the one that belongs to its residuals (float32 engines)."""
+"""Largest relative difference between a value and the one computed from its residuals, for float32 engines."""
 
 DECIMALS = 9
-"""Decimals of unit coordinates that agree in points taken for one."""
+"""Decimals of unit coordinates to which two points have to agree to count as one."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Evaluations:
 
     Attributes:
         x: Points [n, d].
-        y: Value [n], +inf where an evaluation failed.
+        y: Value [n], +inf for a failed evaluation.
         residuals: Residuals [n, m], whose mean square rises and falls with y, or None.
         jacobian: Derivatives of the residuals by the parameters [n, m, d], or None.
     """
@@ -55,11 +55,7 @@ class Evaluations:
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """The residuals [n, m], where the algorithm uses them.
-
-        Raises:
-            InputError: None were told.
-        """
+        """The residuals [n, m], for algorithms that use them."""
         if self.residuals is None:
             raise InputError(
                 "residuals = None; this optimizer uses them: call tell(x, y, residuals=..., ...)"
@@ -68,43 +64,24 @@ class Evaluations:
 
     @property
     def slopes(self) -> NDArray[np.float64]:
-        """The derivatives of the residuals [n, m, d], where the algorithm uses them.
-
-        Raises:
-            InputError: None were told.
-        """
+        """The derivatives of the residuals [n, m, d], for algorithms that use them."""
         if self.jacobian is None:
             raise InputError("jacobian = None; this optimizer uses them: call tell(x, y, jacobian=..., ...)")
         return self.jacobian
 
     def rows(self, rows: NDArray[np.intp]) -> Evaluations:
-        """Choose evaluations.
-
-        Args:
-            rows: Their indices [k].
-
-        Returns:
-            The k evaluations, in that order.
-        """
-        residuals, jacobian = (
-            None if part is None else part[rows] for part in (self.residuals, self.jacobian)
-        )
+        """The evaluations with these indices [k], in that order."""
+        residuals = None if self.residuals is None else self.residuals[rows]
+        jacobian = None if self.jacobian is None else self.jacobian[rows]
         return Evaluations(self.x[rows], self.y[rows], residuals, jacobian)
 
     @staticmethod
     def joined(parts: list[Evaluations]) -> Evaluations:
-        """Put evaluations one after the other.
-
-        Args:
-            parts: At least one set of evaluations, all with the same information.
-
-        Returns:
-            All of them.
-        """
+        """Concatenate at least one set of evaluations, all with the same information."""
 
         def stack(arrays: Iterable[NDArray[np.float64] | None]) -> NDArray[np.float64] | None:
-            given = [array for array in arrays if array is not None]
-            return np.concatenate(given) if given else None
+            present = [array for array in arrays if array is not None]
+            return np.concatenate(present) if present else None
 
         return Evaluations(
             np.concatenate([part.x for part in parts]),
@@ -115,7 +92,7 @@ class Evaluations:
 
 
 class Archive:
-    """Every evaluation that was told, in order, asked or not."""
+    """Every evaluation of a run in the order told, asked for or not."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -125,14 +102,10 @@ class Archive:
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
 
-    def add(self, told: Evaluations) -> None:
-        """Append evaluations.
-
-        Args:
-            told: Checked evaluations. Their Jacobians are not kept.
-        """
-        self._parts.append(Evaluations(told.x, told.y, told.residuals))
-        lowest = self._parts[-1].rows(np.argmin(told.y, keepdims=True))
+    def add(self, evaluations: Evaluations) -> None:
+        """Append checked evaluations; their Jacobians are not kept."""
+        self._parts.append(Evaluations(evaluations.x, evaluations.y, evaluations.residuals))
+        lowest = self._parts[-1].rows(np.argmin(evaluations.y, keepdims=True))
         if self._leading is None or lowest.y[0] < self._leading.y[0]:
             self._leading = lowest
 
@@ -157,10 +130,7 @@ class Archive:
         return self._leading
 
     def all(self) -> Evaluations:
-        """Every evaluation so far, without Jacobians.
-
-        Returns:
-            The evaluations, in the order told.
+        """Every evaluation so far in the order told, without Jacobians.
 
         Raises:
             InputError: Nothing has been told yet.
@@ -177,36 +147,36 @@ class Archive:
             count: How many.
 
         Returns:
-            Points [count, d], best first, ties by the order told; the last one is repeated when there are
+            Points [count, d], best first, ties in the order told; the last one is repeated if there are
             fewer.
         """
-        told = self.all()
+        evaluations = self.all()
         chosen: list[NDArray[np.float64]] = []
-        for row in np.argsort(told.y, kind="stable"):
-            if not any(np.array_equal(told.x[row], point) for point in chosen):
-                chosen.append(told.x[row])
+        for row in np.argsort(evaluations.y, kind="stable"):
+            if not any(np.array_equal(evaluations.x[row], point) for point in chosen):
+                chosen.append(evaluations.x[row])
                 if len(chosen) == count:
                     break
         return np.array(chosen + [chosen[-1]] * (count - len(chosen)))
 
-    def imputed(self, told: Evaluations) -> Evaluations:
-        """Give failed evaluations the values of the worst successful one; models then steer away from them.
+    def imputed(self, evaluations: Evaluations) -> Evaluations:
+        """Give failed evaluations the values of the worst successful one, so that models steer away from them.
 
         Args:
-            told: Evaluations, some of them failed.
+            evaluations: Evaluations of this run, some of them failed.
 
         Returns:
             The same with finite values; zero while every evaluation of the run has failed.
         """
-        every = self.all()
-        failed, good = ~np.isfinite(told.y), np.flatnonzero(np.isfinite(every.y))
-        worst = good[np.argmax(every.y[good])] if good.size else None
-        y = np.where(failed, 0.0 if worst is None else every.y[worst], told.y)
-        residuals = told.residuals
+        run = self.all()
+        failed, good = ~np.isfinite(evaluations.y), np.flatnonzero(np.isfinite(run.y))
+        worst = good[np.argmax(run.y[good])] if good.size else None
+        y = np.where(failed, 0.0 if worst is None else run.y[worst], evaluations.y)
+        residuals = evaluations.residuals
         if residuals is not None:
-            fill = np.zeros(residuals.shape[1]) if worst is None else every.errors[worst]
+            fill = np.zeros(residuals.shape[1]) if worst is None else run.errors[worst]
             residuals = np.where(failed[:, None], fill, residuals)
-        return Evaluations(told.x, y, residuals)
+        return Evaluations(evaluations.x, y, residuals)
 
 
 def checked_evaluations(
@@ -218,22 +188,22 @@ def checked_evaluations(
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy what was told.
+    """Validate and copy evaluations.
 
     Args:
         box: The box searched.
         x: Points [n, d].
-        y: Value [n]; +inf is a failed evaluation, whose residuals and derivatives may be anything.
+        y: Value [n]; +inf is a failed evaluation, whose residuals and derivatives are ignored.
         residuals: Residuals [n, m], or None.
         jacobian: Derivatives of the residuals [n, m, d], or None.
-        uses: What the optimizer uses; the rest is checked and left out.
-        objective: The value that belongs to residuals; not checked if None.
+        uses: Parts that the optimizer uses; the others are checked and left out.
+        objective: Residuals to the value; not checked if None.
 
     Returns:
-        The evaluations with exactly the information used.
+        The evaluations with exactly the parts used.
 
     Raises:
-        InputError: A shape is wrong, a number is not finite, a point lies outside the box, something that the
+        InputError: A shape is wrong, a number is not finite, a point lies outside the box, a part that the
             optimizer uses is missing, or a value does not belong to its residuals.
     """
     points, values = _array("x", x, (None, box.dimension)), _array("y", y, (None,))
@@ -249,9 +219,9 @@ def checked_evaluations(
         )
     for (row,) in np.argwhere(~((values > -np.inf) & (values <= np.inf))):
         raise InputError(f"y[{row}] = {values[row]}; it must be a number, +inf for a failed evaluation")
-    given = {"residuals": residuals, "jacobian": jacobian}
-    for name in sorted(uses & given.keys()):
-        if given[name] is None:
+    parts = {"residuals": residuals, "jacobian": jacobian}
+    for name in sorted(uses & parts.keys()):
+        if parts[name] is None:
             raise InputError(f"{name} = None; this optimizer uses them: call tell(x, y, residuals=..., ...)")
     good = np.isfinite(values)
     errors = None if residuals is None else _array("residuals", residuals, (len(values), None))
@@ -271,53 +241,47 @@ def checked_evaluations(
     )
 
 
-def check_order(told: Evaluations, archive: Archive) -> None:
-    """Check that a lower value comes with a lower mean square, within what is told and against the best before.
+def check_order(evaluations: Evaluations, archive: Archive) -> None:
+    """Check that a lower value comes with a lower mean square, among evaluations and against the best before.
 
     Args:
-        told: Checked evaluations with residuals.
+        evaluations: Checked evaluations with residuals.
         archive: Those before.
 
     Raises:
         InputError: An evaluation has a lower value than another and yet a higher mean square.
     """
     if len(archive):
-        told = Evaluations.joined([archive.leading, Evaluations(told.x, told.y, told.residuals)])
-    told = told.rows(np.flatnonzero(np.isfinite(told.y)))
-    size = root_mean_square(told.errors)
+        without_jacobian = Evaluations(evaluations.x, evaluations.y, evaluations.residuals)
+        evaluations = Evaluations.joined([archive.leading, without_jacobian])
+    evaluations = evaluations.rows(np.flatnonzero(np.isfinite(evaluations.y)))
+    size = root_mean_square(evaluations.errors)
     order = np.argsort(size, kind="stable")
-    value, size = told.y[order], size[order]
+    value, size = evaluations.y[order], size[order]
     highest = np.maximum.accumulate(value)
     slack = OBJECTIVE_TOLERANCE * np.abs(value) + 1e-9
     for row in np.flatnonzero(highest > value + slack):
         before = int(np.argmax(value[:row]))
         if size[row] > (1.0 + OBJECTIVE_TOLERANCE) * size[before] + 1e-9:
             raise InputError(
-                f"y = {value[row]:g} where sqrt(mean(residuals**2)) = {size[row]:g}, but y = {value[before]:g} "
-                f"where it is {size[before]:g}; the mean square must rise with the value: tell deviance residuals"
+                f"y = {value[row]:g} with sqrt(mean(residuals**2)) = {size[row]:g}, but y = {value[before]:g} "
+                f"with {size[before]:g}; the mean square must rise with the value: tell deviance residuals"
             )
 
 
 def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The value that belongs to residuals unless an optimizer is told otherwise.
-
-    Args:
-        residuals: Residuals [n, m].
-
-    Returns:
-        Their root mean square [n].
-    """
+    """The default objective: the root mean square [n] of residuals [n, m]."""
     return np.sqrt(np.mean(residuals**2, axis=1))
 
 
-def merged(
+def merge_repeated(
     unit: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge points that were told more than once.
+    """Merge points that were evaluated more than once.
 
     Args:
         unit: Points in the unit cube [n, d].
-        values: What was evaluated there [n, ...].
+        values: Values there [n, ...].
 
     Returns:
         The distinct points [k, d] and the means of their values [k, ...].
@@ -328,14 +292,7 @@ def merged(
 
 
 def read_only(array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Protect an array that is handed out.
-
-    Args:
-        array: The array, changed in place.
-
-    Returns:
-        The same array, no longer writeable.
-    """
+    """Make an array read-only in place, and return it."""
     array.setflags(write=False)
     return array
 
@@ -344,11 +301,9 @@ def _array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArra
     array = np.array(value, dtype=float)
     fits = len(shape) == array.ndim and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
     if not fits:
-        wanted = ", ".join(
-            letter if want is None else str(want)
-            for letter, want in zip("nmd"[: len(shape)], shape, strict=True)
-        )
-        raise InputError(f"{name} has shape {array.shape}; it must be [{wanted}]: reshape it")
+        letters = "nmd"[: len(shape)]
+        sizes = (letter if size is None else str(size) for letter, size in zip(letters, shape, strict=True))
+        raise InputError(f"{name} has shape {array.shape}; it must be [{', '.join(sizes)}]: reshape it")
     return array
 
 
@@ -356,9 +311,9 @@ def _finite(name: str, array: NDArray[np.float64], rows: NDArray[np.bool_] | Non
     bad = ~np.isfinite(array)
     if rows is not None:
         bad &= rows.reshape(-1, *[1] * (array.ndim - 1))
-    for place in np.argwhere(bad):
+    for index in np.argwhere(bad):
         raise InputError(
-            f"{name}[{', '.join(map(str, place))}] = {array[tuple(place)]}; it must be finite: "
+            f"{name}[{', '.join(map(str, index))}] = {array[tuple(index)]}; it must be finite: "
             "tell y = +inf for an evaluation that failed"
         )
 
@@ -369,16 +324,14 @@ def _check_value(
     good: NDArray[np.bool_],
     objective: Objective,
 ) -> None:
-    formed = np.where(good, objective(np.where(good[:, None], residuals, 0.0)), 0.0)
-    usual = objective is root_mean_square
-    name, remedy = (
-        ("sqrt(mean(residuals[{}]**2))", "put the weights into the residuals")
-        if usual
-        else ("objective(residuals[{}])", "tell the value that belongs to the residuals")
-    )
-    slack = OBJECTIVE_TOLERANCE * np.abs(formed) + 1e-9
-    for row in np.flatnonzero(good & ~(np.abs(np.where(good, values, 0.0) - formed) <= slack)):
+    computed = np.where(good, objective(np.where(good[:, None], residuals, 0.0)), 0.0)
+    slack = OBJECTIVE_TOLERANCE * np.abs(computed) + 1e-9
+    for row in np.flatnonzero(good & ~(np.abs(np.where(good, values, 0.0) - computed) <= slack)):
+        if objective is root_mean_square:
+            name, remedy = f"sqrt(mean(residuals[{row}]**2))", "put the weights into the residuals"
+        else:
+            name, remedy = f"objective(residuals[{row}])", "tell the value that belongs to the residuals"
         raise InputError(
-            f"y[{row}] = {values[row]:g}, but {name.format(row)} = {formed[row]:g}; they must agree within "
+            f"y[{row}] = {values[row]:g}, but {name} = {computed[row]:g}; they must agree within "
             f"{OBJECTIVE_TOLERANCE:g}: {remedy}"
         )

@@ -1,10 +1,9 @@
 """Bayesian optimization of the objective: a Gaussian process of the value alone, and its expected improvement.
 
-The scalar rival of `VectorSurrogate`, on the same model (see `kriging.py`) of one number instead of every
-residual. A run begins with a maximin Latin hypercube; every further candidate maximises the logarithm of the
-expected improvement: D. R. Jones, M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; its
-logarithm after S. Ament et al., NeurIPS 2023, arXiv:2310.20708. A failed evaluation enters the model with the
-worst successful value.
+It models one number where `VectorSurrogate` models every residual, with the same `kriging.py`. A run begins with a
+maximin Latin hypercube. Every further candidate maximises the logarithm of the expected improvement (D. R. Jones,
+M. Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15; the logarithm after S. Ament et al., NeurIPS 2023,
+arXiv:2310.20708). A failed evaluation enters the model with the worst successful value.
 """
 
 from __future__ import annotations
@@ -13,40 +12,38 @@ from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
 from scipy.special import erfcx
 from scipy.stats import norm
 
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.evaluations import Archive, merged
-from calibray.optimizers.multifidelity.kriging import Kriging, fit, solve
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.sampling import maximin_design
-from calibray.optimizers.schedule import AS_GIVEN, Schedule
+from calibray.optimizers.evaluations import Archive, merge_repeated
+from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
+from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
 from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 300
-"""Drawn over the box, and as many around the best points."""
+"""Candidates drawn over the box, and as many around the best points."""
 
 REFINEMENTS = (0.1, 0.01, 0.001)
-"""Of the unit cube: how far around the most promising candidate more are drawn."""
+"""Standard deviations, in the unit cube, of further candidates around the most promising one."""
 
 SEPARATION = 1e-4
-"""Of the unit cube, below which a point is taken for one already evaluated."""
+"""Distance in the unit cube below which a point counts as evaluated already."""
 
 OFTEN = 40
-"""Evaluations up to which the scales are learned anew every time; beyond, every tenth."""
+"""Evaluations up to which the scales are learned every time; beyond, every tenth."""
 
 
 @final
 class GaussianProcess(Optimizer):
-    """Bayesian optimization. Uses the value alone; 20 d evaluations unless told otherwise.
+    """Bayesian optimization. Uses the value alone; 20 d evaluations by default.
 
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the one random generator.
+        seed: Seed of the random generator.
         budget: Number of evaluations, 20 d if None.
         initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
 
@@ -83,40 +80,33 @@ class GaussianProcess(Optimizer):
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
 
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self._budget
-
     def _search(self, archive: Archive) -> Search:
         d, left = self.box.dimension, self._budget
-        hyper: NDArray[np.float64] | None = None
+        model: Kriging | None = None
         missing = min(left, max(self.initial - len(archive), 0))
         if missing:
             yield self.box.from_unit(maximin_design(missing, d, self._rng))
             left -= missing
         for turn in range(left):
-            told = archive.imputed(archive.all())
-            unit = self.box.to_unit(told.x)
-            points, values = merged(unit, told.y[:, None])
+            evaluated = archive.imputed(archive.all())
+            unit = self.box.to_unit(evaluated.x)
+            points, values = merge_repeated(unit, evaluated.y[:, None])
             spanned = np.linalg.matrix_rank(points - points.mean(axis=0)) == d
-            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # nothing to model yet
+            if not spanned or len(points) < d + 2 or np.ptp(values) == 0.0:  # too little for a model
                 x = self._rng.random(d)
             else:
-                if hyper is None or len(points) <= OFTEN or turn % 10 == 0:
-                    model = fit(points, values, guess=hyper)
+                kernel = None if model is None else model.process.kernel
+                if kernel is None or len(points) <= OFTEN or turn % 10 == 0:
+                    model = fit(points, values, guess=kernel)
                 else:
-                    model = solve(points, values, hyper)
-                hyper = model.hyper
-                x = self._promising(model, unit[np.argsort(told.y, kind="stable")])
+                    model = solve(points, values, kernel)
+                x = self._promising(model, unit[np.argsort(evaluated.y, kind="stable")])
             yield self.box.from_unit(x[None])
 
     def _promising(self, model: Kriging, taken: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The point of the largest expected improvement [d]; `taken` are the points told, best first."""
+        """The point of the largest expected improvement [d]; `taken` are the evaluated points, best first."""
         d, best = self.box.dimension, float(model.residuals.min())
-        near = taken[self._rng.integers(0, min(5, len(taken)), CANDIDATES)]
-        reach = 10.0 ** self._rng.uniform(-3.0, -0.5, (CANDIDATES, 1))
-        around = np.clip(near + reach * self._rng.standard_normal((CANDIDATES, d)), 0.0, 1.0)
+        around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
         candidates = np.vstack([self._rng.random((CANDIDATES, d)), around])
         promise = log_improvement(model, candidates, best)
         for reach in REFINEMENTS:
@@ -124,7 +114,7 @@ class GaussianProcess(Optimizer):
             closer = np.clip(candidates[np.argmax(promise)] + closer, 0.0, 1.0)
             candidates = np.vstack([candidates, closer])
             promise = np.append(promise, log_improvement(model, closer, best))
-        fresh = cdist(candidates, taken).min(axis=1) > SEPARATION
+        fresh = distance_to_nearest(candidates, taken) > SEPARATION
         return candidates[np.argmax(np.where(fresh, promise, -np.inf))]
 
 
@@ -146,7 +136,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), without loss where that is tiny.
+    """The logarithm of phi(z) + z Phi(z), accurate where that is tiny.
 
     Args:
         z: Predicted improvement in standard deviations [k].

@@ -4,17 +4,16 @@ S. Mirjalili, S. M. Mirjalili, A. Lewis, "Grey Wolf Optimizer", Advances in Engi
 
 Choices where descriptions and common implementations differ:
 
-- Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T).
-  The move after the last evaluation would never be evaluated, so a run takes exactly N T evaluations.
-- alpha, beta and delta are the three best *distinct* points evaluated so far over the whole run (not of
-  the last generation), ties broken by the order of evaluation. A wolf that stands on a leader is a leader
-  once.
-- Wolves are always replaced, never kept because the new place is worse.
-- Places outside of the bounds are clipped to them before evaluation.
-- A failed evaluation (+inf) ranks last and changes nothing else.
-- C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the
-  pack is biased to the origin. That is the algorithm as published and the default; `centred=True` measures
-  positions from the middle of the box instead, and no longer depends on where the origin lies.
+- Iteration t = 1..T evaluates the whole population, then moves it with a(t) = 2 (1 - t/T). The move after the last
+  evaluation is omitted, so a run takes exactly N T evaluations.
+- alpha, beta and delta are the three best *distinct* points over the whole run (not of the last generation), ties in
+  the order of evaluation. Wolves at the same point count as one leader.
+- Wolves always move, even to a worse position.
+- Positions outside the bounds are clipped to them before evaluation.
+- A failed evaluation (+inf) ranks last and has no other effect.
+- C multiplies a position, so steps are short near the origin of the coordinates and long far from it: the pack is
+  biased towards the origin. That is the published algorithm and the default; `centred=True` measures positions from the
+  middle of the box instead, and does not depend on the origin.
 """
 
 from __future__ import annotations
@@ -27,18 +26,17 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.schedule import Schedule
+from calibray.optimizers.protocol import Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
 
-# Alpha, beta, delta.
 LEADERS = 3
+"""Alpha, beta and delta."""
 
-# The paper's population (table II).
 WOLVES = 30
+"""N of the paper (table II)."""
 
-# Below, a pack would have no three leaders.
 LEAST_BUDGET = 24
+"""Smallest budget that leaves SGWO-IM three leaders."""
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
@@ -68,12 +66,12 @@ def encircle(
         positions: X [n, d].
         leaders: Positions of alpha, beta and delta [3, d].
         a: Convergence factor.
-        r1: Uniform random numbers in [0, 1) [n, 3, d], per wolf, leader and dimension.
+        r1: Uniform random numbers in [0, 1) per wolf, leader and dimension [n, 3, d].
         r2: The same, independent of r1 [n, 3, d].
         origin: The point that positions are measured from [d].
 
     Returns:
-        X_GWO, the mean of the three guided places [n, d], not yet clipped.
+        X_GWO, the mean of the three guided positions [n, d], not yet clipped.
     """
     guide = leaders - origin
     a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3
@@ -83,13 +81,13 @@ def encircle(
 
 
 def whole_iterations(budget: int) -> dict[str, int]:
-    """The settings of GWO that keep to a budget: 30 wolves, and as many whole iterations as it holds.
+    """The settings of GWO that keep to a budget: 30 wolves, and as many whole iterations as fit.
 
     Args:
         budget: Number of evaluations.
 
     Returns:
-        Population and iterations; fewer wolves where the budget holds no two iterations of all.
+        Population and iterations; fewer wolves if two iterations of 30 do not fit.
 
     Example:
         >>> whole_iterations(600), whole_iterations(45)
@@ -106,7 +104,7 @@ class GWO(Optimizer):
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the one random generator.
+        seed: Seed of the random generator.
         population: N, number of wolves.
         iterations: T.
         centred: Measure positions from the middle of the box instead of the origin.
@@ -141,14 +139,10 @@ class GWO(Optimizer):
         self.box = Box.between(lower, upper)
         self.population = whole("population", population, at_least=LEADERS)
         self.iterations = whole("iterations", iterations, at_least=1)
+        self._budget = self.population * self.iterations
         self.origin = self.box.centre if centred else np.zeros(self.box.dimension)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
-
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self.population * self.iterations
 
     @property
     def leaders(self) -> NDArray[np.float64]:

@@ -1,22 +1,18 @@
 """Multi-start least squares with exact derivatives: projected Levenberg-Marquardt on all starts at once.
 
-Local searches are cheap where derivatives come with the residuals, and a batch of candidates costs little
-more than one; so many starts run side by side, and each `ask` holds the next trial point of every start that
-is still moving. RMSE over permittivities is multimodal (slab resonances), which is why one start is not
-enough. A search is given up when it nears a better one, or lies so far behind the best that it can hardly
-catch up; where it stood is kept as a minimum of its own (`minima`), for what fits nearly as well tells how
-far the best can be trusted. The steps are those of `descent.py`.
+Local searches are cheap if derivatives come with the residuals, and a batch of candidates costs little more than one.
+So many starts run in parallel, and each `ask` holds the next trial point of every start that still moves. RMSE over
+permittivities is multimodal (slab resonances), so one start is not enough. A search is given up when it comes close to
+a better one, or is so far behind the best that it can hardly catch up. Its last point is kept as a further minimum
+(`minima`): minima that fit nearly as well show how ambiguous the best one is. The steps are those of `descent.py`.
 
-Starts come in rounds, and end once the best minimum has come back often enough: another one that fits better,
-with as wide a basin, would have been missed by all searches with a probability of e^-k after k returns. Narrower
-ones are what a problem gets all its starts for. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical
-Programming 37, 1987, counts the different minima, for which every search would have to be followed to its end.
-With all that were given up as one minimum it stopped short of the optimum in two of four seeds of `hall`, one of
-`landscapes.py`; with each as a minimum of its own it never stopped.)
+Starts come in rounds, and end once `RETURNS` searches have ended in the best minimum. Another minimum that fits better
+and has as wide a basin would then have been missed by all searches with a probability of e^-k after k returns. Problems
+with narrower basins use all their starts. (The Bayesian rule of Boender and Rinnooy Kan, Mathematical Programming 37,
+1987, counts the different minima, for which every search would have to be followed to its end.)
 
-Where the starts are used up and the best has not come back that often, combinations of the minima are tried, and
-searches start from those that fit best, until they give no better minimum (`recombination.py`). Following what was
-given up to its end instead took twice the evaluations, and found the optimum of an office floor less often.
+If the starts are used up before the best minimum has returned that often, minima are combined into new starting points
+(`recombine`), and searches start from those that fit best, until they find no better minimum.
 """
 
 from __future__ import annotations
@@ -26,57 +22,70 @@ from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 
 from calibray.errors import InputError
 from calibray.optimizers.arguments import real, whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.descent import Starts, descend, distinct
 from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.recombination import SPACE, recombined
+from calibray.optimizers.protocol import Optimizer, Schedule
 from calibray.optimizers.sampling import design
-from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Search, Session
 
 CATCH_UP = 100.0
-"""Predicted decreases that a search may lie behind the best one before it is given up, unless told otherwise."""
+"""Default number of predicted decreases that a search may be behind the best one before it is given up."""
+
 NEARER = 10.0
-"""The same of searches that begin near their end, or beside others that stand there."""
-RECOMBINED = 32
+"""The same for searches that start near their end, or with others that do."""
+
+COMBINATIONS = 32
 """Combinations of minima that are tried at a time, no more than there were starts."""
+
 FOLLOWED = 0.2
-"""Share of them that searches start from, those that fit best."""
+"""Share of them from which searches start, those that fit best."""
+
+PARENTS = 12
+"""Lowest minima that are combined."""
+
+SPACE = 0.05
+"""Smallest distance in the unit cube of a combination to the known minima and to the other combinations."""
+
 ROUND = 64
 """Starts of a round."""
+
 RETURNS = 10
 """Searches that end in the best minimum before no more are started."""
+
 LEVEL = 1e-4
 """Relative difference of the mean square below which two minima fit equally well, as along a valley."""
+
 NOISELESS = 1e-9
-"""The same, relative to the largest mean square: where data hold no noise, the lowest ones are rounding."""
+"""The same relative to the largest mean square: without noise, the lowest mean squares are rounding errors."""
+
 APART = 0.01
-"""Distance in the unit cube below which two searches are taken to have ended in the same minimum."""
+"""Distance in the unit cube below which two searches ended in the same minimum."""
 
 
 @final
 class LeastSquares(Optimizer):
-    """Multi-start Levenberg-Marquardt. Uses residuals and Jacobian; no budget, for it stops by itself.
+    """Multi-start Levenberg-Marquardt. Uses residuals and Jacobian; it has no budget and stops by itself.
 
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed of the scrambled Sobol points that the searches start from.
-        starts: Number of those points at most; powers of two are spread best. Each costs about ten evaluations, and
-            where all are used, combinations of what they found some hundred more.
-            The best point told before the first `ask`, if any, is a further start.
-        x0: Further starting points of the user's, [d] or [k, d].
+        starts: Largest number of those points; powers of two are spread best. Each costs about ten evaluations. If all
+            are used, combinations of the minima cost some hundred more. The best point told before the first `ask`, if
+            any, is a further start.
+        x0: Further starting points, [d] or [k, d].
         iterations: Largest number of steps of each search.
         tolerance: A search has converged when its model predicts less than this relative decrease of the mean
             square, or a step shorter than this in the unit cube.
-        catch_up: Predicted decreases that a search may lie behind the best one before it is given up; fewer where
-            starts are minima already, and the others need but show whether they lead to a better one.
-        objective: The value that belongs to residuals [n, m], [n]; their root mean square unless told otherwise. It
-            must rise with their mean square, which is what is minimised; both are checked.
+        catch_up: Predicted decreases that a search may be behind the best one before it is given up. Use fewer if
+            starts are minima already and the others only have to show whether they lead to a better one.
+        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
+            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.
@@ -110,6 +119,7 @@ class LeastSquares(Optimizer):
         objective: Objective = root_mean_square,
     ) -> None:
         self.box = Box.between(lower, upper)
+        self._budget = None
         self.starts = whole("starts", starts, at_least=1)
         self.iterations = whole("iterations", iterations, at_least=1)
         self.tolerance = real("tolerance", tolerance, at_least=0.0, at_most=1.0)
@@ -118,16 +128,13 @@ class LeastSquares(Optimizer):
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search, objective)
 
-    @property
-    def budget(self) -> None:
-        """None: it stops when every search has converged."""
-        return
-
     def _search(self, archive: Archive) -> Search:
         box = self.box
-        told_best = [box.to_unit(archive.best.x[None])] if len(archive) else []
+        unit = box.to_unit(self.x0)
+        if len(archive):
+            unit = np.vstack([unit, box.to_unit(archive.best.x)])
         sobol = design("sobol", self.starts, box.dimension, self._rng)
-        unit, ended = np.concatenate([box.to_unit(self.x0), *told_best]), None
+        ended = None
         for first in range(0, self.starts, ROUND):
             unit = np.concatenate([unit, sobol[first : first + ROUND]])
             ended = yield from self._descended(unit, ended, self.catch_up)
@@ -140,11 +147,11 @@ class LeastSquares(Optimizer):
             self._session.minima = box.from_unit(distinct(ended, APART).unit)
 
     def _recombined(self, ended: Starts) -> Generator[NDArray[np.float64], Evaluations, Starts]:
-        number, before = min(RECOMBINED, self.starts), np.inf
+        number, before = min(COMBINATIONS, self.starts), np.inf
         followed = round(FOLLOWED * number)
         while followed and ended.cost.min() < before:
-            before = ended.cost.min() - _alike(ended)
-            unit = recombined(distinct(ended, SPACE).unit, number)
+            before = ended.cost.min() - _slack(ended)
+            unit = recombine(distinct(ended, SPACE).unit, number)
             if not len(unit):
                 break
             ended = yield from self._descended(unit, ended, min(NEARER, self.catch_up), followed)
@@ -153,37 +160,75 @@ class LeastSquares(Optimizer):
     def _descended(
         self,
         unit: NDArray[np.float64],
-        known: Starts | None,
+        earlier: Starts | None,
         catch_up: float,
         followed: int | None = None,
     ) -> Generator[NDArray[np.float64], Evaluations, Starts]:
-        descent = descend(unit, self.iterations, self.tolerance, catch_up, known, followed)
+        descent = descend(unit, self.iterations, self.tolerance, catch_up, earlier, followed)
         try:
             unit = next(descent)
             while True:
-                told = yield self.box.from_unit(unit)
-                failed = ~np.isfinite(told.y)[:, None]
-                residuals = np.where(failed, np.inf, told.errors)
-                unit = descent.send((residuals, told.slopes * self.box.width))
+                answers = yield self.box.from_unit(unit)
+                failed = ~np.isfinite(answers.y)[:, None]
+                residuals = np.where(failed, np.inf, answers.errors)
+                unit = descent.send((residuals, answers.slopes * self.box.width))
         except StopIteration as end:
             return end.value
 
 
 def returns(ended: Starts) -> int:
-    """How many searches ended in the best minimum, or in one that fits as well.
+    """Number of searches that ended in the best minimum, or in one that fits as well.
 
     Args:
         ended: The searches.
 
     Returns:
-        Their number, with those that were merged with them.
+        Their number, merged searches included.
     """
     if not len(ended.cost):
         return 0
-    return int(ended.searches[ended.cost <= ended.cost.min() + _alike(ended)].sum())
+    return int(ended.searches[ended.cost <= ended.cost.min() + _slack(ended)].sum())
 
 
-def _alike(ended: Starts) -> float:
+def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    """Combine minima into points from which other minima may be reached.
+
+    The best minimum is shifted by the difference of two others, or takes one coordinate of another. Shifts help because
+    one cause, such as a resonating slab, repeats minima at equal distances wherever the other parameters are. They are
+    the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997). Exchanges help
+    where parameters act nearly independently, such as materials that few paths meet both of. They are its crossover.
+
+    Args:
+        minima: Minima in the unit cube, none within `SPACE` of another, the best first [k, d].
+        number: Number of points wanted.
+
+    Returns:
+        Points inside the unit cube, those of the lowest minima first, shifted and exchanged ones in turn; fewer than
+        wanted if the minima give no more.
+    """
+    best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
+    target, source = np.nonzero(~np.eye(len(low), dtype=bool))
+    order = np.lexsort((target + source, np.maximum(target, source)))
+    shifted = best + (low[target] - low[source])[order]
+    exchanged = np.where(np.eye(dimension, dtype=bool), low[1:, None], best).reshape(-1, dimension)
+    new = [_new(points, minima) for points in (shifted, exchanged)]
+    turn = np.argsort(np.concatenate([np.arange(len(points)) for points in new]), kind="stable")
+    kept = np.empty((0, dimension))
+    for point in np.concatenate(new)[turn]:
+        if len(kept) >= number:
+            break
+        if (np.linalg.norm(kept - point, axis=1) > SPACE).all():
+            kept = np.vstack([kept, point])
+    return kept
+
+
+def _new(points: NDArray[np.float64], minima: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points inside the unit cube that are far from every minimum."""
+    inside = ((points >= 0.0) & (points <= 1.0)).all(axis=1)
+    return points[inside & (cdist(points, minima) > SPACE).all(axis=1)]
+
+
+def _slack(ended: Starts) -> float:
     """Difference of cost below which two minima fit equally well."""
     return float(LEVEL * ended.cost.min() + NOISELESS * ended.cost.max())
 

@@ -1,8 +1,8 @@
-"""Library minimisers that call an objective, turned into searches that are asked and told.
+"""Minimisers of libraries that call an objective, turned into ask-and-tell searches.
 
-The minimiser runs in a thread of its own and waits inside its objective for the evaluation; one side runs
-at a time, so a run is as reproducible as the library. A search that is dropped before its end takes its
-thread with it: the objective then raises inside the library, which ends the thread.
+The minimiser runs in a separate thread and waits inside its objective for the evaluation. Only one side runs at a time,
+so a run is as reproducible as the library. When a search is dropped before its end, the objective raises inside the
+library, which ends the thread.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from calibray.optimizers.evaluations import Evaluations
 from calibray.optimizers.session import Search
 
 Evaluate = Callable[[NDArray[np.float64]], Evaluations]
-"""What a minimiser calls: candidates [n, d] to their evaluations."""
+"""The function that a minimiser calls: candidates [n, d] to their evaluations."""
 
 
 class _AbandonedError(BaseException):
-    """What ends a minimiser whose search was dropped; not an `Exception`, so that no library swallows it."""
+    """Ends a minimiser whose search was dropped; not an `Exception`, so that no library swallows it."""
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
     """Run a minimiser in a thread and yield the candidates that it wants evaluated.
 
     Args:
-        minimise: Calls its argument as often as it likes, then returns.
+        minimise: Calls its argument any number of times, then returns.
 
     Yields:
         Candidates [n, d].
@@ -74,7 +74,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """End a search when it has used its budget, shortening the last batch.
+    """End a search when it has used its budget, and shorten the last batch.
 
     Args:
         search: The search; it must not end before.
@@ -86,11 +86,11 @@ def limited(search: Search, budget: int) -> Search:
     with closing(search):
         x = next(search)
         while True:
-            told = yield x[:budget]
-            budget -= len(told)
+            answers = yield x[:budget]
+            budget -= len(answers)
             if budget == 0:
                 return
-            x = search.send(told)
+            x = search.send(answers)
 
 
 def library(name: str, package: str, extra: str = "optimizers") -> ModuleType:
@@ -98,8 +98,8 @@ def library(name: str, package: str, extra: str = "optimizers") -> ModuleType:
 
     Args:
         name: Name of its module.
-        package: Its name where packages are installed from.
-        extra: The extra of Calibray that brings it.
+        package: Name of its package.
+        extra: The extra of Calibray that installs it.
 
     Returns:
         The module.

@@ -1,4 +1,4 @@
-"""The methods by the names that a study file uses, and an optimizer made by its name."""
+"""Methods by the names that a study file uses."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
-from calibray.optimizers.multifidelity.vector_surrogate import VectorSurrogate
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
-from calibray.optimizers.screened import Screen, ScreenedSGWOIM
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.optimizers.vector_surrogate import VectorSurrogate
 from calibray.support.messages import did_you_mean
 
 METHODS: Final[dict[str, type[Optimizer]]] = {
     "gwo": GWO,
     "sgwo-im": SGWOIM,
-    "sgwo-im-screened": ScreenedSGWOIM,
     "space-mapping": SpaceMapping,
     "vector-surrogate": VectorSurrogate,
     "least-squares": LeastSquares,
@@ -42,6 +40,16 @@ METHODS: Final[dict[str, type[Optimizer]]] = {
     "sobol": Sobol,
 }
 
+LABELS: Final = {
+    "gwo": "GWO",
+    "sgwo-im": "SGWO-IM",
+    "space-mapping": "space mapping",
+    "auto": "auto (least squares)",
+}
+
+_NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
+"""Constructor arguments that the study sets, so that users cannot."""
+
 
 def method(name: str) -> type[Optimizer]:
     """Look up a method.
@@ -50,7 +58,7 @@ def method(name: str) -> type[Optimizer]:
         name: Its name.
 
     Returns:
-        Its class, which tells what it uses, its schedule, and whether it takes starting points.
+        Its class, which states what it uses, its schedule, and whether it takes starting points.
 
     Raises:
         InputError: There is no such method.
@@ -64,6 +72,24 @@ def method(name: str) -> type[Optimizer]:
     return METHODS[name]
 
 
+def label(name: str) -> str:
+    """A method's name in tables and figures.
+
+    Args:
+        name: A method, or `METHOD@CALLS` with its budget.
+
+    Returns:
+        The name.
+
+    Example:
+        >>> label("gwo@600")
+        'GWO, 600 calls'
+    """
+    bare, _, calls = name.partition("@")
+    text = LABELS.get(bare, bare)
+    return f"{text}, {calls} calls" if calls else text
+
+
 def make(
     name: str,
     lower: ArrayLike,
@@ -74,24 +100,22 @@ def make(
     start: ArrayLike | None = None,
     starts: int | None = None,
     objective: Objective | None = None,
-    screen: Screen | None = None,
-    model: CheapModel | None = None,
+    cheap_model: CheapModel | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> Optimizer:
-    """Make an optimizer by its method's name; every method takes of this what it declares to take.
+    """Make an optimizer by its method's name; each method receives the arguments that it takes.
 
     Args:
         name: A method of `METHODS`.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
         seed: Seed.
-        budget: Number of evaluations to keep to; its own if None. A method that stops by itself is left to it.
+        budget: Number of evaluations to keep to; the method's default if None. Ignored if the method stops by itself.
         start: Points to start from, [d] or [k, d], for methods that take them.
-        starts: Starting points of its own, for the same methods; its default if None.
-        objective: The value of residuals, for methods that use them; their root mean square if None.
-        screen: The objective of a cheap model, for methods that screen by one.
-        model: A cheap model of what is minimised, for methods that take one.
-        options: Settings of the method, which go before all of these.
+        starts: Number of further starting points, for the same methods; their default if None.
+        objective: Residuals to the value, for methods that use residuals; their root mean square if None.
+        cheap_model: A cheap model of the engine, for methods that take one.
+        options: Settings of the method, which override all of these.
 
     Returns:
         The optimizer.
@@ -105,22 +129,19 @@ def make(
         90
     """
     kind = method(name)
+    parameters = set(signature(kind).parameters)
     settings: dict[str, Any] = {} if budget is None else dict(kind.within(budget))
     if kind.takes_starts:
         settings |= {key: value for key, value in (("x0", start), ("starts", starts)) if value is not None}
     if objective is not None and "residuals" in kind.uses:
         settings["objective"] = objective
-    for key, value in (("screen", screen), ("model", model)):
-        if value is not None and key in signature(kind).parameters:
-            settings[key] = value
-    given = dict(options or {})
-    known = sorted(
-        set(signature(kind).parameters) - {"lower", "upper", "seed", "objective", "screen", "model"}
-    )
-    for key in sorted(given.keys() - set(known)):
+    if cheap_model is not None and "cheap_model" in parameters:
+        settings["cheap_model"] = cheap_model
+    options, allowed = dict(options or {}), sorted(parameters - _NO_OPTIONS)
+    for key in sorted(options.keys() - set(allowed)):
         raise InputError(
-            f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, known)}"
+            f"method.options of {name!r}: there is no setting {key!r}; {did_you_mean(key, allowed)}"
         )
     # The constructors differ in their settings, which were looked up above.
     construct = cast(Callable[..., Optimizer], kind)
-    return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **given})
+    return construct(np.asarray(lower), np.asarray(upper), seed=seed, **{**settings, **options})

@@ -1,12 +1,12 @@
-"""SGWO-IM as a sampler for Optuna, so that its storages, dashboard and workers serve the paper's method.
+"""SGWO-IM as a sampler for Optuna, for use with its storages, dashboard and workers.
 
-Every candidate that is handed out is written into its trial. A sampler made anew with the same seed on a stored
-study therefore goes through the same candidates again, takes the answers that are there, and goes on where the
-study stopped. Trials that it did not propose (enqueued, or of another sampler) join the archive: they can lead
-the pack. A trial that failed counts as a failed evaluation.
+Every candidate that is handed out is written into its trial. A new sampler with the same seed on a stored study
+therefore repeats the same candidates, takes their stored answers, and continues where the study stopped. Trials that it
+did not propose (enqueued, or from another sampler) join the archive and can lead the pack. A failed trial counts as a
+failed evaluation.
 
-The pack cannot move before the iteration is complete. When every open candidate is with a worker, one that another
-process took is handed out again, for that process may be gone; else the next trial is a random point.
+The pack cannot move before the iteration is complete. If every open candidate is with a worker, one that another
+process took is handed out again, because that process may have ended; otherwise the next trial is a random point.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ else:
     TrialState = optuna.trial.TrialState
 
 CANDIDATE = "sgwo-im:candidate"
-"""System attribute of a trial: its candidate in the coordinates of the search."""
+"""System attribute of a trial that holds its candidate in search coordinates."""
 
 
 @final
@@ -78,7 +78,7 @@ class SGWOIMSampler(BaseSampler):
         self._random = optuna.samplers.RandomSampler(seed=seed)
         self._optimizer: SGWOIM | None = None
         self._told: set[int] = set()
-        self._given: set[int] = set()
+        self._proposed: set[int] = set()
         self._lock = Lock()
         SGWOIM([0.0] * max(len(self._space), 1), [1.0] * max(len(self._space), 1), **self._settings)
 
@@ -94,9 +94,9 @@ class SGWOIMSampler(BaseSampler):
         """
         if self._space:
             return self._space
-        found = self._inferred.calculate(study)
+        inferred = self._inferred.calculate(study)
         numeric = (FloatDistribution, IntDistribution)
-        return {name: d for name, d in found.items() if isinstance(d, numeric) and not d.single()}
+        return {name: d for name, d in inferred.items() if isinstance(d, numeric) and not d.single()}
 
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
@@ -109,7 +109,7 @@ class SGWOIMSampler(BaseSampler):
             search_space: The parameters that the pack moves in.
 
         Returns:
-            Values by name; empty where Optuna should draw them at random.
+            Values by name; empty if Optuna should draw them at random.
 
         Raises:
             InputError: The study has several objectives.
@@ -124,15 +124,16 @@ class SGWOIMSampler(BaseSampler):
                 return {}
             running = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
             taken = {other.number: other.system_attrs.get(CANDIDATE) for other in running}
-            ours = [taken[number] for number in self._given & taken.keys()]
-            asked = optimizer.ask().tolist()
-            left = [x for x in asked if x not in taken.values()] or [x for x in asked if x not in ours]
-            if not left:
+            ours = [taken[number] for number in self._proposed & taken.keys()]
+            candidates = optimizer.ask().tolist()
+            free = [x for x in candidates if x not in taken.values()]
+            free = free or [x for x in candidates if x not in ours]
+            if not free:
                 return {}
-            free = left[0]
-            self._given.add(trial.number)
-            study._storage.set_trial_system_attr(trial._trial_id, CANDIDATE, free)
-        values = zip(search_space.items(), free, strict=True)
+            candidate = free[0]
+            self._proposed.add(trial.number)
+            study._storage.set_trial_system_attr(trial._trial_id, CANDIDATE, candidate)
+        values = zip(search_space.items(), candidate, strict=True)
         return {name: _value(cast("Numeric", distribution), x) for (name, distribution), x in values}
 
     def sample_independent(
@@ -154,7 +155,7 @@ class SGWOIMSampler(BaseSampler):
     def after_trial(
         self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """Take a trial's answer, and stop the study when the pack has hunted to the end.
+        """Take a trial's answer, and stop the study after the last iteration.
 
         Args:
             study: The study.
@@ -167,11 +168,11 @@ class SGWOIMSampler(BaseSampler):
                 return
             self._take(self._optimizer, study, trial, state, values)
             if self._optimizer.done:
-                with suppress(RuntimeError):  # nothing to stop where trials are asked for one by one
+                with suppress(RuntimeError):  # trials that are asked for one by one cannot be stopped
                     study.stop()
 
     def _synchronized(self, study: Study, space: Mapping[str, BaseDistribution]) -> SGWOIM:
-        """The optimizer, told every finished trial of the study in order."""
+        """The optimizer after every finished trial of the study, in order."""
         if self._optimizer is None or self._space != space:
             bounds = np.array([_bounds(cast("Numeric", distribution)) for distribution in space.values()])
             self._optimizer, self._space, self._told = SGWOIM(*bounds.T, **self._settings), dict(space), set()
@@ -188,11 +189,11 @@ class SGWOIMSampler(BaseSampler):
         state: TrialState,
         values: Sequence[float] | None,
     ) -> None:
-        """Tell a finished trial, once."""
+        """Tell a finished trial to the optimizer, once."""
         if trial.number in self._told or optimizer.done:
             return
         self._told.add(trial.number)
-        optimizer.ask()  # the iteration begins before its answers come, however many are stored already
+        optimizer.ask()  # the iteration has to begin before its answers are told, even if all are stored already
         x = np.array(trial.system_attrs.get(CANDIDATE, self._foreign(trial)), dtype=float)
         if x.shape != optimizer.box.lower.shape or not np.array_equal(x, optimizer.box.clip(x)):
             return
@@ -200,7 +201,7 @@ class SGWOIMSampler(BaseSampler):
         optimizer.tell([x], [sign * values[0] if state == TrialState.COMPLETE and values else np.inf])
 
     def _foreign(self, trial: FrozenTrial) -> list[float]:
-        """Where a trial lies that the pack did not propose; empty if it lacks a parameter."""
+        """Search coordinates of a trial that the pack did not propose; empty if it lacks a parameter."""
         if not self._space.keys() <= trial.params.keys():
             return []
         return [
@@ -210,7 +211,7 @@ class SGWOIMSampler(BaseSampler):
 
 
 def _bounds(distribution: Numeric) -> tuple[float, float]:
-    """Bounds of the search coordinate; an integer has an interval of its own width to either side."""
+    """Bounds of the search coordinate; each integer covers an interval of width 1."""
     margin = 0.5 if isinstance(distribution, IntDistribution) else 0.0
     return _coordinate(distribution, distribution.low - margin), _coordinate(
         distribution, distribution.high + margin

@@ -1,46 +1,68 @@
-"""What every optimizer offers: ask for candidates, tell their evaluations, until it is done."""
+"""The interface of every optimizer: ask for candidates, tell their evaluations, until it is done."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import ClassVar
+from abc import ABC
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.optimizers.evaluations import Best
-from calibray.optimizers.schedule import Schedule
 from calibray.optimizers.session import Session
 
 
-class Optimizer(ABC):
-    """What minimises a value over a box; the caller owns the loop.
-
-    `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is the whole of it. A final class states
-    its settings in its constructor, hands its algorithm to a `Session`, declares the attributes below, and overrides
-    nothing that stands here.
-
-    The value may be any number: an error, a negative logarithm of a likelihood. A method that uses residuals
-    minimises their mean square, so its value must rise and fall with that. For a likelihood tell deviance residuals:
-    sign(r) sqrt(2 (l(r) - l(0))) of a residual r whose negative log-likelihood is l; its constructor's `objective`
-    says what value belongs to them.
+@dataclass(frozen=True)
+class Schedule:
+    """How a method keeps to a budget.
 
     Attributes:
-        uses: What it uses of an evaluation, of "value", "residuals" and "jacobian".
-        schedule: How it keeps to a budget; None where it stops by itself.
-        takes_starts: Whether its constructor takes `x0`, points to start from, and `starts`, how many of its own it
-            adds. The best point told to any other before the first `ask` leads its search.
+        settings: From a number of evaluations to the constructor arguments that keep to it.
+        least: Smallest budget that the method can run on.
+    """
+
+    settings: Callable[[int], dict[str, int]]
+    least: int = 1
+
+
+def _as_given(budget: int) -> dict[str, int]:
+    return {"budget": budget}
+
+
+AS_GIVEN: Final = Schedule(_as_given)
+"""The schedule of a method that takes any budget as its setting `budget`."""
+
+
+class Optimizer(ABC):
+    """Minimises a value over a box; the caller owns the loop.
+
+    `while not opt.done: x = opt.ask(); opt.tell(x, *evaluate(x))` is a complete run. A final class takes its settings
+    in the constructor, hands its algorithm to a `Session`, sets the attributes below, and overrides nothing.
+
+    The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
+    their mean square, so the value must rise and fall with it. For a likelihood tell deviance residuals
+    sign(r) sqrt(2 (l(r) - l(0))) of residuals r with negative log likelihood l; the constructor's `objective` computes
+    the value from them.
+
+    Attributes:
+        uses: Parts of an evaluation that the method uses, of "value", "residuals" and "jacobian".
+        schedule: How it keeps to a budget; None if it stops by itself.
+        takes_starts: Whether its constructor takes `x0`, points to start from, and `starts`, the number of its own
+            starting points. In every other method the best point told before the first `ask` leads the search.
     """
 
     uses: ClassVar[frozenset[str]]
     schedule: ClassVar[Schedule | None]
     takes_starts: ClassVar[bool]
     _session: Session
+    _budget: Any  # int, or None if the method stops by itself
 
     @classmethod
     def needs_derivatives(cls) -> bool:
-        """Tell whether every evaluation must come with derivatives.
+        """Whether every evaluation must come with derivatives.
 
         Returns:
             True if so.
@@ -55,7 +77,7 @@ class Optimizer(ABC):
             budget: Number of evaluations.
 
         Returns:
-            Arguments of the constructor; none where it stops by itself.
+            Constructor arguments; none if the method stops by itself.
 
         Raises:
             InputError: The budget is too small for the method.
@@ -69,9 +91,9 @@ class Optimizer(ABC):
         return cls.schedule.settings(budget)
 
     @property
-    @abstractmethod
     def budget(self) -> int | None:
-        """Number of evaluations it will ask for, or None when it stops by itself."""
+        """Largest number of evaluations it will ask for, or None if it stops by itself."""
+        return self._budget
 
     @property
     def done(self) -> bool:
@@ -85,11 +107,11 @@ class Optimizer(ABC):
         Raises:
             InputError: Nothing has been told yet.
         """
-        return self._session.best
+        return self._session.archive.best
 
     @property
     def minima(self) -> NDArray[np.float64]:
-        """Where the search ended [k, d]: the best point, then every other minimum that the method keeps.
+        """The best point, then every other minimum that the method keeps [k, d].
 
         Raises:
             InputError: Nothing has been told yet.
@@ -105,7 +127,7 @@ class Optimizer(ABC):
         """The candidates to evaluate next.
 
         Returns:
-            Points [n, d] inside the bounds, each still without an evaluation; the same again until told.
+            Points [n, d] inside the bounds that still wait for an evaluation; the same again until told.
 
         Raises:
             InputError: The optimizer is done.
@@ -121,16 +143,15 @@ class Optimizer(ABC):
     ) -> None:
         """Tell evaluations; everything is copied.
 
-        Candidates that were asked for may come in any order and in portions; the search goes on when the
-        batch is complete. Points that were not asked for, for instance those of an earlier run, join the
-        archive: they can become the best point, a leader or data of a surrogate, but stand for no
-        candidate and no iteration.
+        Candidates that were asked for may come in any order and in portions; the search goes on when the batch is
+        complete. Points that were not asked for, for instance those of an earlier run, join the archive. They can
+        become the best point, a leader or data of a surrogate, but answer no candidate and end no iteration.
 
         Args:
             x: Points [n, d] inside the bounds.
-            y: Value [n]; +inf tells that an evaluation failed.
-            residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or whatever value the
-                constructor was told to belong to them. Not looked at where only the value is used.
+            y: Value [n]; +inf for a failed evaluation.
+            residuals: Residuals [n, m], weighted so that y = sqrt(mean(residuals**2)), or the value that the
+                constructor's `objective` gives. Ignored if only the value is used.
             jacobian: Derivatives of the residuals by the parameters [n, m, d].
 
         Raises:

@@ -1,4 +1,4 @@
-"""Designs of points in a box, and the searches that evaluate one and stop: the negative controls.
+"""Designs of points in a box, and searches that evaluate one and stop: the negative controls.
 
 An optimizer that does not beat these at an equal budget has learned nothing from its evaluations.
 """
@@ -9,13 +9,13 @@ from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist, pdist
 from scipy.stats import qmc
 
 from calibray.optimizers.arguments import whole
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.schedule import AS_GIVEN, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
 from calibray.support.interruption import defer_interruption
 
@@ -28,7 +28,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
             dimension) or "sobol" (scrambled; the first n of the next power of two).
         count: Number of points n.
         dimension: Number of dimensions d.
-        rng: Where the randomness comes from.
+        rng: Random generator.
 
     Returns:
         Points [n, d].
@@ -37,7 +37,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
         return rng.random((count, dimension))
     if kind == "latin-hypercube":
         return qmc.LatinHypercube(dimension, rng=rng).random(count)
-    # SciPy drops an interruption while it reads its direction numbers, and goes on without them.
+    # SciPy swallows an interruption while it reads its direction numbers, and goes on without them.
     with defer_interruption():
         sequence = qmc.Sobol(dimension, rng=rng)
     # Sobol points are balanced in blocks of a power of two only, and SciPy warns about other counts.
@@ -52,20 +52,39 @@ def maximin_design(
     Args:
         count: Number of points n.
         dimension: Number of dimensions d.
-        rng: Where the randomness comes from.
+        rng: Random generator.
         tries: Latin hypercubes to choose from.
 
     Returns:
         The one with the largest smallest distance [n, d].
     """
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
-    spacing = [_smallest_distance(points) for points in drawn]
+    spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
 
 
-def _smallest_distance(points: NDArray[np.float64]) -> float:
-    square = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
-    return float(np.sqrt(square[~np.eye(len(points), dtype=bool)].min(initial=np.inf)))
+def draw_around(
+    points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw points near given ones, at distances over several orders of magnitude.
+
+    Args:
+        points: Points of the unit cube [n, d].
+        count: Number of points to draw.
+        log_reach: Decimal logarithm of the smallest standard deviation; the largest is 10^-0.5.
+        rng: Random generator.
+
+    Returns:
+        Points of the unit cube [count, d].
+    """
+    near = points[rng.integers(0, len(points), count)]
+    reach = 10.0 ** rng.uniform(log_reach, -0.5, (count, 1))
+    return np.clip(near + reach * rng.standard_normal(near.shape), 0.0, 1.0)
+
+
+def distance_to_nearest(x: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of each point x [k, d] to the nearest of at least one other [n, d]."""
+    return cdist(x, points).min(axis=1)
 
 
 class Sampling(Optimizer):
@@ -95,18 +114,13 @@ class Sampling(Optimizer):
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._session = Session(self.box, self.uses, self._search)
 
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        return self._budget
-
     def _search(self, archive: Archive) -> Search:
         yield self.box.from_unit(design(self.kind, self._budget, self.box.dimension, self._rng))
 
 
 @final
 class RandomSearch(Sampling):
-    """Independent uniform points. Uses the value alone; budget as given.
+    """Independent uniform points. Uses the value alone; budget as set.
 
     Example:
         >>> RandomSearch([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape
@@ -118,7 +132,7 @@ class RandomSearch(Sampling):
 
 @final
 class LatinHypercube(Sampling):
-    """One point in each slice of every dimension. Uses the value alone; budget as given.
+    """One point in each slice of every dimension. Uses the value alone; budget as set.
 
     Example:
         >>> sorted((LatinHypercube([0.0], [1.0], budget=4).ask()[:, 0] * 4).astype(int).tolist())
@@ -130,7 +144,7 @@ class LatinHypercube(Sampling):
 
 @final
 class Sobol(Sampling):
-    """A scrambled Sobol sequence. Uses the value alone; budget as given.
+    """A scrambled Sobol sequence. Uses the value alone; budget as set.
 
     Example:
         >>> Sobol([0.0, 0.0], [1.0, 2.0], budget=10).ask().shape

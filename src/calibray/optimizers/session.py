@@ -1,8 +1,8 @@
 """One run of an algorithm, turned from a loop into ask and tell.
 
-An algorithm is written as it stands in its paper: a generator that yields the candidates [n, d] of each
-iteration and receives their evaluations. The session holds it between `ask` and `tell`, checks what is
-told, keeps the archive, and collects the answers of a batch in whatever order and portions they come.
+An algorithm is written as in its paper: a generator that yields the candidates [n, d] of each iteration and receives
+their evaluations. The session holds it between `ask` and `tell`, checks the evaluations, keeps the archive, and
+collects the answers of a batch in any order and in portions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from calibray.errors import InputError
 from calibray.optimizers.box import Box
 from calibray.optimizers.evaluations import (
     Archive,
-    Best,
     Evaluations,
     Objective,
     check_order,
@@ -33,12 +32,12 @@ class Session:
 
     Args:
         box: The box searched.
-        uses: What the algorithm uses of an evaluation: "value", "residuals", "jacobian".
+        uses: Parts of an evaluation that the algorithm uses: "value", "residuals", "jacobian".
         search: Starts the algorithm on the archive; nothing of it runs before the first `ask`.
-        objective: The value that belongs to residuals, where they are used.
+        objective: Residuals to the value, if residuals are used.
 
     Attributes:
-        minima: Distinct minima that the algorithm found beside the best [k, d]; none until it leaves some.
+        minima: Distinct minima of the algorithm other than the best [k, d]; empty until it sets them.
     """
 
     def __init__(
@@ -59,26 +58,14 @@ class Session:
 
     @property
     def done(self) -> bool:
-        """Whether the algorithm has ended; the next candidates are worked out for it."""
-        # Nothing begins before the first ask, so that earlier evaluations can still be told.
+        """Whether the algorithm has ended; to know that, it works out the next candidates."""
+        # Nothing starts before the first ask, so that earlier evaluations can still be told.
         if self._asked is not None:
             self._advance()
         return self._finished
 
-    @property
-    def best(self) -> Best:
-        """The best evaluation so far."""
-        return self.archive.best
-
     def ask(self) -> NDArray[np.float64]:
-        """The candidates that wait for their evaluation.
-
-        Returns:
-            Points [n, d]; the same again until they are told.
-
-        Raises:
-            InputError: The search has ended.
-        """
+        """See `Optimizer.ask`."""
         self._advance()
         if self._asked is None:
             raise InputError(f"done after {len(self.archive)} evaluations; start a new optimizer to go on")
@@ -91,35 +78,27 @@ class Session:
         residuals: ArrayLike | None = None,
         jacobian: ArrayLike | None = None,
     ) -> None:
-        """Take evaluations; those of the candidates asked for answer them, others only join the archive.
-
-        Args:
-            x: Points [n, d].
-            y: Value [n], +inf for a failed evaluation.
-            residuals: Residuals [n, m].
-            jacobian: Derivatives of the residuals [n, m, d].
-
-        Raises:
-            InputError: What is told is malformed; nothing of it is kept.
-        """
-        told = checked_evaluations(self.archive.box, x, y, residuals, jacobian, self._uses, self._objective)
-        if told.residuals is not None:
-            links = told.residuals.shape[1]
+        """See `Optimizer.tell`."""
+        evaluations = checked_evaluations(
+            self.archive.box, x, y, residuals, jacobian, self._uses, self._objective
+        )
+        if evaluations.residuals is not None:
+            links = evaluations.residuals.shape[1]
             if self._links not in (None, links):
                 raise InputError(
                     f"residuals have {links} columns, earlier ones {self._links}; tell the same links"
                 )
             if self._objective is not root_mean_square:
-                check_order(told, self.archive)
+                check_order(evaluations, self.archive)
             self._links = links
-        self.archive.add(told)
+        self.archive.add(evaluations)
         if self._asked is None:
             return
-        for row in range(len(told)):
+        for row in range(len(evaluations)):
             waiting = self._open()
-            same = waiting[(self._asked[waiting] == told.x[row]).all(axis=1)]
+            same = waiting[(self._asked[waiting] == evaluations.x[row]).all(axis=1)]
             if same.size:
-                self._answers[same[0]] = told.rows(np.array([row]))
+                self._answers[same[0]] = evaluations.rows(np.array([row]))
 
     def _open(self) -> NDArray[np.intp]:
         """Rows of the batch without an answer."""

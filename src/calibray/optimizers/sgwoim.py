@@ -2,40 +2,55 @@
 
 X. Zou, P. Tang, P. Liu, C. Tai, "Efficient and Accurate Surrogate-Assisted Electromagnetic Parameter
 Calibration for 6G Digital Twin Channels", Algorithm 1 and eqs. 2 to 4. Defaults are its Table II: N = 30,
-T = 20, cosine convergence, memory weight 0.1 to 0.3, 5 full iterations, then K = 5 real evaluations an
+T = 20, cosine convergence, memory weight 0.1 to 0.3, 5 full iterations, then K = 5 real evaluations per
 iteration: 5 * 30 + 15 * 5 = 225 evaluations.
 
-Choices where the paper is silent, beside those of `gwo.py`:
+Choices where the paper is silent, in addition to those of `gwo.py`:
 
-- "RBF model is available" means t > `full_iterations`; the model is refitted in every iteration on all real
-  evaluations of the run, those told without being asked included. See `screening.py` for the model.
-- Wolves that are screened out still move; their memory changes only by their own real evaluations.
+- "RBF model is available" means t > `full_iterations`. The model is refitted in every iteration on all real
+  evaluations of the run, including those that were not asked for.
+- Wolves that are screened out still move; only their real evaluations change their memory.
 - Memory starts at the initial position with a score of infinity, and changes on strictly lower scores.
 - The K elites are evaluated in the order of their predictions; equal predictions keep the order of the pack.
-- Memory fusion (eq. 3) takes the unclipped X_GWO; the fused place is clipped.
-- Predictions choose which wolves are evaluated and enter nothing else: leaders, memories and the best
+- Memory fusion (eq. 3) takes the unclipped X_GWO; the fused position is clipped.
+- Predictions choose which wolves are evaluated and have no other effect: leaders, memories and the best
   point come from the archive of real evaluations.
 
 With `w_min = w_max = 0`, linear convergence and no surrogate this is GWO, bit for bit.
+
+The surrogate is SciPy's `RBFInterpolator` on inputs scaled to the unit cube, with smoothing 1e-6. The default kernel is
+cubic with a linear tail. The Gaussian one is the classical RBF network with a constant tail; its width follows the rule
+of the largest spacing, sigma = d_max / sqrt(2 M) for M centres (S. Haykin, Neural Networks, 2nd ed., sec. 5.13).
+Repeated points are merged with the mean of their objectives. A failed evaluation counts as the worst successful one, so
+the model steers away from it and is not distorted by infinity.
 """
 
 from __future__ import annotations
 
-from math import cos, pi
+from math import cos, pi, sqrt
 from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial.distance import pdist
 
 from calibray.errors import InputError
 from calibray.optimizers.arguments import choice, real, whole
 from calibray.optimizers.box import Box
-from calibray.optimizers.evaluations import Archive, Evaluations, read_only
+from calibray.optimizers.evaluations import Archive, Evaluations, merge_repeated, read_only
 from calibray.optimizers.gwo import LEADERS, LEAST_BUDGET, WOLVES, encircle, linear_decay
-from calibray.optimizers.protocol import Optimizer
-from calibray.optimizers.scalar_surrogate import KERNELS, predict
-from calibray.optimizers.schedule import Schedule
+from calibray.optimizers.protocol import Optimizer, Schedule
 from calibray.optimizers.session import Search, Session
+
+FULL_ITERATIONS = 5
+"""Iterations that evaluate all wolves (table II)."""
+
+ELITES = 5
+"""K, wolves evaluated in each later iteration (table II)."""
+
+KERNELS = ("cubic", "gaussian")
+SMOOTHING = 1e-6
 
 
 def cosine_decay(iteration: int, iterations: int) -> float:
@@ -52,7 +67,7 @@ def cosine_decay(iteration: int, iterations: int) -> float:
 
 
 def memory_weight(iteration: int, iterations: int, w_min: float, w_max: float) -> float:
-    """The weight of a wolf's own memory (paper eq. 4).
+    """The weight of a wolf's memory (paper eq. 4).
 
     Args:
         iteration: t, from 1.
@@ -68,14 +83,11 @@ def memory_weight(iteration: int, iterations: int, w_min: float, w_max: float) -
 
 CONVERGENCE = {"cosine": cosine_decay, "linear": linear_decay}
 
-# Table II: iterations that evaluate all wolves, and wolves evaluated in each one after.
-FULL_ITERATIONS, ELITES = 5, 5
-
 
 def screened_iterations(budget: int) -> dict[str, int]:
-    """The settings of SGWO-IM that keep to a budget: the paper's schedule at 225, and alike at any other.
+    """The settings of SGWO-IM that keep to a budget: the paper's schedule at 225, and in proportion at any other.
 
-    Two thirds are spent in 5 full iterations, on 30 wolves at most, and the rest on 5 elites an iteration.
+    Two thirds are spent in 5 full iterations, on 30 wolves at most, and the rest on 5 elites per iteration.
 
     Args:
         budget: Number of evaluations.
@@ -100,7 +112,7 @@ class SGWOIM(Optimizer):
     Args:
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        seed: Seed of the one random generator.
+        seed: Seed of the random generator.
         population: N, number of wolves.
         iterations: T.
         full_iterations: Iterations that evaluate the whole population before the surrogate screens.
@@ -108,7 +120,7 @@ class SGWOIM(Optimizer):
         w_min: Memory weight at the start.
         w_max: Memory weight at the end.
         convergence: "cosine" (the paper's eq. 2) or "linear" (standard GWO).
-        surrogate: Whether to screen at all; without it every iteration evaluates the whole population.
+        surrogate: Whether to screen; without it every iteration evaluates the whole population.
         kernel: Radial basis function of the surrogate: "cubic" or "gaussian".
         centred: Measure positions from the middle of the box instead of the origin.
 
@@ -162,16 +174,12 @@ class SGWOIM(Optimizer):
                 f"population * full_iterations = {samples} samples; a surrogate of {d} parameters needs at "
                 f"least {d + 1}: raise population or full_iterations"
             )
-        self.origin = self.box.centre if centred else np.zeros(self.box.dimension)
+        full = min(self.full_iterations, self.iterations) if surrogate else self.iterations
+        self._budget = self.population * full + self.elites * (self.iterations - full)
+        self.origin = self.box.centre if centred else np.zeros(d)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
         self._memory: Evaluations | None = None
         self._session = Session(self.box, self.uses, self._search)
-
-    @property
-    def budget(self) -> int:
-        """Number of evaluations it will ask for."""
-        full = min(self.full_iterations, self.iterations) if self.surrogate else self.iterations
-        return self.population * full + self.elites * (self.iterations - full)
 
     @property
     def leaders(self) -> NDArray[np.float64]:
@@ -195,8 +203,8 @@ class SGWOIM(Optimizer):
         memory = Evaluations(positions, np.full(self.population, np.inf))
         for iteration in range(1, total + 1):
             wolves = self._screen(archive, positions, iteration)
-            told = yield positions[wolves]
-            self._memory = memory = remember(memory, wolves, told)
+            answers = yield positions[wolves]
+            self._memory = memory = remember(memory, wolves, answers)
             a = CONVERGENCE[self.convergence](iteration, total)  # eq. 2
             w = memory_weight(iteration, total, self.w_min, self.w_max)  # eq. 4
             r1, r2 = self._rng.random((2, self.population, LEADERS, self.box.dimension))
@@ -211,18 +219,32 @@ class SGWOIM(Optimizer):
         return np.argsort(predicted, kind="stable")[: self.elites]
 
 
-def remember(memory: Evaluations, wolves: NDArray[np.intp], told: Evaluations) -> Evaluations:
-    """Update the pack's memory, by strict improvement.
+def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations) -> Evaluations:
+    """Update the pack's memory with the answers of evaluated wolves, where a score is strictly lower."""
+    x, y = memory.x.copy(), memory.y.copy()
+    better = answers.y < y[wolves]
+    x[wolves[better]], y[wolves[better]] = answers.x[better], answers.y[better]
+    return Evaluations(read_only(x), read_only(y))
+
+
+def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cubic") -> NDArray[np.float64]:
+    """Predict the objective of candidates from all real evaluations.
 
     Args:
-        memory: The best evaluation of each wolf.
-        wolves: Wolves that were evaluated.
-        told: Their evaluations.
+        archive: The evaluations, with more than d distinct points that span the box.
+        candidates: Points [n, d].
+        kernel: "cubic" or "gaussian".
 
     Returns:
-        The memory after.
+        Predicted objective [n]; all zero while every evaluation has failed.
     """
-    x, y = memory.x.copy(), memory.y.copy()
-    better = told.y < y[wolves]
-    x[wolves[better]], y[wolves[better]] = told.x[better], told.y[better]
-    return Evaluations(read_only(x), read_only(y))
+    if not np.isfinite(archive.best.y):
+        return np.zeros(len(candidates))
+    evaluated = archive.imputed(archive.all())
+    x, y = merge_repeated(archive.box.to_unit(evaluated.x), evaluated.y)
+    if kernel == "gaussian":
+        # phi(r) = exp(-(epsilon r)^2) with epsilon = 1 / (sqrt(2) sigma)
+        settings = {"kernel": "gaussian", "epsilon": sqrt(len(x)) / pdist(x).max(), "degree": 0}
+    else:
+        settings = {"kernel": "cubic", "degree": 1}
+    return RBFInterpolator(x, y, smoothing=SMOOTHING, **settings)(archive.box.to_unit(candidates))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from calibray.optimizers.labels import label
+from calibray.optimizers import label
 from calibray.reporting.link_survey import Survey
 from calibray.reporting.trust_figures import examined
 from calibray.result.record import Record

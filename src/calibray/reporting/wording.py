@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from calibray.optimizers.labels import label
+from calibray.optimizers.methods import label
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.reporting.link_survey import residual
 from calibray.result.record import Record

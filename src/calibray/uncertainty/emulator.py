@@ -22,12 +22,16 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
 from calibray.optimizers.box import Box
-from calibray.optimizers.evaluations import merged
+from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.correction import Corrected, correct
-from calibray.optimizers.multifidelity.discrepancy import Seen
-from calibray.optimizers.multifidelity.sampled_functions import Plausible, drawn, surprise
-from calibray.optimizers.multifidelity.space_mapping import CLOUD, JUDGED, MISLED, misleading
+from calibray.optimizers.multifidelity.sampled_functions import (
+    SampledFunction,
+    sample_function,
+    standardized_error,
+)
+from calibray.optimizers.multifidelity.space_mapping import CLOUD, JUDGED, MISLED, error_ratio
+from calibray.optimizers.regression import Inputs
 from calibray.optimizers.sampling import design
 from calibray.parameters import Parameters
 
@@ -47,13 +51,13 @@ NEAR: Final = 0.005
 class Ground(Protocol):
     """What is known of the links before any call."""
 
-    def seen(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Seen]:
+    def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
         """Path loss [k, m] at points of the unit cube [k, d], and these as the process sees them."""
         ...
 
-    def sloped(
+    def base_and_slope(
         self, unit: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Seen, NDArray[np.float64]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
         """The same with derivatives [k, m, d], and those of the responses [k, r, d]."""
         ...
 
@@ -68,17 +72,17 @@ class Planes:
 
     centre: NDArray[np.float64]
 
-    def seen(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Seen]:
-        """See `Ground.seen`."""
-        return np.tile(self.centre, (len(unit), 1)), Seen(unit, _steepness(unit) * (unit - 0.5))
+    def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
+        """See `Ground.base`."""
+        return np.tile(self.centre, (len(unit), 1)), Inputs(unit, _steepness(unit) * (unit - 0.5))
 
-    def sloped(
+    def base_and_slope(
         self, unit: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Seen, NDArray[np.float64]]:
-        """See `Ground.sloped`."""
-        (count, d), (base, seen) = unit.shape, self.seen(unit)
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
+        """See `Ground.base_and_slope`."""
+        (count, d), (base, inputs) = unit.shape, self.base(unit)
         change = np.broadcast_to(_steepness(unit) * np.eye(d), (count, d, d))
-        return base, np.zeros((*base.shape, d)), seen, change
+        return base, np.zeros((*base.shape, d)), inputs, change
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +154,7 @@ class StandIn:
     materials: dict[str, Material]
     interactions: int
     ground: Ground
-    function: Plausible
+    function: SampledFunction
     links: NDArray[np.int64]
     elsewhere: NDArray[np.float64]
     calls: int = 0
@@ -158,19 +162,19 @@ class StandIn:
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Engine.path_loss`."""
-        base, seen = self.ground.seen(self._unit(candidates))
-        return self._placed(base + self.function.values(seen))
+        base, inputs = self.ground.base(self._unit(candidates))
+        return self._placed(base + self.function.values(inputs))
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See `Differentiable.path_loss_and_jacobian`."""
-        base, slope, seen, change = self.ground.sloped(self._unit(candidates))
+        base, slope, inputs, change = self.ground.base_and_slope(self._unit(candidates))
         box, scale = self._box, self.parameters.search_slope(candidates)
-        slope = (slope + self.function.slopes(seen, change)) / (box.width * scale[:, None, :])
+        slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
         whole = np.zeros((len(candidates), len(self.elsewhere), box.dimension))
         whole[:, self.links] = slope
-        return self._placed(base + self.function.values(seen)), whole
+        return self._placed(base + self.function.values(inputs)), whole
 
     @property
     def _box(self) -> Box:
@@ -227,34 +231,39 @@ def ensemble(problem: Problem, trail: Trail, model: ReplayedModel | None = None)
     corrected = None
     if replayed is not None and len(asked.unit) > 1:
         corrected = _corrected(replayed, box, asked, random, noisy)
-        if len(asked.unit) >= JUDGED and misleading(corrected) > MISLED:
+        if len(asked.unit) >= JUDGED and error_ratio(corrected) > MISLED:
             corrected = None
     if corrected is not None:
         ground: Ground = corrected
-        process = corrected.rest
+        process = corrected.discrepancy
     elif len(asked.unit) >= box.dimension + 2:
         ground, replayed = Planes(asked.loss.mean(axis=0)), None
-        base, seen = ground.seen(asked.unit)
+        base, inputs = ground.base(asked.unit)
         scale = float(np.sqrt(np.mean((asked.loss - base) ** 2)))
-        process = discrepancy.fit(seen, asked.loss - base, max(scale, 1e-6), noisy=noisy)
+        process = discrepancy.fit(inputs, asked.loss - base, max(scale, 1e-6), noisy=noisy)
     else:
         return None
     better = np.argsort(asked.value, kind="stable")[: max(2, len(asked.value) // 2)]
-    stretch = max(1.0, surprise(process, better), surprise(process, np.arange(len(asked.value))))
+    stretch = max(
+        1.0, standardized_error(process, better), standardized_error(process, np.arange(len(asked.value)))
+    )
     cost = asked.loss.size + (0 if replayed is None else _interactions(replayed.engine))
 
-    functions = [drawn(process, random, 0.0), *(drawn(process, random, stretch) for _ in range(FUNCTIONS))]
+    functions = [
+        sample_function(process, random, 0.0),
+        *(sample_function(process, random, stretch) for _ in range(FUNCTIONS)),
+    ]
     mean, *others = (
         StandIn(parameters, problem.engine.materials, cost, ground, each, links, problem.before)
         for each in functions
     )
-    _, seen = ground.seen(design("sobol", CLOUD, box.dimension, random))
-    middle, *apart = (function.values(seen) for function in functions)
+    _, inputs = ground.base(design("sobol", CLOUD, box.dimension, random))
+    middle, *apart = (function.values(inputs) for function in functions)
     return Ensemble(
         mean,
         tuple(others),
         float(np.sqrt(np.mean((np.array(apart) - middle) ** 2))),
-        float(np.sqrt(np.mean(process.left_out()[better] ** 2))),
+        float(np.sqrt(np.mean(process.left_out_errors()[better] ** 2))),
         len(asked.unit),
         replayed,
     )
@@ -267,7 +276,7 @@ def _asked(problem: Problem, trail: Trail, box: Box, links: NDArray[np.int64]) -
     modelled = np.array([*trail.modelled, problem.before])
     loss = objective.capped(modelled)[:, links]
     good = np.isfinite(loss).all(axis=1)
-    unit, both = merged(
+    unit, both = merge_repeated(
         box.to_unit(parameters.to_search(candidates[good])),
         np.column_stack([loss[good], objective.value(modelled[good])]),
     )

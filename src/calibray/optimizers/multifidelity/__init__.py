@@ -1,1 +1,1 @@
-"""Methods that learn an expensive model from few calls: space mapping and vector surrogates."""
+"""Space mapping: a cheap model corrected by few calls of an expensive engine."""

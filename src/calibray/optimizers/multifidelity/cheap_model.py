@@ -1,4 +1,4 @@
-"""What a cheap model of the dear one offers, and one made of a function without derivatives."""
+"""What a cheap model of an expensive engine offers, and a cheap model made of a function without derivatives."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 STEP: Final = 1e-5
-"""Of a coordinate's range, for central differences."""
+"""Step of central differences, as a share of a coordinate's range."""
 
 
 class CheapAnswer(NamedTuple):
-    """What a cheap model answers to n points, each with constants of its own.
+    """The answer of a cheap model to n points, each with one set of constants.
 
     Attributes:
-        residuals: Residuals, in the rows that the dear model is told in [n, m].
+        residuals: Residuals in the order of the engine's residuals [n, m].
         by_point: Their derivatives by the search coordinates [n, m, d].
         by_constant: Their derivatives by the model's constants [n, m, q].
     """
@@ -29,11 +29,11 @@ class CheapAnswer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """What a cheap model takes for granted, and may be told wrongly; the search does not move it.
+    """Constants of a cheap model that the search does not move and that may be wrong.
 
     Attributes:
-        centre: Their believed values [q]; there may be none.
-        spread: Standard deviations of how far off they may be [q].
+        centre: Their believed values [q]; q may be 0.
+        spread: Standard deviations of their errors [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
     """
@@ -48,57 +48,52 @@ class Constants:
         """No constants."""
         return Constants(*(np.zeros(0) for _ in range(4)))
 
+    @property
+    def width(self) -> NDArray[np.float64]:
+        """Upper minus lower bounds [q]."""
+        return self.upper - self.lower
+
+    def draw(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Constants from their prior within the bounds [k, q], from standard normal numbers [k, q]."""
+        return np.clip(self.centre + self.spread * normal, self.lower, self.upper)
+
 
 class CheapModel(Protocol):
-    """A model that costs next to nothing beside the one that is minimised."""
+    """A model whose cost is negligible compared with the engine that is minimised."""
 
     @property
     def constants(self) -> Constants:
-        """Its constants, to be adjusted until it answers as the dear model does."""
+        """Its constants, which are adjusted until it agrees with the engine."""
         ...
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Rows of the residuals that it says something about [m]; of others it gives any number that is constant."""
+        """Residuals that the model predicts [m]; for the others it answers any constant number."""
         ...
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals [n, m] at points of the box [n, d], each with constants of its own [n, q]."""
+        """Residuals [n, m] at points of the box [n, d] with constants [n, q]."""
         ...
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
-        """The same with derivatives."""
+        """Residuals with their derivatives."""
         ...
-
-
-def value_of(model: CheapModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The objective of a cheap model with the constants that it was told, over the rows that it knows.
-
-    Args:
-        model: The model.
-        points: Points of the box [n, d].
-
-    Returns:
-        Root mean square of its residuals [n].
-    """
-    constants = np.repeat(model.constants.centre[None], len(points), axis=0)
-    return np.sqrt(np.mean(model.residuals(points, constants)[:, model.known] ** 2, axis=1))
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Differenced:
-    """A cheap model of a function, its derivatives by central differences.
+class FunctionModel:
+    """A cheap model given as a function; its derivatives are central differences.
 
     Attributes:
         function: Points [n, d] and constants [n, q] to residuals [n, m].
         width: Range of each search coordinate [d].
-        known: Rows that it says something about [m].
+        known: Residuals that the function predicts [m].
         constants: Its constants.
 
     Example:
         >>> import numpy as np
-        >>> model = Differenced(lambda x, c: x**2, np.ones(1), np.ones(1, dtype=bool))
+        >>> model = FunctionModel(lambda x, c: x**2, np.ones(1), np.ones(1, dtype=bool))
         >>> model.answer(np.array([[3.0]]), np.zeros((1, 0))).by_point.round(6).tolist()
         [[[6.0]]]
     """
@@ -114,10 +109,10 @@ class Differenced:
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """See `CheapModel.answer`."""
-        d, joined = points.shape[1], np.hstack([points, constants])
-        step = STEP * np.concatenate([self.width, self.constants.upper - self.constants.lower])
+        d, arguments = points.shape[1], np.hstack([points, constants])
+        step = STEP * np.concatenate([self.width, self.constants.width])
         moves = np.concatenate([np.diag(step), -np.diag(step)])
-        moved = (joined + moves[:, None]).reshape(-1, joined.shape[1])
+        moved = (arguments + moves[:, None]).reshape(-1, arguments.shape[1])
         values = self.function(moved[:, :d], moved[:, d:]).reshape(2, len(step), len(points), -1)
         slopes = np.moveaxis((values[0] - values[1]) / (2.0 * step[:, None, None]), 0, -1)
         return CheapAnswer(self.function(points, constants), slopes[:, :, :d], slopes[:, :, d:])

@@ -1,11 +1,11 @@
-"""A cheap model, corrected until it answers as the dear one does: its constants adjusted, and what remains modelled.
+"""A cheap model corrected until it agrees with the engine: first its constants, then the remaining discrepancy.
 
-*Input mapping*: the constants that the cheap model takes for granted are those that explain the dear model's answers
-best. Errors are weighed by the covariance of what remains, which is common to an offset and little else, so that an
-offset of a link is no reason to bend a constant; and the constants have a prior around what they are believed to be.
-Walls resonate, so that there are many minima: the search starts from the likeliest of many draws from that prior.
-This is implicit space mapping (J. W. Bandler, Q. S. Cheng, N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory
-Tech. 52 (2004) 378). *Output mapping*: offset, slope and rest by `discrepancy.py`. The two are fitted in turns.
+*Input mapping*: the constants of the cheap model are set to those that explain the engine's answers best. Errors are
+weighted by the covariance of the discrepancy, most of which is a common offset. So an offset of a link does not bend a
+constant. The constants have a prior around their believed values. Slabs resonate, so there are many minima: the search
+starts from the likeliest of many draws from that prior. This is implicit space mapping (J. W. Bandler, Q. S. Cheng,
+N. K. Nikolova, M. A. Ismail, IEEE Trans. Microw. Theory Tech. 52 (2004) 378). *Output mapping*: offset, slope and rest
+by `discrepancy.py`. Both are fitted in turns.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.optimizers.box import Box
-from calibray.optimizers.descent import Residuals, Starts, descend
+from calibray.optimizers.descent import Residuals, descend_all
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
-from calibray.optimizers.multifidelity.discrepancy import Discrepancy, Seen
+from calibray.optimizers.regression import Inputs, Kernel, Process
 
 TURNS: Final = 2
 """Rounds of output and input mapping."""
@@ -30,18 +30,23 @@ STEPS: Final = 12
 """Steps of an input mapping from one start."""
 
 FOLLOWED: Final = 8
-"""Trials, those that explain the answers best, that an input mapping starts from."""
+"""Draws from the prior, those that explain the answers best, from which an input mapping starts."""
+
+CONVERGED: Final = 1e-4
+"""Relative decrease of the cost, or step in the unit cube, at which an input mapping has converged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What a cheap model does over the box.
+    """The response of a cheap model over the box.
 
     Attributes:
+        known: Residuals that the model predicts [m].
         centre: Mean of its residuals [m].
-        scale: Root mean square of what they do around it.
+        scale: Root mean square of their deviations from it.
     """
 
+    known: NDArray[np.bool_]
     centre: NDArray[np.float64]
     scale: float
 
@@ -51,27 +56,35 @@ class Response:
 
         Args:
             residuals: Residuals at points spread over the box [k, m].
-            known: Rows that the model says something about [m].
+            known: Residuals that the model predicts [m].
 
         Returns:
             The response.
         """
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
-        return Response(centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
+        return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
+
+    def inputs(self, unit: NDArray[np.float64], residuals: NDArray[np.float64]) -> Inputs:
+        """Points of the unit cube [k, d] as the discrepancy sees them, from the cheap model's residuals [k, m]."""
+        return Inputs(unit, self.scaled(residuals - self.centre))
+
+    def scaled(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The predicted ones of the residuals [k, m, ...], scaled to a mean square of 1 together [k, r, ...]."""
+        return rows[:, self.known] / (self.scale * np.sqrt(max(int(self.known.sum()), 1)))
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A cheap model with what it leaves unexplained.
+    """A cheap model with its discrepancy.
 
     Attributes:
         model: The cheap model.
         box: The box searched.
         constants: Its constants as adjusted [q].
-        response: What it does over the box.
-        residuals: What the dear model answered [n, m].
-        rest: What remains.
+        response: Its response over the box.
+        residuals: Answers of the engine [n, m].
+        discrepancy: The discrepancy.
     """
 
     model: CheapModel
@@ -79,12 +92,17 @@ class Corrected:
     constants: NDArray[np.float64]
     response: Response
     residuals: NDArray[np.float64]
-    rest: Discrepancy
+    discrepancy: Process
+
+    @property
+    def unit(self) -> NDArray[np.float64]:
+        """The evaluated points, in the unit cube [n, d]."""
+        return self.discrepancy.inputs.unit
 
     @property
     def root(self) -> NDArray[np.float64]:
-        """Factor of the covariance of the residuals, as in `Discrepancy.root`."""
-        return self.rest.root
+        """Factor of the covariance of the residuals, as in `Process.root`."""
+        return self.discrepancy.root
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Predict residuals.
@@ -93,68 +111,57 @@ class Corrected:
             unit: Points of the unit cube [k, d].
 
         Returns:
-            Mean [k, m], and the variance by that of each residual [k].
+            Mean [k, m], and the variance relative to that of each residual [k].
         """
-        cheap, seen = self.seen(unit)
-        mean, share = self.rest.predict(seen)
+        cheap, inputs = self.base(unit)
+        mean, share = self.discrepancy.predict(inputs)
         return cheap + mean, share
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict residuals and their derivatives.
+        """Predicted residuals [k, m] and their Jacobian [k, m, d] at points of the unit cube [k, d]."""
+        cheap, slope, inputs, response_slope = self.base_and_slope(unit)
+        return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
+
+    def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
+        """Residuals of the cheap model with adjusted constants.
 
         Args:
             unit: Points of the unit cube [k, d].
 
         Returns:
-            Mean [k, m] and Jacobian by the coordinates of the unit cube [k, m, d].
+            Residuals [k, m], and the points as the discrepancy sees them.
         """
-        cheap, slope, seen, change = self.sloped(unit)
-        mean, _ = self.rest.predict(seen)
-        return cheap + mean, slope + self.rest.slope(seen, change)
+        cheap = cheap_residuals(self.model, self.box, unit, self.constants)
+        return cheap, self.response.inputs(unit, cheap)
 
-    def seen(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Seen]:
-        """What the cheap model says, its constants adjusted.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Residuals [k, m], and the points as the rest sees them.
-        """
-        cheap = _cheap(self.model, self.box, unit, self.constants)
-        return cheap, _seen(self.model, self.response, unit, cheap)
-
-    def sloped(
+    def base_and_slope(
         self, unit: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Seen, NDArray[np.float64]]:
-        """The same with derivatives by the coordinates of the unit cube.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
+        """Residuals of the cheap model with adjusted constants, and derivatives by the coordinates of the unit cube.
 
         Args:
             unit: Points of the unit cube [k, d].
 
         Returns:
-            Residuals [k, m], their derivatives [k, m, d], the points as the rest sees them, and the derivatives of
-            what it sees [k, r, d].
+            Residuals [k, m], their derivatives [k, m, d], the points as the discrepancy sees them, and the derivatives
+            of their responses [k, r, d].
         """
         cheap, slope = cheap_and_slope(self.model, self.box, unit, self.constants)
-        seen = _seen(self.model, self.response, unit, cheap)
-        return cheap, slope, seen, _known(self.model, self.response, slope)
+        return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
 
-    def with_point(self, point: NDArray[np.float64], told: NDArray[np.float64]) -> Corrected:
-        """Pretend that a point had been evaluated.
+    def with_point(self, point: NDArray[np.float64], residuals: NDArray[np.float64]) -> Corrected:
+        """Add a point of the unit cube [d] as if evaluated with these residuals [1, m]."""
+        unit, answers = np.vstack([self.unit, point]), np.vstack([self.residuals, residuals])
+        cheap, inputs = self.base(unit)
+        process = discrepancy.solve(inputs, answers - cheap, self.discrepancy.kernel)
+        return replace(self, residuals=answers, discrepancy=process)
 
-        Args:
-            point: The point of the unit cube [d].
-            told: Its residuals [1, m].
-
-        Returns:
-            A model certain at that point too.
-        """
-        unit = np.vstack([self.rest.seen.unit, point])
-        residuals = np.vstack([self.residuals, told])
-        cheap, seen = self.seen(unit)
-        rest = discrepancy.solve(seen, residuals - cheap, self.rest.hyper, self.rest.scale)
-        return replace(self, residuals=residuals, rest=rest)
+    def with_constants(self, constants: NDArray[np.float64]) -> Corrected:
+        """Other constants [q], with a discrepancy through the same answers and with the same kernel."""
+        moved = replace(self, constants=constants)
+        cheap, inputs = moved.base(self.unit)
+        process = discrepancy.solve(inputs, self.residuals - cheap, self.discrepancy.kernel)
+        return replace(moved, discrepancy=process)
 
 
 def correct(
@@ -168,83 +175,59 @@ def correct(
     noisy: bool = False,
     before: Corrected | None = None,
 ) -> Corrected:
-    """Fit a corrected model to what a dear one answered.
+    """Fit a corrected model to the answers of an engine.
 
     Args:
         model: The cheap model.
         box: The box searched.
-        unit: The points evaluated, in the unit cube [n, d].
+        unit: The evaluated points, in the unit cube [n, d].
         residuals: The answers [n, m].
         cloud: Points spread over the unit cube, at which the cheap model's response is measured [k, d].
-        trials: Constants, the likeliest of which the input mapping starts from, beside those before [s, q].
+        trials: Constants; the input mapping starts from the likeliest of them and from those before [s, q].
         noisy: Whether the answers scatter.
         before: The model of fewer points, to go on from.
 
     Returns:
         The model.
     """
+
+    def with_discrepancy(constants: NDArray[np.float64], guess: tuple[Kernel, float] | None) -> Corrected:
+        response = Response.of(cheap_residuals(model, box, cloud, constants), model.known)
+        cheap = cheap_residuals(model, box, unit, constants)
+        # The kernel's variances are relative to the response, which depends on the constants.
+        kernel = None if guess is None else Kernel.of(guess[0].logarithms(guess[1]), response.scale)
+        process = discrepancy.fit(
+            response.inputs(unit, cheap), residuals - cheap, response.scale, noisy=noisy, guess=kernel
+        )
+        return Corrected(model, box, constants, response, residuals, process)
+
+    def guess(corrected: Corrected) -> tuple[Kernel, float]:
+        return corrected.discrepancy.kernel, corrected.response.scale
+
     constants = model.constants.centre if before is None else before.constants
-    hyper = None if before is None else before.rest.hyper
-
-    def around(constants: NDArray[np.float64], hyper: NDArray[np.float64] | None) -> Corrected:
-        response = Response.of(_cheap(model, box, cloud, constants), model.known)
-        cheap = _cheap(model, box, unit, constants)
-        seen = _seen(model, response, unit, cheap)
-        rest = discrepancy.fit(seen, residuals - cheap, response.scale, noisy=noisy, guess=hyper)
-        return Corrected(model, box, constants, response, residuals, rest)
-
-    corrected = around(constants, hyper)
+    corrected = with_discrepancy(constants, None if before is None else guess(before))
     for _ in range(TURNS if len(constants) else 0):
         constants = _adjusted(corrected, trials)
         moved = np.abs(constants - corrected.constants).max() > 1e-3 * model.constants.spread.max()
-        corrected, trials = around(constants, corrected.rest.hyper), trials[:0]
+        corrected, trials = with_discrepancy(constants, guess(corrected)), trials[:0]
         if not moved:
             break
     return corrected
 
 
+def cheap_residuals(
+    model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m]."""
+    return model.residuals(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
+
+
 def cheap_and_slope(
     model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A cheap model's residuals, and their derivatives by the coordinates of the unit cube.
-
-    Args:
-        model: The cheap model.
-        box: The box searched.
-        unit: Points of the unit cube [k, d].
-        constants: The model's constants [q].
-
-    Returns:
-        Residuals [k, m] and Jacobian [k, m, d].
-    """
-    told = model.answer(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
-    return told.residuals, told.by_point * box.width
-
-
-def descended(
-    unit: NDArray[np.float64],
-    evaluate: Callable[[NDArray[np.float64]], Residuals],
-    steps: int,
-    tolerance: float,
-) -> Starts:
-    """Descend from many points of the unit cube.
-
-    Args:
-        unit: The points [s, d].
-        evaluate: Residuals and their Jacobian.
-        steps: Largest number of steps.
-        tolerance: Relative decrease of the cost at which a search has converged.
-
-    Returns:
-        Where the searches ended.
-    """
-    descent = descend(unit, steps, tolerance)
-    point = next(descent)
-    while True:
-        try:
-            point = descent.send(evaluate(point))
-        except StopIteration as end:
-            return end.value
+    """Residuals of a cheap model with constants [q] at points of the unit cube [k, m], and Jacobian [k, m, d]."""
+    answer = model.answer(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
+    return answer.residuals, answer.by_point * box.width
 
 
 def constants_fit(
@@ -252,85 +235,68 @@ def constants_fit(
     centre: NDArray[np.float64] | None = None,
     noise: NDArray[np.float64] | None = None,
 ) -> Callable[[NDArray[np.float64]], Residuals]:
-    """The least squares problem of the constants, the covariance of what remains kept.
+    """The least squares problem of the constants, with the covariance of the discrepancy held.
 
     Args:
         corrected: The model whose constants are fitted.
         centre: Centre of their prior [q]; that of the cheap model if None.
-        noise: What the answers are disturbed by, in their standard deviations [n m]; nothing if None.
+        noise: Disturbance of the answers, in their standard deviations [n m]; none if None.
 
     Returns:
-        Constants, in the unit cube between their bounds [s, q], to rows and their Jacobian; half the sum of squares of
-        the rows is their negative log density.
+        A function of constants, in the unit cube between their bounds [s, q], that gives rows and their Jacobian; half
+        the sum of squares of the rows is the negative log density.
     """
-    model, rest, given = corrected.model, corrected.rest, corrected.model.constants
-    points, width = corrected.box.from_unit(rest.seen.unit), given.upper - given.lower
-    (count, links), size = corrected.residuals.shape, len(given.centre)
-    whiten = np.linalg.inv(rest.lower)
-    weight = np.sqrt(rest.precision)
-    prior_slope = np.diag(width / given.spread)
-    believed = given.centre if centre is None else centre
+    model, process, prior = corrected.model, corrected.discrepancy, corrected.model.constants
+    points, width = corrected.box.from_unit(corrected.unit), prior.width
+    (count, links), size = corrected.residuals.shape, len(prior.centre)
+    whiten = np.linalg.inv(process.lower)
+    weight = np.sqrt(process.precision)
+    prior_slope = np.diag(width / prior.spread)
+    believed = prior.centre if centre is None else centre
     shift = np.zeros(count * links) if noise is None else noise
 
     def evaluate(unit: NDArray[np.float64]) -> Residuals:
-        constants = given.lower + unit * width
-        told = model.answer(np.tile(points, (len(unit), 1)), np.repeat(constants, count, axis=0))
-        remains = corrected.residuals - told.residuals.reshape(-1, count, links)
-        rows = (whiten @ remains * weight).reshape(len(unit), -1) + shift
-        slope = told.by_constant.reshape(-1, count, links * size)
+        constants = prior.lower + unit * width
+        answer = model.answer(np.tile(points, (len(unit), 1)), np.repeat(constants, count, axis=0))
+        errors = corrected.residuals - answer.residuals.reshape(-1, count, links)
+        rows = (whiten @ errors * weight).reshape(len(unit), -1) + shift
+        slope = answer.by_constant.reshape(-1, count, links * size)
         slope = -(whiten @ slope).reshape(-1, count, links, size) * weight[:, None] * width
-        rows = np.hstack([rows, (constants - believed) / given.spread])
-        prior = np.broadcast_to(prior_slope, (len(unit), size, size))
-        return rows, np.concatenate([slope.reshape(len(unit), -1, size), prior], axis=1)
+        rows = np.hstack([rows, (constants - believed) / prior.spread])
+        prior_rows = np.broadcast_to(prior_slope, (len(unit), size, size))
+        return rows, np.concatenate([slope.reshape(len(unit), -1, size), prior_rows], axis=1)
 
     return evaluate
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How badly constants explain the answers, the covariance of what remains kept.
+    """Negative log density of constants, with the kernel of the discrepancy held.
+
+    The variances of the links are integrated out. So a link that the present constants do not explain counts fully for
+    others that may.
 
     Args:
         corrected: The model whose constants are judged.
         constants: Constants [s, q].
 
     Returns:
-        Their negative log density, but for a term that all have [s]. Variances of links are integrated out, so that
-        links which other constants did not explain count again.
+        Their negative log density up to a constant [s].
     """
-    model, rest, given = corrected.model, corrected.rest, corrected.model.constants
-    points, (count, links) = corrected.box.from_unit(rest.seen.unit), corrected.residuals.shape
-    told = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
-    rows = np.linalg.inv(rest.lower) @ (corrected.residuals - told.reshape(-1, count, links))
-    return discrepancy.negative_log_density(rows) + 0.5 * np.sum(
-        ((constants - given.centre) / given.spread) ** 2, axis=1
-    )
+    model, prior = corrected.model, corrected.model.constants
+    points, (count, links) = corrected.box.from_unit(corrected.unit), corrected.residuals.shape
+    cheap = model.residuals(np.tile(points, (len(constants), 1)), np.repeat(constants, count, axis=0))
+    errors = corrected.residuals - cheap.reshape(-1, count, links)
+    rows = np.linalg.inv(corrected.discrepancy.lower) @ errors
+    away = (constants - prior.centre) / prior.spread
+    return discrepancy.negative_log_density(rows) + 0.5 * np.sum(away**2, axis=1)
 
 
 def _adjusted(corrected: Corrected, trials: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The constants [q] that explain the answers best, the covariance of what remains kept."""
-    given, own = corrected.model.constants, corrected.constants[None]
-    width = given.upper - given.lower
-    likely = (
-        trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]] if len(trials) else trials
-    )
-    starts = (np.vstack([own, likely]) - given.lower) / width
-    ended = descended(starts, constants_fit(corrected), STEPS, 1e-4)
-    found = np.vstack([own, given.lower + ended.unit * width])
-    return found[np.argmin(misfit(corrected, found))]
-
-
-def _cheap(
-    model: CheapModel, box: Box, unit: NDArray[np.float64], constants: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return model.residuals(box.from_unit(unit), np.tile(constants, (len(unit), 1)))
-
-
-def _seen(
-    model: CheapModel, response: Response, unit: NDArray[np.float64], cheap: NDArray[np.float64]
-) -> Seen:
-    return Seen(unit, _known(model, response, (cheap - response.centre)[:, :, None])[:, :, 0])
-
-
-def _known(model: CheapModel, response: Response, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows [k, m, ...] of which the cheap model knows something, scaled to a mean square of 1 together."""
-    return rows[:, model.known] / (response.scale * np.sqrt(max(int(model.known.sum()), 1)))
+    """The constants [q] that explain the answers best, with the kernel of the discrepancy held."""
+    prior, present = corrected.model.constants, corrected.constants[None]
+    if len(trials):
+        trials = trials[np.argsort(misfit(corrected, trials), kind="stable")[:FOLLOWED]]
+    starts = (np.vstack([present, trials]) - prior.lower) / prior.width
+    ends = descend_all(starts, constants_fit(corrected), STEPS, CONVERGED)
+    candidates = np.vstack([present, prior.lower + ends.unit * prior.width])
+    return candidates[np.argmin(misfit(corrected, candidates))]

@@ -1,11 +1,11 @@
-"""Functions that a fitted process deems possible, each drawn whole.
+"""Functions drawn from the posterior of a discrepancy, each one whole.
 
-Where a process is uncertain, it says how much at every point; what it does not say is that errors at two near points
-are one and the same. Who asks where the minimum of a function may lie needs whole functions. One is drawn from the
-prior, as a sum of the process's features with normal weights, and what it misses at the evaluated points is added by
-the process itself (J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020,
-eq. 10). Features of the Matern kernel are cosines whose frequencies follow Student's t with 5 degrees of freedom
-(A. Rahimi, B. Recht, Random features for large-scale kernel machines, NIPS 2007).
+A process states its uncertainty point by point, but errors at two near points are the same error. To learn where the
+minimum of an uncertain function may lie one needs whole functions. A function is drawn from the prior, as a sum of the
+kernel's features with normal weights. The process then adds what that function misses at the evaluated points
+(J. T. Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020, eq. 10). Features of
+the Matern kernel are cosines whose frequencies follow Student's t with 5 degrees of freedom (A. Rahimi, B. Recht,
+Random features for large-scale kernel machines, NIPS 2007).
 """
 
 from __future__ import annotations
@@ -17,114 +17,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.discrepancy import FREEDOM, Discrepancy, Seen
+from calibray.optimizers.multifidelity.discrepancy import FREEDOM
+from calibray.optimizers.regression import Inputs, Process
 
 COSINES: Final = 256
 """Features of the Matern kernel."""
 
 SMOOTHNESS: Final = 5.0
-"""Twice that of the kernel."""
+"""Degrees of freedom of the frequencies: twice the smoothness of the kernel."""
 
 
 @dataclass(frozen=True, eq=False)
-class Plausible:
-    """A function that passes through the evaluated points.
+class PriorDraw:
+    """A function drawn from the prior: an offset, slopes by the responses, and cosines.
 
     Attributes:
-        offset: Its value but for all that follows [m].
-        steep: Its slopes by the responses [r, m].
-        frequency: Of its cosines [k, d].
-        phase: Theirs [k].
-        height: Theirs [k, m].
-        rest: What all that misses at the evaluated points.
+        offset: Constant part [m].
+        steepness: Slopes by the responses [r, m].
+        frequency: Frequencies of the cosines [k, d].
+        phase: Phases of the cosines [k].
+        amplitude: Amplitudes of the cosines [k, m].
     """
 
     offset: NDArray[np.float64]
-    steep: NDArray[np.float64]
+    steepness: NDArray[np.float64]
     frequency: NDArray[np.float64]
     phase: NDArray[np.float64]
-    height: NDArray[np.float64]
-    rest: Discrepancy
+    amplitude: NDArray[np.float64]
 
-    def values(self, seen: Seen) -> NDArray[np.float64]:
-        """Evaluate it.
+    def values(self, at: Inputs) -> NDArray[np.float64]:
+        """Values at points [k, m]."""
+        cosines = np.cos(at.unit @ self.frequency.T + self.phase)
+        return self.offset + at.response @ self.steepness + cosines @ self.amplitude
 
-        Args:
-            seen: Points.
+    def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives at points [k, m, d], from those of their responses [k, r, d]."""
+        sines = -np.sin(at.unit @ self.frequency.T + self.phase)[:, :, None] * self.frequency
+        waves = np.einsum("kfd,fm->kmd", sines, self.amplitude, optimize=True)
+        return waves + np.einsum("krd,rm->kmd", response_slope, self.steepness, optimize=True)
 
-        Returns:
-            Values [k, m].
-        """
-        return self._prior(seen) + self.rest.predict(seen)[0]
 
-    def slopes(self, seen: Seen, change: NDArray[np.float64]) -> NDArray[np.float64]:
+@dataclass(frozen=True, eq=False)
+class SampledFunction:
+    """A function that passes through the evaluated points.
+
+    Attributes:
+        prior: A draw from the prior.
+        rest: Process through what the draw misses at the evaluated points.
+    """
+
+    prior: PriorDraw
+    rest: Process
+
+    def values(self, at: Inputs) -> NDArray[np.float64]:
+        """Values at points [k, m]."""
+        return self.prior.values(at) + self.rest.mean(at)
+
+    def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """Its derivatives.
 
         Args:
-            seen: Points.
-            change: Derivatives of their responses by the coordinates of the unit cube [k, r, d].
+            at: Points [k].
+            response_slope: Derivatives of their responses by the coordinates of the unit cube [k, r, d].
 
         Returns:
             Derivatives by these coordinates [k, m, d].
         """
-        bent = -np.sin(seen.unit @ self.frequency.T + self.phase)[:, :, None] * self.frequency
-        waves = np.einsum("kfd,fm->kmd", bent, self.height, optimize=True)
-        lines = np.einsum("krd,rm->kmd", change, self.steep, optimize=True)
-        return waves + lines + self.rest.slope(seen, change)
-
-    def _prior(self, seen: Seen) -> NDArray[np.float64]:
-        waves = np.cos(seen.unit @ self.frequency.T + self.phase)
-        return self.offset + seen.response @ self.steep + waves @ self.height
+        return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
-def drawn(process: Discrepancy, random: np.random.Generator, stretch: float = 1.0) -> Plausible:
+def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
     """Draw a function.
 
     Args:
         process: The process.
         random: Random numbers.
-        stretch: Factor of its deviations from the mean.
+        stretch: Factor of its deviations from the mean; 0 gives the mean.
 
     Returns:
         The function.
     """
-    seen, (d, links) = process.seen, (process.seen.unit.shape[1], process.remains.shape[1])
-    size = stretch * process.scale * np.exp(0.5 * process.hyper)
-    rates = np.exp(process.hyper[3 : 3 + d])
+    inputs, kernel = process.inputs, process.kernel
+    (count, d), residuals = inputs.unit.shape, process.values.shape[1]
+    size = stretch * np.sqrt(kernel.variances)
 
-    def rows(count: int) -> NDArray[np.float64]:
-        """Normal draws with the covariance of the residuals [count, m], as by `Discrepancy.root`."""
-        known, (points, _) = process.whitened, process.whitened.shape
-        own = np.sqrt(FREEDOM) * random.standard_normal((count, links))
-        return (random.standard_normal((count, points)) @ known + own) / np.sqrt(points + FREEDOM)
+    def correlated(rows: int) -> NDArray[np.float64]:
+        """Normal draws with the covariance of the residuals [rows, m], as by `Process.root`."""
+        independent = np.sqrt(FREEDOM) * random.standard_normal((rows, residuals))
+        draws = random.standard_normal((rows, count)) @ process.whitened
+        return (draws + independent) / np.sqrt(count + FREEDOM)
 
+    # A t distribution is a normal one divided by the root of a chi-square.
     tail = np.sqrt(random.chisquare(SMOOTHNESS, (COSINES, 1)) / SMOOTHNESS)
-    prior = Plausible(
-        size[0] * rows(1)[0],
-        size[1] * rows(seen.response.shape[1]),
-        rates * random.standard_normal((COSINES, d)) / tail,
+    prior = PriorDraw(
+        size[0] * correlated(1)[0],
+        size[1] * correlated(inputs.response.shape[1]),
+        kernel.rates * random.standard_normal((COSINES, d)) / tail,
         random.uniform(0.0, 2.0 * np.pi, COSINES),
-        size[2] * np.sqrt(2.0 / COSINES) * rows(COSINES),
-        process,
+        size[2] * np.sqrt(2.0 / COSINES) * correlated(COSINES),
     )
-    scatter = stretch * process.scale * np.exp(0.5 * process.hyper[-1]) * rows(len(seen.unit))
-    missed = process.remains - prior._prior(seen) - scatter
-    return Plausible(
-        prior.offset, prior.steep, prior.frequency, prior.phase, prior.height,
-        discrepancy.solve(seen, missed, process.hyper, process.scale),
-    )  # fmt: skip
+    scatter = stretch * np.sqrt(kernel.nugget) * correlated(count)
+    missed = process.values - prior.values(inputs) - scatter
+    return SampledFunction(prior, discrepancy.solve(inputs, missed, kernel))
 
 
-def surprise(process: Discrepancy, points: NDArray[np.intp]) -> float:
-    """By how much errors at points that are left out exceed what the process expects of them.
+def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
+    """Errors at points that are left out, relative to what the process expects of them.
 
     Args:
         process: The process.
-        points: Places of the points.
+        points: Indices of the points.
 
     Returns:
-        Root mean square of the errors over their standard deviations; 1 where the process knows itself.
+        Root mean square of the errors over their standard deviations; 1 where the stated uncertainty is right.
     """
-    inverse = np.linalg.inv(process.lower @ process.lower.T)
-    expected = 1.0 / np.outer(np.diag(inverse), process.precision)
-    return float(np.sqrt(np.mean((process.left_out() ** 2 / expected)[points])))
+    expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
+    return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

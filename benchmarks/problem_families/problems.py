@@ -1,4 +1,4 @@
-"""Problems with a known minimum that methods are compared on: landscapes in closed form, and planted problems."""
+"""Problems with a known minimum for comparing methods: landscapes in closed form, and planted problems."""
 
 from __future__ import annotations
 
@@ -8,38 +8,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.comparison.problems import Arena
+from calibray.comparison.problem import ComparisonProblem
 from calibray.fitting.cheap_replay import ReplayedModel, with_constants
 from calibray.fitting.problem import Evaluation
 from problem_families import landscapes
 from problem_families.family import PlantedProblem, problem
-from problem_families.numpy_replay import Direct
+from problem_families.numpy_replay import NumpyReplay
 
 
-def landscape_arena(name: str) -> Arena:
-    """A landscape of `problem_families.landscapes`.
-
-    Args:
-        name: The function that makes it.
-
-    Returns:
-        The arena.
-    """
+def landscape_problem(name: str) -> ComparisonProblem:
+    """A landscape of `problem_families.landscapes`, by the name of the function that makes it."""
     land: landscapes.Landscape = getattr(landscapes, name)()
 
     def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
         value, residuals, jacobian = land.evaluate(points)
         return Evaluation(value, residuals, jacobian if derivatives else None, residuals, value)
 
-    known = float(np.nan_to_num(land.minimum, nan=np.inf))
+    minimum = float(np.nan_to_num(land.minimum, nan=np.inf))
     middle = 0.5 * (land.lower + land.upper)
     digest = hashlib.sha256(name.encode())
     for part in (land.lower, land.upper, *land.evaluate(middle[None])):
         digest.update(np.round(part, 9).astype("<f8").tobytes())
-    return Arena(name, digest.hexdigest(), land.lower, land.upper, None, None, False, known, evaluate)
+    return ComparisonProblem(
+        name, digest.hexdigest(), land.lower, land.upper, None, None, False, minimum, evaluate
+    )
 
 
-def family_arena(kind: str, seed: int) -> Arena:
+def planted_problem(kind: str, seed: int) -> ComparisonProblem:
     """A planted problem of `problem_families.family`, whose lowest objective is known.
 
     Args:
@@ -47,7 +42,7 @@ def family_arena(kind: str, seed: int) -> Arena:
         seed: Its seed.
 
     Returns:
-        The arena.
+        The problem.
 
     Raises:
         InputError: There is no such family.
@@ -55,10 +50,10 @@ def family_arena(kind: str, seed: int) -> Arena:
     planted = problem(seed, kind)
 
     def evaluate(points: NDArray[np.float64], derivatives: bool) -> Evaluation:
-        told = planted.told(points, derivatives)
-        return Evaluation(*told, told.residuals, told.value)
+        answer = planted.evaluate(points, derivatives)
+        return Evaluation(*answer, answer.residuals, answer.value)
 
-    return Arena(
+    return ComparisonProblem(
         f"{kind}-{seed}",
         planted.fingerprint,
         planted.lower,
@@ -68,15 +63,14 @@ def family_arena(kind: str, seed: int) -> Arena:
         False,
         planted.minimum_rmse_db,
         evaluate,
-        planted.cheap_rmse_db,
-        lambda: planted_model(planted),
-        planted.differences.misinformed,
+        lambda: cheap_model(planted),
+        planted.differences.wrong_constants,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class PlantedRows:
-    """The residuals of a planted problem, each transmitter's offset taken out.
+    """The residuals of a planted problem, with each transmitter's offset eliminated.
 
     Attributes:
         planted: The problem.
@@ -102,20 +96,13 @@ class PlantedRows:
     def slopes(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """See `Rows.slopes`; residuals are linear in what path loss has beyond the measurements."""
+        """See `Rows.slopes`; residuals are linear in the path loss minus the measurements."""
         rows = np.moveaxis(slope, 1, -1)
         return np.moveaxis(self.planted.residuals(self.planted.measured + rows), -1, 1)
 
 
-def planted_model(planted: PlantedProblem) -> ReplayedModel:
-    """The cheap model of a planted problem, with the constants that it was told.
-
-    Args:
-        planted: The problem.
-
-    Returns:
-        The model.
-    """
+def cheap_model(planted: PlantedProblem) -> ReplayedModel:
+    """The cheap model of a planted problem, with its believed constants."""
     paths = planted.cheap.paths
-    engine = Direct(paths, with_constants(planted.parameters, paths.materials))
+    engine = NumpyReplay(paths, with_constants(planted.parameters, paths.materials))
     return ReplayedModel(engine, len(planted.parameters), PlantedRows(planted))

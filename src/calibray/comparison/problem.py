@@ -1,4 +1,4 @@
-"""The problem that methods are compared on: a study on its stored paths."""
+"""A problem on which methods are compared, and one made of a study on its stored paths."""
 
 from __future__ import annotations
 
@@ -19,27 +19,25 @@ from calibray.fitting.noise_level import weighed
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Evaluate
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
-from calibray.optimizers.screened import Screen
 from calibray.study import Setup, Study
 
 
 @dataclass(frozen=True, eq=False)
-class Arena:
-    """A problem that any method can be run on.
+class ComparisonProblem:
+    """A problem on which any method can be run.
 
     Attributes:
         name: Its name.
-        fingerprint: All that an answer depends on.
+        fingerprint: Digest of everything that an evaluation depends on.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Where a user would start [d]; None if that is nowhere in particular.
-        starts: Further starting points for the methods that take them; their own number if None.
-        large: Whether an evaluation is so dear that searches from few starts have to do.
-        minimum: Lowest objective known beforehand; +inf if none is.
-        evaluate: What is searched.
-        screen: The objective of a cheap model of it; None where there is none.
-        model: Makes that cheap model anew, for methods that correct it; None where there is none.
-        misinformed: Whether that cheap model is told wrong constants.
+        start: Starting point of a user [d]; None if there is none.
+        starts: Further starting points for methods that take them; their default if None.
+        large: Whether evaluations are so expensive that the reference search has few starts.
+        minimum: Lowest objective known beforehand; +inf if unknown.
+        evaluate: The function that is minimised.
+        cheap_model: Makes a cheap model of it; None if there is none.
+        wrong_constants: Whether that cheap model has wrong constants.
     """
 
     name: str
@@ -51,19 +49,18 @@ class Arena:
     large: bool
     minimum: float
     evaluate: Evaluate
-    screen: Screen | None = None
-    model: Callable[[], CheapModel] | None = None
-    misinformed: bool = False
+    cheap_model: Callable[[], CheapModel] | None = None
+    wrong_constants: bool = False
 
 
-def study_arena(path: str | Path) -> Arena:
+def study_problem(path: str | Path) -> ComparisonProblem:
     """A study on its stored paths, which are traced if they are not in the cache.
 
     Args:
         path: The study file.
 
     Returns:
-        The arena.
+        The problem.
 
     Raises:
         InputError: The study cannot be used, or its engine is an external program.
@@ -71,8 +68,8 @@ def study_arena(path: str | Path) -> Arena:
     study = Study.load(path)
     if study.engine.external:
         raise InputError(
-            f"{path}: engine {study.engine.name!r} is too dear for hundreds of runs; methods are compared on stored "
-            "paths: set engine.name to 'replay'"
+            f"{path}: engine {study.engine.name!r} is too expensive for hundreds of runs; methods are compared on "
+            "stored paths: set engine.name to 'replay'"
         )
     setup = Setup.open(study.replace(engine="replay"))
     # A replay gives derivatives.
@@ -89,7 +86,7 @@ def study_arena(path: str | Path) -> Arena:
     digest.update(repr(problem.priors).encode() if len(problem.priors) else b"")
     digest.update(b"" if links.frequency is None else links.frequency.astype("<f8").tobytes())
     start = parameters.to_search(parameters.start)
-    return Arena(
+    return ComparisonProblem(
         Path(path).stem,
         digest.hexdigest(),
         lower,

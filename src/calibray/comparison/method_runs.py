@@ -1,0 +1,250 @@
+"""Runs of methods with equal budgets: one run, its record, and a file that keeps finished runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import time
+from bisect import bisect_right
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from calibray import optimizers
+from calibray.comparison.problem import ComparisonProblem
+from calibray.errors import InputError
+from calibray.fitting.search import rounds
+from calibray.optimizers import METHODS, Optimizer
+from calibray.support.output_files import exists
+
+LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
+"""Largest numbers accepted: a comparison with more would not end."""
+
+RunKey = tuple[str, int, int]
+"""Method, budget and seed, which identify a run on a problem."""
+
+
+@dataclass(frozen=True)
+class BudgetedMethod:
+    """A method with its budget.
+
+    Attributes:
+        name: Its name in tables, as requested.
+        method: Its name in `METHODS`.
+        budget: RT calls that it may use.
+    """
+
+    name: str
+    method: str
+    budget: int
+
+    @property
+    def stops_by_itself(self) -> bool:
+        """Whether the method ignores the budget."""
+        return METHODS[self.method].schedule is None
+
+    @staticmethod
+    def parse(name: str, budget: int) -> BudgetedMethod:
+        """Read a method with its budget.
+
+        Args:
+            name: A method, or `METHOD@CALLS` with another budget than the common one.
+            budget: The common budget [RT calls].
+
+        Returns:
+            The method.
+
+        Raises:
+            InputError: There is no such method, or the budget is no whole number, or too small.
+
+        Example:
+            >>> BudgetedMethod.parse("gwo@600", 225)
+            BudgetedMethod(name='gwo@600', method='gwo', budget=600)
+        """
+        method, _, calls = name.partition("@")
+        schedule = optimizers.method(method).schedule
+        if calls:
+            with suppress(ValueError):
+                budget = int(calls)
+        least = 1 if schedule is None else schedule.least
+        if (calls and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
+            raise InputError(
+                f"method {name!r}: a budget of {calls or budget} RT calls; it must be a whole number from {least} to "
+                f"{LIMITS['budget']:,}"
+            )
+        return BudgetedMethod(name, method, budget)
+
+    def key(self, seed: int) -> RunKey:
+        """The key of a run from a seed."""
+        return self.method, self.budget, seed
+
+    def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
+        """Make the optimizer of a run.
+
+        Args:
+            problem: The problem.
+            seed: The run's seed.
+
+        Returns:
+            An optimizer that keeps to the budget, or stops by itself.
+
+        Raises:
+            InputError: The method does not fit the problem, or its library is not installed.
+        """
+        return optimizers.make(
+            self.method,
+            problem.lower,
+            problem.upper,
+            seed,
+            budget=self.budget,
+            start=problem.start,
+            starts=problem.starts,
+            cheap_model=None if problem.cheap_model is None else problem.cheap_model(),
+        )
+
+    def run(self, problem: ComparisonProblem, seed: int) -> MethodRun:
+        """Run the method; an error ends the run, and its message is kept."""
+        return run_optimizer(problem, self.key(seed), lambda: self.optimizer(problem, seed))
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """One run of a method.
+
+    Attributes:
+        method: The method.
+        budget: RT calls that it was allowed.
+        seed: Its seed.
+        evaluations: RT calls that it used.
+        calls: Numbers of the RT calls that improved on all before them.
+        best: Objectives there, [dB].
+        seconds: Duration [s].
+        failure: The error that ended it; empty if it finished.
+    """
+
+    method: str
+    budget: int
+    seed: int
+    evaluations: int
+    calls: tuple[int, ...]
+    best: tuple[float, ...]
+    seconds: float
+    failure: str = ""
+
+    def at(self, calls: int) -> float:
+        """The best objective after a number of RT calls [dB]; +inf before the first."""
+        index = bisect_right(self.calls, calls)
+        return self.best[index - 1] if index else np.inf
+
+    def first(self, objective: float) -> float:
+        """Number of the first RT call that reached an objective [dB]; +inf if none did."""
+        return next(
+            (float(call) for call, value in zip(self.calls, self.best, strict=True) if value <= objective),
+            np.inf,
+        )
+
+
+def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Optimizer]) -> MethodRun:
+    """Run an optimizer to its end.
+
+    Args:
+        problem: The problem.
+        key: Key of the run.
+        make: Makes the optimizer.
+
+    Returns:
+        The run; an error ends it, and its message is kept.
+    """
+    calls: list[int] = []
+    best: list[float] = []
+    evaluations, failure, started = 0, "", time.perf_counter()
+    try:
+        optimizer = make()
+        for _, evaluation in rounds(optimizer, problem.evaluate):
+            for value in evaluation.value.tolist():
+                evaluations += 1
+                if value < (best[-1] if best else np.inf):
+                    calls.append(evaluations)
+                    best.append(value)
+    except Exception as error:  # a failed run is a result about its method
+        failure = f"{type(error).__name__}: {error}"
+    seconds = time.perf_counter() - started
+    return MethodRun(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
+
+
+class RunFile:
+    """Finished runs of one problem, in a file of JSON lines that may hold runs of others.
+
+    Runs are appended one by one, so a comparison that was killed continues where it stopped.
+
+    Args:
+        path: The file; made when the first run is added.
+        problem: Digest of everything that a run depends on apart from method, budget and seed.
+
+    Raises:
+        InputError: The file holds something else.
+    """
+
+    def __init__(self, path: Path, problem: str) -> None:
+        self._path, self._problem = path, problem
+        self._runs: dict[RunKey, MethodRun] = {}
+        text = path.read_text(encoding="utf-8") if exists(path) else ""
+        self._torn = bool(text) and not text.endswith("\n")
+        for line in text.splitlines():
+            try:
+                record = json.loads(line)
+            except ValueError:  # the line that a killed process was writing
+                continue
+            if not isinstance(record, dict) or "problem" not in record:
+                raise InputError(f"{path}: holds something else than finished runs; name another folder")
+            if record.pop("problem") == problem:
+                run = MethodRun(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
+                self._runs[run.method, run.budget, run.seed] = run
+
+    def find(self, key: RunKey) -> MethodRun | None:
+        """The finished run with a key, or None."""
+        return self._runs.get(key)
+
+    def add(self, run: MethodRun) -> MethodRun:
+        """Append a run to the file, and return it."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write("\n" * self._torn + json.dumps({"problem": self._problem, **asdict(run)}) + "\n")
+        self._torn = False
+        self._runs[run.method, run.budget, run.seed] = run
+        return run
+
+
+@cache
+def code_fingerprint(method: str | None = None) -> str:
+    """Digest of the optimizers' code: runs of other code are not comparable.
+
+    Args:
+        method: Digest only the module of this method and all optimizer modules that it imports; None for all methods.
+
+    Returns:
+        The first digits of a SHA-256 in hexadecimal.
+    """
+    folder = Path(optimizers.__file__).parent
+    files = set(folder.rglob("*.py")) if method is None else set()
+    waiting = [] if method is None else [METHODS[method].__module__]
+    while waiting:
+        file = folder.joinpath(*waiting.pop().split(".")[2:]).with_suffix(".py")
+        if file.is_file() and file not in files:
+            files.add(file)
+            text = file.read_text("utf-8")
+            waiting += re.findall(r"^from (calibray\.optimizers\.[\w.]+) import", text, re.MULTILINE)
+            for package, names in re.findall(
+                r"^from (calibray\.optimizers[\w.]*) import (\w+)$", text, re.MULTILINE
+            ):
+                waiting.append(f"{package}.{names}")
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]

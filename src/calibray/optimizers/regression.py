@@ -1,0 +1,364 @@
+"""Gaussian process regression of many residuals that share one kernel.
+
+    K(x, x') = v_0 + v_1 h(x).h(x') + v_2 M(x, x') + nugget [x = x']
+
+M is the Matern-5/2 kernel with one rate (inverse length scale) per coordinate of the unit cube. h(x) is the response of
+a cheap model at x, if there is one. So v_0 allows an offset, v_1 a change of the response and v_2 a smooth rest. All
+residuals share K, so one factorization serves any number of them. With a linear trend the coefficients of 1 and x are
+unknown without a prior (universal kriging).
+
+One derivation covers both cases. C [n, f] holds orthonormal combinations of the points on which the trend vanishes;
+without a trend C is the identity. C^T y has covariance A = C^T K C, and P = C A^-1 C^T plays the role of K^-1.
+
+C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eqs. 2.25, 2.26, 2.41,
+2.42, 4.17, 5.9 and sec. 9.9; leave-one-out in closed form after S. Rippa, Adv. Comput. Math. 11 (1999) 193.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+SINGULAR = 1e10
+"""Value of the likelihood where the kernel matrix cannot be factored."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Points as the kernel sees them.
+
+    Attributes:
+        unit: Coordinates in the unit cube [n, d].
+        response: Response of a cheap model there, h [n, r]; r = 0 without one.
+    """
+
+    unit: NDArray[np.float64]
+    response: NDArray[np.float64]
+
+    @staticmethod
+    def plain(unit: NDArray[np.float64]) -> Inputs:
+        """Points of the unit cube [n, d] without a cheap model."""
+        return Inputs(unit, np.zeros((len(unit), 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """A kernel with its hyperparameters.
+
+    Attributes:
+        variances: v_0, v_1 and v_2.
+        rates: Inverse length scales [d].
+        nugget: Variance of independent errors at the points.
+    """
+
+    variances: NDArray[np.float64]
+    rates: NDArray[np.float64]
+    nugget: float
+
+    @staticmethod
+    def of(hyper: NDArray[np.float64], scale: float = 1.0) -> Kernel:
+        """Make a kernel of logarithms.
+
+        Args:
+            hyper: Logarithms of v_0, v_1 and v_2, of the rates [d], and of the nugget [3 + d + 1].
+            scale: Factor whose square multiplies variances and nugget.
+
+        Returns:
+            The kernel.
+        """
+        return Kernel(scale**2 * np.exp(hyper[:3]), np.exp(hyper[3:-1]), float(scale**2 * np.exp(hyper[-1])))
+
+    def logarithms(self, scale: float = 1.0) -> NDArray[np.float64]:
+        """The inverse of `of`; -inf for a variance of 0."""
+        with np.errstate(divide="ignore"):
+            variances = np.log(self.variances / scale**2)
+        return np.concatenate([variances, np.log(self.rates), [np.log(self.nugget / scale**2)]])
+
+    def covariance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
+        """Covariance between points a [k] and b [n] without the nugget [k, n]."""
+        smooth = matern(self.distance(a, b))
+        return self.variances[0] + self.variances[1] * a.response @ b.response.T + self.variances[2] * smooth
+
+    def variance(self, at: Inputs) -> NDArray[np.float64]:
+        """Prior variance at points without the nugget [k]."""
+        return self.variances[0] + self.variances[1] * np.sum(at.response**2, axis=1) + self.variances[2]
+
+    def matrix(self, at: Inputs) -> NDArray[np.float64]:
+        """Covariance of points among themselves with the nugget, K [n, n]."""
+        return self.covariance(at, at) + self.nugget * np.eye(len(at.unit))
+
+    def distance(self, a: Inputs, b: Inputs) -> NDArray[np.float64]:
+        """Distance between points in length scales [k, n]."""
+        return np.asarray(cdist(a.unit * self.rates, b.unit * self.rates), dtype=np.float64)
+
+
+class Trend(NamedTuple):
+    """A trend at evaluated points.
+
+    Attributes:
+        contrasts: C [n, f].
+        left_inverse: Maps values at the points to the coefficients of the trend through them [p, n].
+    """
+
+    contrasts: NDArray[np.float64]
+    left_inverse: NDArray[np.float64]
+
+    @staticmethod
+    def of(unit: NDArray[np.float64], linear: bool) -> Trend:
+        """The linear trend at points [n, d], or none."""
+        if not linear:
+            return Trend(np.eye(len(unit)), np.zeros((0, len(unit))))
+        basis = trend_basis(unit)
+        size = basis.shape[1]
+        q, r = np.linalg.qr(basis, mode="complete")
+        return Trend(q[:, size:], solve_triangular(r[:size], q[:, :size].T))
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """A Gaussian process conditioned on values at evaluated points; build it with `condition`.
+
+    Attributes:
+        inputs: The evaluated points.
+        values: Values of every residual there [n, m].
+        kernel: The kernel.
+        linear: Whether there is a linear trend.
+        freedom: Degrees of freedom of the prior of a residual's variance; 0 if the variance is profiled out.
+        trend: The trend at the points.
+        lower: Cholesky factor of A [f, f].
+        whitened: Its inverse times C^T y [f, m].
+        weights: P y [n, m].
+        coefficients: Coefficients of the trend [p, m].
+    """
+
+    inputs: Inputs
+    values: NDArray[np.float64]
+    kernel: Kernel
+    linear: bool
+    freedom: float
+    trend: Trend
+    lower: NDArray[np.float64]
+    whitened: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+
+    @property
+    def precision(self) -> NDArray[np.float64]:
+        """Inverse of the variance of each residual, relative to K [m]."""
+        return _precision(len(self.whitened), np.sum(self.whitened**2, axis=0), self.freedom)
+
+    @property
+    def root(self) -> NDArray[np.float64]:
+        """Factor B of the covariance B^T B of the residuals, relative to K [f, m], or [f + m, m] with a prior."""
+        rows = self.whitened
+        if self.freedom:
+            rows = np.vstack([rows, np.sqrt(self.freedom) * np.eye(rows.shape[1])])
+        return rows / np.sqrt(len(self.whitened) + self.freedom)
+
+    @property
+    def inverse_diagonal(self) -> NDArray[np.float64]:
+        """Diagonal of P [n]."""
+        return np.sum(self._whiten(np.eye(len(self.values))) ** 2, axis=0)
+
+    def predict(self, at: Inputs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Predict the residuals.
+
+        Args:
+            at: Points [k].
+
+        Returns:
+            Mean [k, m], and the variance relative to that of each residual [k].
+        """
+        cross, prior = self.kernel.covariance(at, self.inputs), self.kernel.variance(at)
+        mean, unexplained = cross @ self.weights, cross
+        if self.linear:
+            # The weights g = basis @ left_inverse interpolate the trend. What is left to predict is z(x) - g.y.
+            basis, left_inverse = trend_basis(at.unit), self.trend.left_inverse
+            spread = left_inverse @ self.kernel.matrix(self.inputs)
+            mean = mean + basis @ self.coefficients
+            unexplained = cross - basis @ spread
+            prior = prior - 2.0 * np.sum((basis @ left_inverse) * cross, axis=1)
+            prior = prior + np.sum((basis @ (spread @ left_inverse.T)) * basis, axis=1)
+        known = self._whiten(unexplained.T)
+        return mean, np.maximum(prior - np.sum(known**2, axis=0), 0.0)  # eqs. 2.25, 2.26, 2.41, 2.42
+
+    def mean(self, at: Inputs) -> NDArray[np.float64]:
+        """Predicted residuals at points [k, m]."""
+        mean = self.kernel.covariance(at, self.inputs) @ self.weights
+        return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
+
+    def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Derivatives of the predicted mean.
+
+        Args:
+            at: Points [k].
+            response_slope: Derivatives of the responses by the coordinates of the unit cube [k, r, d]; None without a
+                cheap model.
+
+        Returns:
+            Derivatives by these coordinates [k, m, d].
+        """
+        rates, variances = self.kernel.rates, self.kernel.variances
+        toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
+        by_coordinate = variances[2] * matern_slope(self.kernel.distance(at, self.inputs))[:, None] * toward
+        if response_slope is not None:
+            by_coordinate += variances[1] * np.moveaxis(response_slope, 1, -1) @ self.inputs.response.T
+        slope = by_coordinate @ self.weights
+        if self.linear:
+            slope = slope + self.coefficients[1:]
+        return slope.transpose(0, 2, 1)
+
+    def left_out_errors(self) -> NDArray[np.float64]:
+        """Value minus prediction of every point when it is left out, hyperparameters kept [n, m] (Rippa 1999)."""
+        return self.weights / self.inverse_diagonal[:, None]
+
+    def _whiten(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Columns over the points [n, k], whitened [f, k]."""
+        return solve_triangular(self.lower, self.trend.contrasts.T @ columns, lower=True)
+
+
+def condition(
+    inputs: Inputs, values: NDArray[np.float64], kernel: Kernel, *, linear: bool = False, freedom: float = 0.0
+) -> Process:
+    """Condition a process on values; for the arguments see `Process`."""
+    trend, matrix = Trend.of(inputs.unit, linear), kernel.matrix(inputs)
+    lower = np.asarray(np.linalg.cholesky(trend.contrasts.T @ matrix @ trend.contrasts), dtype=np.float64)
+    whitened = solve_triangular(lower, trend.contrasts.T @ values, lower=True)
+    weights = trend.contrasts @ solve_triangular(lower.T, whitened)
+    coefficients = trend.left_inverse @ (values - matrix @ weights)
+    return Process(inputs, values, kernel, linear, freedom, trend, lower, whitened, weights, coefficients)
+
+
+class Likelihood:
+    """Negative log likelihood of kernels, restricted to the contrasts, up to a constant.
+
+    Without a prior of the variances each one takes its most likely value; with one the residuals follow a
+    multivariate t distribution. For the arguments see `Process`.
+    """
+
+    def __init__(
+        self, inputs: Inputs, values: NDArray[np.float64], *, linear: bool = False, freedom: float = 0.0
+    ) -> None:
+        unit = inputs.unit
+        self.values, self.freedom = values, freedom
+        self.response = inputs.response @ inputs.response.T
+        self.squares = ((unit[:, None] - unit[None]) ** 2).reshape(-1, unit.shape[1])
+        self.contrasts = Trend.of(unit, linear).contrasts
+
+    def __call__(self, kernel: Kernel) -> tuple[float, NDArray[np.float64]]:
+        """Evaluate it.
+
+        Args:
+            kernel: The kernel.
+
+        Returns:
+            The value, and its gradient by the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1]; `SINGULAR` and
+            zeros where the kernel matrix cannot be factored.
+        """
+        count, residuals = self.values.shape
+        rates_squared = kernel.rates**2
+        distance = np.sqrt(self.squares @ rates_squared).reshape(count, count)
+        v_0, v_1, v_2 = kernel.variances
+        smooth = matern(distance)
+        matrix = v_0 + v_1 * self.response + v_2 * smooth + kernel.nugget * np.eye(count)
+        try:
+            lower = np.linalg.cholesky(self.contrasts.T @ matrix @ self.contrasts)
+        except np.linalg.LinAlgError:
+            return SINGULAR, np.zeros(len(rates_squared) + 4)
+        half = solve_triangular(lower, self.contrasts.T, lower=True)
+        inverse = half.T @ half  # P
+        weights = inverse @ self.values
+        square = np.maximum(np.sum(self.values * weights, axis=0), 1e-300)
+        free = len(lower)
+        value = residuals * np.log(np.diag(lower)).sum()
+        value += 0.5 * (self.freedom + free) * np.log((self.freedom + square) / (self.freedom + free)).sum()
+        # Derivative by K (eq. 5.9), each residual weighted by its precision.
+        gap = residuals * inverse - (weights * _precision(free, square, self.freedom)) @ weights.T
+        gap *= 0.5
+        by_variance = kernel.variances * [gap.sum(), np.sum(gap * self.response), np.sum(gap * smooth)]
+        by_rate = v_2 * ((gap * matern_slope(distance)).ravel() @ self.squares) * rates_squared
+        return float(value), np.concatenate([by_variance, by_rate, [kernel.nugget * np.trace(gap)]])
+
+
+class Prior(NamedTuple):
+    """Independent normal priors of the logarithms of v_0, v_1, v_2, rates and nugget, within bounds [3 + d + 1].
+
+    Attributes:
+        mean: Means.
+        spread: Standard deviations.
+        lower: Lower bounds.
+        upper: Upper bounds.
+        fixed: How many of the first ones stay at their mean.
+    """
+
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    fixed: int = 0
+
+
+def most_probable(
+    likelihood: Likelihood,
+    prior: Prior,
+    *,
+    scale: float = 1.0,
+    divisor: float = 1.0,
+    guess: Kernel | None = None,
+    steps: int = 30,
+) -> Kernel:
+    """The kernel of the largest posterior density.
+
+    Args:
+        likelihood: Likelihood of kernels.
+        prior: Prior of their hyperparameters.
+        scale: Factor whose square multiplies variances and nugget.
+        divisor: What the loss is divided by, which sets the size of the first step.
+        guess: A kernel to start from as well as the prior's mean, such as that of an earlier fit.
+        steps: Largest number of steps from each start.
+
+    Returns:
+        The kernel.
+    """
+    held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
+
+    def loss(hyper: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        value, slope = likelihood(Kernel.of(np.concatenate([held, hyper]), scale))
+        away = (hyper - prior.mean[learned]) / prior.spread[learned]
+        value += 0.5 * float(away @ away)
+        return value / divisor, (slope[learned] + away / prior.spread[learned]) / divisor
+
+    starts = [prior.mean] if guess is None else [prior.mean, guess.logarithms(scale)]
+    bounds = list(zip(prior.lower[learned], prior.upper[learned], strict=True))
+    ends = [
+        minimize(loss, start[learned], jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
+        for start in starts
+    ]
+    return Kernel.of(np.concatenate([held, min(ends, key=lambda end: end.fun).x]), scale)
+
+
+def matern(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The Matern kernel of smoothness 5/2 at a distance in length scales [...] (eq. 4.17)."""
+    a = np.sqrt(5.0) * distance
+    return (1.0 + a + a * a / 3.0) * np.exp(-a)
+
+
+def matern_slope(distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivative of the Matern kernel divided by the distance, M'(r) / r [...]; finite at 0."""
+    a = np.sqrt(5.0) * distance
+    return -5.0 / 3.0 * (1.0 + a) * np.exp(-a)
+
+
+def trend_basis(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The functions of a linear trend, 1 and the coordinates, at points of the unit cube [n, 1 + d]."""
+    return np.hstack([np.ones((len(unit), 1)), unit])
+
+
+def _precision(free: int, square: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
+    return (freedom + free) / (freedom + square)

@@ -1,0 +1,303 @@
+"""The vector surrogate: a model of every residual instead of their root mean square, searched globally.
+
+The objective is a sum over links, so an evaluation that returns the residual of every link tells far more than their
+sum. Residuals are smoother than the objective, and tens of them share one dependence on the parameters (`kriging.py`).
+
+A run begins with a maximin Latin hypercube. It has few points for many parameters, because residuals can be modelled as
+soon as a plane can be laid through them. Then three kinds of step take turns on a model that is refitted after every
+batch:
+
+- *exploration*: the point of the largest expected improvement of the mean square of the residuals, over draws from the
+  model (R. Astudillo, P. Frazier, ICML 2019). A normal distribution of the mean square instead (D. R. Jones, M.
+  Schonlau, W. J. Welch, J. Global Optim. 13 (1998) 455, eq. 15) gives weight to values below the possible minimum, and
+  wastes the step on the emptiest corner of many dimensions;
+- *exploitation*: the lowest minimum of the predicted objective that has not been evaluated yet, found by many local
+  searches with exact derivatives of the model;
+- *another basin*: the lowest minimum of the predicted objective where the model is still uncertain, so that polishing
+  one basin does not keep the search from the next.
+
+Input scales are learned at every step up to `OFTEN` points, and then whenever the number of points has grown by a
+tenth; in between the model only takes new points, which saves most of the time.
+
+In a batch every further candidate is chosen as if the earlier ones had been evaluated exactly as predicted. A failed
+evaluation enters the model with the residuals of the worst successful one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist, pdist
+from scipy.stats import spearmanr
+
+from calibray.errors import InputError
+from calibray.optimizers.arguments import real, whole
+from calibray.optimizers.box import Box
+from calibray.optimizers.descent import descend_all
+from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
+from calibray.optimizers.kriging import Kriging, fit, solve
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
+from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
+from calibray.optimizers.session import Search, Session
+
+FIRST = 5
+"""Points of the initial design beyond the number of parameters, at most."""
+
+CANDIDATES = 600
+"""Candidates drawn over the box, and as many around the best points."""
+
+DRAWS = 256
+"""Draws of the residuals for the expected improvement."""
+
+OFTEN = 80
+"""Points up to which input scales are learned at every step."""
+
+REFIT = 1.1
+"""Growth of the number of points at which they are learned again beyond."""
+
+SEARCHES = 16
+"""Local searches on the model."""
+
+SEPARATION = 1e-4
+"""Distance in the unit cube below which a point counts as evaluated already."""
+
+UNCERTAIN = 1e-3
+"""Share of the prior variance above which a predicted minimum counts as another basin."""
+
+PATIENCE = 4
+"""Batches in a row that promise too little before the search stops."""
+
+
+@final
+class VectorSurrogate(Optimizer):
+    """Surrogate of the residual vector. Uses residuals; 20 d evaluations by default.
+
+    Args:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        seed: Seed of the random generator.
+        budget: Number of evaluations, 20 d if None.
+        initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None; points told before the first
+            `ask` count, those closer together than half of the design's spacing as one.
+        batch: Candidates asked for at once after the initial design, for engines that run in parallel.
+        logarithmic: Parameters that the model sees on a logarithmic scale, [d] or one for all.
+        noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
+        tolerance: Stop before the budget is used when the predicted gain stays below this, in the unit of the
+            residuals' root mean square; never if None.
+        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
+            square, which is minimised; both are checked.
+
+    Raises:
+        InputError: An argument is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> opt = VectorSurrogate([0.0, 0.0], [9.0, 9.0], budget=20)
+        >>> while not opt.done:
+        ...     x = opt.ask()
+        ...     r = np.sin(x) - 0.5 * x[:, ::-1]
+        ...     opt.tell(x, np.sqrt(np.mean(r**2, axis=1)), residuals=r)
+        >>> opt.evaluations, bool(opt.best.y < 1e-2)
+        (20, True)
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int | None = None,
+        initial: int | None = None,
+        batch: int = 1,
+        logarithmic: ArrayLike = False,
+        noisy: bool = False,
+        tolerance: float | None = None,
+        objective: Objective = root_mean_square,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        d = self.box.dimension
+        self._budget = 20 * d if budget is None else whole("budget", budget, at_least=1)
+        default = min(2 * (d + 1), d + FIRST)
+        self.initial = default if initial is None else whole("initial", initial, at_least=d + 2)
+        self.batch = whole("batch", batch, at_least=1)
+        self.noisy = noisy
+        self.tolerance = None if tolerance is None else real("tolerance", tolerance, at_least=0.0)
+        self._logarithmic = _flags(logarithmic, self.box)
+        self._scaled_box = Box.between(self._scaled(self.box.lower), self._scaled(self.box.upper))
+        self._model: Kriging | None = None
+        self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
+        self._session = Session(self.box, self.uses, self._search, objective)
+
+    @property
+    def trust(self) -> float | None:
+        """How well the model ranks left-out points by their objective; None without a model.
+
+        Spearman's rank correlation: 1 is perfect, 0 is useless and calls for more initial points.
+        """
+        if self._model is None:
+            return None
+        y, predicted = (root_mean_square(r) for r in (self._model.residuals, self._model.left_out()))
+        correlation: Any = spearmanr(y, predicted)
+        return float(correlation.statistic)
+
+    def _search(self, archive: Archive) -> Search:
+        d, left, quiet, turn = self.box.dimension, self._budget, 0, 0
+        missing = self._design(self._to_unit(archive.all().x) if len(archive) else np.empty((0, d)))[:left]
+        if len(missing):
+            yield self._from_unit(missing)
+            left -= len(missing)
+        while left > 0 and quiet < PATIENCE:
+            count = min(self.batch, left)
+            evaluated = archive.all()
+            unit, good = self._to_unit(evaluated.x), np.isfinite(evaluated.y)
+            points, residuals = merge_repeated(unit, archive.imputed(evaluated).errors)
+            spanned = np.linalg.matrix_rank(points - points.mean(axis=0))
+            if spanned < d or len(points) < d + 2 or good.sum() < 2:  # too few points for a model
+                chosen = self._rng.random((count, d))
+            else:
+                self._model = self._fitted(points, residuals)
+                best_first = unit[np.argsort(evaluated.y, kind="stable")]
+                best = float(root_mean_square(archive.leading.errors)[0])
+                chosen, gain = self._choose(self._model, best_first, best, turn, count)
+                quiet = quiet + 1 if self.tolerance is not None and gain < self.tolerance else 0
+            yield self._from_unit(chosen)
+            left, turn = left - count, turn + count
+
+    def _design(self, earlier: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The initial design [k, d], less its points next to earlier ones [n, d] that are not clumped."""
+        points = maximin_design(self.initial, self.box.dimension, self._rng)
+        spacing, counted = 0.5 * float(pdist(points).min()), earlier[:0]
+        for point in earlier:
+            clumped = len(counted) and distance_to_nearest(point[None], counted)[0] < spacing
+            if len(points) and not clumped:
+                counted = np.vstack([counted, point])
+                points = np.delete(points, np.argmin(cdist(point[None], points)), axis=0)
+        return points
+
+    def _fitted(self, points: NDArray[np.float64], residuals: NDArray[np.float64]) -> Kriging:
+        """A model of all points, with new scales if their number has grown enough to improve them."""
+        if self._model is None:
+            self._learned = len(points)
+            return fit(points, residuals, noisy=self.noisy)
+        kernel = self._model.process.kernel
+        if len(points) <= OFTEN or len(points) >= REFIT * self._learned:
+            self._learned = len(points)
+            return fit(points, residuals, noisy=self.noisy, guess=kernel)
+        return solve(points, residuals, kernel)
+
+    def _choose(
+        self, model: Kriging, taken: NDArray[np.float64], best: float, turn: int, count: int
+    ) -> tuple[NDArray[np.float64], float]:
+        """The next batch [count, d] and the gain it promises; `taken` are the evaluated points, best first."""
+        d = self.box.dimension
+        starts = np.vstack([taken[: SEARCHES // 2], self._rng.random((SEARCHES, d))])[:SEARCHES]
+        minima = predicted_minima(model, starts)
+        chosen, gain = [], 0.0
+        for step in range(turn, turn + count):
+            fresh = minima[distance_to_nearest(minima, taken) > SEPARATION]
+            if step % 3 and len(fresh):
+                mean, share = model.predict(fresh)
+                # argmax of flags is the first uncertain minimum, or the lowest one if none is uncertain
+                index = 0 if step % 3 == 1 else np.argmax(share > UNCERTAIN)
+                x, promised = fresh[index], best - float(np.sqrt(np.mean(mean[index] ** 2)))
+            else:
+                x, promised = self._explore(model, taken, fresh, best)
+            chosen.append(x)
+            gain = max(gain, promised)
+            if len(chosen) < count:
+                model, taken = model.with_point(x), np.vstack([taken, x])
+        return np.array(chosen), gain
+
+    def _explore(
+        self, model: Kriging, taken: NDArray[np.float64], fresh: NDArray[np.float64], best: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """The point of the largest expected improvement [d], and the gain it promises."""
+        around = draw_around(taken[:5], CANDIDATES, -3.0, self._rng)
+        candidates = np.vstack([self._rng.random((CANDIDATES, self.box.dimension)), around, fresh])
+        candidates = candidates[distance_to_nearest(candidates, taken) > SEPARATION]
+        normal = self._rng.standard_normal((DRAWS, len(model.root)))
+        mean, share = model.predict(candidates)
+        gain = improvement(mean, share, normal @ model.root, best)
+        if not gain.any():  # no draw improves anywhere: take the point closest to improving
+            centre, spread = mean_square(model, candidates)
+            return candidates[np.argmax((best**2 - centre) / np.maximum(spread, 1e-300))], 0.0
+        return candidates[np.argmax(gain)], best - np.sqrt(max(best**2 - gain.max(), 0.0))
+
+    def _scaled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithms of the logarithmic parameters."""
+        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, x, 1.0)), x)
+
+    def _to_unit(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._scaled_box.to_unit(self._scaled(x))
+
+    def _from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        scaled = self._scaled_box.from_unit(unit)
+        raised = np.exp(np.where(self._logarithmic, scaled, 0.0))
+        return self.box.clip(np.where(self._logarithmic, raised, scaled))
+
+
+def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The distribution of the mean square Q of the residuals, as the model predicts it.
+
+    With prediction r, prior covariance V of the residuals and share s^2 of it, which grows with the distance from
+    evaluated points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of
+    different links are correlated: treating them as independent would stop exploration too soon.
+
+    Args:
+        model: The model of the residuals.
+        x: Points of the unit cube [k, d].
+
+    Returns:
+        Expectation and standard deviation [k].
+    """
+    mean, share = model.predict(x)
+    root, links = model.root, model.root.shape[1]
+    centre = np.mean(mean**2, axis=1) + share * np.sum(root**2) / links
+    along = np.sum((mean @ root.T) ** 2, axis=1)  # r^T V r
+    return centre, np.sqrt(4.0 * share * along + 2.0 * share**2 * np.sum((root @ root.T) ** 2)) / links
+
+
+def improvement(
+    mean: NDArray[np.float64], share: NDArray[np.float64], draws: NDArray[np.float64], best: float
+) -> NDArray[np.float64]:
+    """Expected decrease of the mean square of the residuals below the best one, by Monte Carlo.
+
+    Args:
+        mean: Predicted residuals [k, m].
+        share: Their variance relative to the prior's [k].
+        draws: Draws of residuals with the prior covariance [draws, m].
+        best: The root mean square of the best residuals so far.
+
+    Returns:
+        Expected improvement [k]; 0 where no draw improves.
+    """
+    along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
+    square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across
+    return np.maximum(best**2 - square / mean.shape[1], 0.0).mean(axis=1)
+
+
+def predicted_minima(model: Kriging, starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Local minima of the predicted objective, lowest first [k, d], searched from starts in the unit cube [s, d]."""
+    ends = descend_all(starts, model.mean_and_slope, 30, 1e-8)
+    return ends.unit[np.argsort(ends.cost, kind="stable")]
+
+
+def _flags(value: ArrayLike, box: Box) -> NDArray[np.bool_]:
+    flags = np.array(value)
+    if flags.dtype != bool or flags.shape not in ((), (box.dimension,)):
+        raise InputError(
+            f"logarithmic = {value!r}; it must be True, False, or one of them for each parameter"
+        )
+    flags = np.broadcast_to(flags, box.dimension)
+    for index in np.flatnonzero(flags & (box.lower <= 0.0)):
+        raise InputError(
+            f"lower[{index}] = {box.lower[index]:g} of a logarithmic parameter; raise it above 0 or use a linear scale"
+        )
+    return flags
