@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -169,13 +168,13 @@ def _whole(
     totals, errors = [], []
     for some in candidates:
         tables = parameters.constants_of(some, paths.materials).astype(np.float32)
-        loss, error = path_losses(plan.program, jnp.asarray(tables))
+        loss, error = path_losses(plan.program, tables)
         totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
         errors.append(error)
     strength = np.zeros(paths.num_paths)
     for some, total in zip(candidates[0][:STRENGTH], totals[0], strict=False):
         table = parameters.constants_of(some[None], paths.materials)[0].astype(np.float32)
-        power = np.asarray(path_powers(plan.program, jnp.asarray(table)))
+        power = np.asarray(path_powers(plan.program, table))
         strength[plan.order] += power / np.where(total > 0, total, np.inf)[paths.link[plan.order]]
     return totals, strength, max(errors)
 
@@ -212,7 +211,7 @@ class _Powers:
     def at(self, which: int, where: slice) -> NDArray[np.float64]:
         """Powers of some of the paths at one set of candidates [n, paths]."""
         if which not in self._known:
-            tables = jnp.asarray(self._tables[which].astype(np.float32))
+            tables = self._tables[which].astype(np.float32)
             self._known[which] = np.stack([np.asarray(path_powers(self._program, table)) for table in tables])
         return self._known[which][:, self._place[where]].astype(float)
 

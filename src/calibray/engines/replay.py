@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
@@ -69,12 +67,11 @@ class Replay:
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
         self._dtype, self._block = dtype, block
-        self._offsets = fields.check_combining(paths, combining, bandwidth)
-        self._combining = combining
+        self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         self._rows, columns = parameters.matrix_indices(list(paths.materials))
         used, self._places = np.unique(columns, return_inverse=True)
         self._columns = columns
-        self._base = fields.material_table(paths).astype(dtype)
+        self._base = paths.material_table().astype(dtype)
         self._fields = tuple(int(column) for column in used)
         self._intervals = None if tabulate is False else self._needed(force=tabulate is True)
         self._program = self._laid_out()
@@ -121,14 +118,16 @@ class Replay:
         loss, jacobian = self._run(self._jacobian, candidates)
         return loss, jacobian
 
-    def _value(self, tables: jax.Array, count: int) -> tuple[jax.Array, float]:
-        return fields.path_losses(self._program, tables, self._combining, self._offsets, count)
+    def _value(self, tables: NDArray[np.floating], count: int) -> tuple[NDArray[np.floating], float]:
+        return fields.path_losses(self._program, tables, self._combining, count)
 
-    def _jacobian(self, tables: jax.Array, count: int) -> tuple[jax.Array, jax.Array, float]:
+    def _jacobian(
+        self, tables: NDArray[np.floating], count: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
         loss, slope, error = fields.path_losses_and_slopes(
-            self._program, tables, self._fields, self._combining, self._offsets, count
+            self._program, tables, self._fields, self._combining, count
         )
-        return loss, _chosen(slope, self._rows, self._places), error
+        return loss, slope[:, :, self._rows, self._places], error
 
     def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
@@ -138,11 +137,11 @@ class Replay:
             block = values[start : start + size]
             tables = np.repeat(self._base[None], size, axis=0)
             tables[: len(block), self._rows, self._columns] = block
-            *found, error = function(jnp.asarray(tables), len(block))
+            *found, error = function(tables, len(block))
             if error > TABLE_TOLERANCE:
                 self._refine()
                 continue
-            parts.append([np.asarray(part, dtype=float)[: len(block)] for part in found])
+            parts.append([np.asarray(part, dtype=float) for part in found])
             start += len(block)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
@@ -165,7 +164,7 @@ class Replay:
         self._program = self._laid_out()
 
     def _laid_out(self) -> fields.GroupedProgram:
-        return fields.layout(self.paths, self._dtype, self._intervals, self._combining != "power").program
+        return fields.layout(self.paths, self._dtype, self._intervals, self._combining.kind != "power").program
 
     def _size(self) -> int:
         """Candidates that a call takes: one where tables are filled for each."""
@@ -173,8 +172,3 @@ class Replay:
             return 1
         room = ANSWERS // max(self.paths.num_links * len(self.materials) * len(self._fields), 1)
         return min(self._block, 1 << max(room, 1).bit_length() - 1)
-
-
-@jax.jit
-def _chosen(slope: jax.Array, rows: NDArray[np.int64], places: NDArray[np.int64]) -> jax.Array:
-    return slope[:, :, rows, places]

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from threading import Event
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -105,10 +104,9 @@ class Retrace:
         tracer = part.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
         solution = tracer.solve(part.links, materials)
-        gain, link, delay = solution.gain, solution.link, solution.delay
-        offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
-        real, imaginary = (jnp.asarray(np.moveaxis(side, 0, -1)) for side in (gain.real, gain.imag))
-        power = fields.link_power(
-            (real, imaginary), link, delay, len(part.links), tracer.frequency, self._combining, offsets
+        combining = fields.Combining.make(
+            self._combining, solution.link, solution.delay, self._bandwidth
         )
-        return np.asarray(fields.decibel(power))
+        return fields.path_loss_of_gains(
+            solution.gain, solution.link, solution.delay, len(part.links), tracer.frequency, combining
+        )
