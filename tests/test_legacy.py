@@ -18,7 +18,6 @@ from calibray import engines
 from calibray.comparison import comparison
 from calibray.comparison.problems import study_arena
 from calibray.comparison.run_log import Runs
-from calibray.paths import Kind
 
 LEGACY = Path(__file__).parent / "legacy"
 EXPECTED = json.loads((LEGACY / "expected.json").read_text())
@@ -57,20 +56,6 @@ def test_a_study_file_means_the_same(name):
     assert study.engine == cb.Study.from_content({**expected, "engine": engine}, study.path).engine
     assert study.content()["engine"].items() <= engine.items()
     study.measurements()
-
-
-def test_a_path_file_gives_the_same_path_loss():
-    paths, expected = cb.Paths.load(LEGACY / "paths.h5"), EXPECTED["paths"]
-    assert set(paths.kind) == set(Kind)
-    assert len(paths.link) == expected["num_paths"]
-    other = paths.materials | {"stone": cb.Material(6.5, 0.1, 0.2, 0.3, 0.1)}
-    for loss, name in (
-        (cb.path_loss(paths), "path_loss_db"),
-        (cb.path_loss(paths, other), "other_path_loss_db"),
-        (cb.path_loss(paths, combining="coherent"), "coherent_path_loss_db"),
-    ):
-        assert loss == pytest.approx(np.array(expected[name]), rel=1e-12)
-    assert cb.path_loss(paths) != pytest.approx(cb.path_loss(paths, other), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["replay", "program"])

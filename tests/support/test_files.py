@@ -52,7 +52,7 @@ def test_what_was_written_may_be_replaced_and_what_was_changed_may_not(tmp_path)
 def test_path_files_say_themselves_whose_they_are(tmp_path):
     file = tmp_path / "paths.h5"
     with h5py.File(file, "w") as content:
-        content.attrs["schema"] = "calibray/paths"
+        content.attrs["format"] = "calibray/paths"
     assert not is_own(file)
     seal(file)
     (tmp_path / SIGNATURES).unlink()

@@ -164,7 +164,9 @@ class Replay:
         self._program = self._laid_out()
 
     def _laid_out(self) -> fields.GroupedProgram:
-        return fields.layout(self.paths, self._dtype, self._intervals, self._combining.kind != "power").program
+        return fields.layout(
+            self.paths, self._dtype, self._intervals, self._combining.kind != "power"
+        ).program
 
     def _size(self) -> int:
         """Candidates that a call takes: one where tables are filled for each."""

@@ -104,9 +104,7 @@ class Retrace:
         tracer = part.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
         solution = tracer.solve(part.links, materials)
-        combining = fields.Combining.make(
-            self._combining, solution.link, solution.delay, self._bandwidth
-        )
+        combining = fields.Combining.make(self._combining, solution.link, solution.delay, self._bandwidth)
         return fields.path_loss_of_gains(
             solution.gain, solution.link, solution.delay, len(part.links), tracer.frequency, combining
         )

@@ -69,8 +69,11 @@ def _band_nodes(
 ) -> NDArray[np.float64]:
     """Gauss-Legendre nodes and weights over a band [2, q], enough for the largest spread of delays within a link.
 
-    The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes integrates
-    them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
+    The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes
+    integrates them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
+
+    Raises:
+        InputError: The bandwidth is not positive.
     """
     if bandwidth is None or not (np.isfinite(bandwidth) and bandwidth > 0):
         raise InputError(f'combining = "band": bandwidth = {bandwidth}: must be a positive number of Hz')

@@ -96,9 +96,7 @@ def path_loss(
 
 
 @jax_settings()
-def program_path_loss(
-    program: GroupedProgram, table: jax.Array, combining: Combining = POWER
-) -> jax.Array:
+def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
     """Path loss of every link of a program, as one pure function.
 
     To differentiate or compile it, do so within `calibray.fields.jax_settings`.
@@ -126,9 +124,7 @@ def path_powers(program: GroupedProgram, table: ArrayLike) -> jax.Array:
     Returns:
         Power gains in the order of the program [P].
     """
-    return _path_powers(
-        program, _split_by_step(program, _material_response(program, jnp.asarray(table)))
-    )
+    return _path_powers(program, _split_by_step(program, _material_response(program, jnp.asarray(table))))
 
 
 @jax_settings()

@@ -33,8 +33,8 @@ _users_cache: Any = None
 def jax_settings() -> Iterator[None]:
     """Compute in double precision and keep compiled programs; afterwards JAX has the user's settings again.
 
-    Every function of `calibray.fields` that computes does so within these settings. Enter them yourself to differentiate
-    or compile around one of the pure functions.
+    Every function of `calibray.fields` that computes does so within these settings. Enter them yourself to
+    differentiate or compile around one of the pure functions.
 
     Example:
         >>> import jax.numpy as jnp
@@ -84,7 +84,7 @@ def _cache_of_jax(programs: Any) -> Iterator[None]:
 @cache
 def _kept_programs() -> Any:
     """The store as a cache for JAX; None if its folder cannot be trusted or JAX has no such interface."""
-    store = cache_folder.compiled()
+    store = cache_folder.compiled_programs()
     if store is None or not store.trusted:
         return None
     try:

@@ -87,9 +87,7 @@ def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResp
         diffuse.patterns,
     )
     root = safe_sqrt(density * diffuse.solid_angle)  # sqrt(f_s dOmega)
-    scattering, xpd = (
-        table[:, FIELD_COLUMN[name]] for name in ("scattering_coefficient", "xpd_coefficient")
-    )
+    scattering, xpd = (table[:, FIELD_COLUMN[name]] for name in ("scattering_coefficient", "xpd_coefficient"))
     co_polarized, cross_polarized = (
         (scattering * safe_sqrt(share)).at[diffuse.material].get(mode="promise_in_bounds") * root
         for share in (1 - xpd, xpd)

@@ -40,8 +40,7 @@ def path_fields(
         Gains in the order of the groups, real and imaginary part [R, T, P].
     """
     gains = [
-        _group_gains(group, response, keep)
-        for group, response in zip(program.groups, responses, strict=True)
+        _group_gains(group, response, keep) for group, response in zip(program.groups, responses, strict=True)
     ]
     if not gains:
         empty = jnp.zeros((1, 1, 0), dtype=program.wavelength.dtype)
@@ -130,9 +129,7 @@ def _scatter(
     )
 
 
-def _diffract(
-    te: Pair, tm: Pair, coefficients: tuple[Pair, ...], form: jax.Array
-) -> tuple[Pair, Pair]:
+def _diffract(te: Pair, tm: Pair, coefficients: tuple[Pair, ...], form: jax.Array) -> tuple[Pair, Pair]:
     """Diffraction, J = C_0 + sum_k R_k C_k."""
     real, imaginary = form[0, 0], form[1, 0]  # [2, 2, n]
     for k, (r_real, r_imaginary) in enumerate(coefficients, start=1):

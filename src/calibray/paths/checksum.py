@@ -77,7 +77,9 @@ def verify(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(BLOCK)
         if head.startswith(_SIGNATURE):
-            raise InputError("has no checksum; trace again, or call calibray.paths.seal if you trust the file")
+            raise InputError(
+                "has no checksum; trace again, or call calibray.paths.seal if you trust the file"
+            )
         if not head.startswith(PATH_SEAL):
             raise InputError("is damaged or no path file; trace again")
         if _block(file) != head:
