@@ -26,7 +26,11 @@ def pytest_configure(config: pytest.Config) -> None:
     if kept is not None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv(caching.CACHE_VARIABLE, str(kept.mkdir("calibray")))
-            import calibray.fields  # noqa: F401
+            from calibray.fields import jax_settings
+
+            # the folder of compiled programs is chosen when Calibray computes first
+            with jax_settings():
+                pass
 
 
 @pytest.fixture(scope="session", autouse=True)

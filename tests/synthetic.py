@@ -1,8 +1,9 @@
-"""Path programs made up at random: any sequence of interactions, without a scene or a tracer."""
+"""Random path programs with any sequences of interactions, without a scene or a tracer."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -14,6 +15,10 @@ MATERIALS = {
     "walls": Material(4.3, 0.08, 0.18, 0.35, 0.2),
     "glass": Material(6.1, 0.02, 0.009, 0.5, 0.1, "directive", alpha_r=3.4),
     "ground": Material(2.7, 0.09, 0.05, 0.6, 0.3, "backscattering", alpha_r=5.6, alpha_i=2.5, lambda_=0.6),
+}
+LAMBERTIAN = {
+    name: replace(material, scattering_pattern="lambertian", alpha_r=1.0, alpha_i=1.0, lambda_=1.0)
+    for name, material in MATERIALS.items()
 }
 EVERY_KIND = [
     (),
@@ -39,10 +44,10 @@ def program(
 
     Args:
         sequences: Kinds of the interactions of every path.
-        seed: Seed of everything else.
-        links: Number of links, among which the paths are shared out evenly.
+        seed: Seed of the geometry and the materials' indices.
+        links: Number of links; every one has the same number of paths, up to one.
         ports: Receive and transmit ports.
-        materials: Materials, drawn from for every interaction.
+        materials: Materials; every interaction has a random one.
         frequency: Carrier frequency [Hz].
 
     Returns:
@@ -86,7 +91,7 @@ def program(
             distance=random.uniform(1, 20, wedges),
             rotations=_rotations(random, (wedges, 4)),
         ),
-        settings={"samples": 1000, "refraction": True, "scene": "made up"},
+        settings={"samples": 1000, "refraction": True, "scene": "synthetic"},
         vertex=random.uniform(-50, 50, (count, 3)).astype(np.float32),
     )
 

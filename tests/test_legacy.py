@@ -59,20 +59,6 @@ def test_a_study_file_means_the_same(name):
     study.measurements()
 
 
-def test_a_path_file_gives_the_same_path_loss():
-    paths, expected = cb.Paths.load(LEGACY / "paths.h5"), EXPECTED["paths"]
-    assert set(paths.kind) == set(Kind)
-    assert len(paths.link) == expected["num_paths"]
-    other = paths.materials | {"stone": cb.Material(6.5, 0.1, 0.2, 0.3, 0.1)}
-    for loss, name in (
-        (cb.path_loss(paths), "path_loss_db"),
-        (cb.path_loss(paths, other), "other_path_loss_db"),
-        (cb.path_loss(paths, combining="coherent"), "coherent_path_loss_db"),
-    ):
-        assert loss == pytest.approx(np.array(expected[name]), rel=1e-12)
-    assert cb.path_loss(paths) != pytest.approx(cb.path_loss(paths, other), rel=1e-6)
-
-
 @pytest.mark.parametrize("name", ["replay", "program"])
 def test_a_result_holds_what_was_written(name, folder):
     written = json.loads((LEGACY / name / "result.json").read_text())

@@ -27,8 +27,7 @@ from calibray.optimizers import LeastSquares
 from calibray.optimizers.sampling import design
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind as InteractionKind
-from calibray.paths import Paths
-from calibray.paths.program import concatenate, take, take_links
+from calibray.paths import Paths, concatenate, take, take_links
 from calibray.scenes import read_scene
 from calibray.support.messages import did_you_mean
 from calibray.tracing import cache

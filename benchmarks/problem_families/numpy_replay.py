@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
 from scipy.sparse import csr_matrix
 
-from calibray.fields import material_table
 from calibray.fields.diffraction import affine_form
 from calibray.materials import FIELDS
 from calibray.parameters import Parameters
@@ -154,7 +153,7 @@ class NumpyReplay:
         self._diffuse = np.flatnonzero(paths.kind == Kind.DIFFUSE)
         self._groups = _by_kinds(paths)
         self._scale = paths.spreading * speed_of_light / paths.frequency / (4.0 * np.pi)
-        self._base = material_table(paths)
+        self._base = paths.material_table()
         self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         link = np.repeat(paths.link, np.diff(paths.first))
         place = np.concatenate([link, link[faces]]) * len(self._base) + self._material

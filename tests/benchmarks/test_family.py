@@ -10,7 +10,7 @@ from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.materials import Material
 from calibray.parameters import Parameter, Parameters
-from calibray.paths.program import take
+from calibray.paths import take
 from problem_families.family import LINKS, NOISE_DB, PARAMETERS, problem
 from problem_families.numpy_replay import NumpyReplay
 from problem_families.sites import district_site, office_site

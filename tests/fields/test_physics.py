@@ -38,8 +38,8 @@ def coefficients(
 ) -> tuple[complex, complex, complex, complex]:
     """R_te, R_tm, T_te and T_tm of a slab so many wavelengths thick."""
     arguments = [np.float64(value) for value in (cosine, permittivity, loss, wavelengths, 1.0)]
-    found = [_coefficients(*arguments, np.bool_(transmitted)) for transmitted in (False, True)]
-    return tuple(complex(real, imaginary) for pair in found for real, imaginary in pair)
+    pairs = [_coefficients(*arguments, np.bool_(transmitted)) for transmitted in (False, True)]
+    return tuple(complex(real, imaginary) for pair in pairs for real, imaginary in pair)
 
 
 _coefficients = jax.jit(slab.coefficients)
@@ -72,11 +72,11 @@ def test_slab_equals_the_characteristic_matrix_of_a_layer(
     eta = complex(eps, -loss)
     root = np.sqrt(eta - (1 - cosine**2))
     phase = 2 * np.pi * d * root
-    found = coefficients(cosine, eps, loss, d)
+    values = coefficients(cosine, eps, loss, d)
     # The transverse magnetic coefficient of the admittance form is that of H; P.2040 has the opposite sign.
     for r, t, sign, outside, inside in (
-        (found[0], found[2], 1, cosine, root),
-        (found[1], found[3], -1, 1 / cosine, eta / root),
+        (values[0], values[2], 1, cosine, root),
+        (values[1], values[3], -1, 1 / cosine, eta / root),
     ):
         a, b, c = np.cos(phase), 1j * np.sin(phase) / inside, 1j * np.sin(phase) * inside  # [[a, b], [c, a]]
         forward, backward = a + b * outside, c + a * outside
@@ -250,12 +250,6 @@ def test_band_average_against_numerical_integration() -> None:
     assert narrow[0] == pytest.approx(path_loss(paths, combining="coherent")[0], abs=1e-6)
 
 
-def test_ports_are_summed_at_the_receiver_and_averaged_at_the_transmitter() -> None:
-    paths = synthetic.program(synthetic.EVERY_KIND[:4], links=2, ports=(2, 2))
-    power = (np.abs(path_gains(paths)) ** 2).sum(axis=(1, 2)) / 2
-    np.testing.assert_allclose(path_loss(paths), -10 * np.log10(np.bincount(paths.link, power)), rtol=1e-12)
-
-
 # Reciprocity
 
 
@@ -284,13 +278,13 @@ def both_ways(
 def test_reflection_and_transmission_are_reciprocal() -> None:
     ends = np.array([[-20.0, 2, 15], [30.0, -3, 5]])
     others = np.random.default_rng(2).uniform((-8, -8, 1.5), (8, 8, 2.5), (3, 3))
-    there, back = both_ways(
+    forth, back = both_ways(
         "sionna:simple_street_canyon", ends, others, "VH", max_depth=3, refraction=True, samples=100_000
     )
-    assert there.num_interactions > 50
-    np.testing.assert_allclose(path_loss(there), path_loss(back), atol=1e-3)
-    new = {name: Material(3.0, 0.1, 0.15) for name in there.materials}
-    np.testing.assert_allclose(path_loss(there, new), path_loss(back, new), atol=1e-3)
+    assert forth.num_interactions > 50
+    np.testing.assert_allclose(path_loss(forth), path_loss(back), atol=1e-3)
+    new = {name: Material(3.0, 0.1, 0.15) for name in forth.materials}
+    np.testing.assert_allclose(path_loss(forth, new), path_loss(back, new), atol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -308,17 +302,17 @@ def port_loss(paths: Paths, port: int) -> np.ndarray:
 
 
 def test_diffraction_at_metal_is_reciprocal_across_the_edge(wedge_both_ways: tuple[Paths, Paths]) -> None:
-    there, back = wedge_both_ways
-    assert (there.kind == 8).any()
-    np.testing.assert_allclose(port_loss(there, 1), port_loss(back, 1), atol=1e-3)
+    forth, back = wedge_both_ways
+    assert (forth.kind == 8).any()
+    np.testing.assert_allclose(port_loss(forth, 1), port_loss(back, 1), atol=1e-3)
 
 
 def test_known_disagreement_of_sionna_2_2_diffraction_along_the_edge_is_not_reciprocal(
     wedge_both_ways: tuple[Paths, Paths],
 ) -> None:
-    """The same wrong sign as at reflection boundaries, see test_fidelity.py and docs/fidelity.md."""
-    there, back = wedge_both_ways
-    gap = np.abs(port_loss(there, 0) - port_loss(back, 0))
+    """Caused by the same wrong sign as at reflection boundaries, see test_fidelity.py and docs/fidelity.md."""
+    forth, back = wedge_both_ways
+    gap = np.abs(port_loss(forth, 0) - port_loss(back, 0))
     assert gap.max() > 0.1, "Sionna repaired it: expect a gap of 0, and correct docs/fidelity.md"
 
 

@@ -22,7 +22,7 @@ from calibray.fitting.search import rounds
 from calibray.materials import Material
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter, Parameters
-from calibray.paths.program import take
+from calibray.paths import take
 from calibray.reporting.result_tables import costs
 from calibray.study import Setup, Study
 from calibray.tables.text import render

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibray.engines.ledger.answers import LedgerEntry
 from calibray.fields import path_loss
-from calibray.paths.checksum import seal
+from calibray.paths import seal
 from calibray.study import Study
 from fuzzing import world
 from fuzzing.mutations import NUMBERS, TEXTS, damage, edited, hostile
@@ -52,7 +52,7 @@ def _field(rng: Random, file: Path) -> tuple[str, bool]:
                     content.attrs[key] = "x"
             case 1:
                 del content[name]
-                note, bad = f"without {name}", name != "interactions/vertex"  # which older files lack
+                note, bad = f"without {name}", True
             case 2:
                 shape = rng.choice([(0,), (), (*array.shape, 2), array.shape[::-1], (array.size + 1,)])
                 del content[name]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from itertools import pairwise
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
-from calibray.fields import path_gains, slab
+import reference_fields
 from calibray.materials import Material
 from calibray.paths import Kind, Paths
 from calibray.paths.chains import (
@@ -29,26 +28,25 @@ from calibray.paths.chains import (
 FREQUENCY = 3e9
 WALL = Material(4.0, 0.1, 0.07, scattering_coefficient=0.6)
 SAMPLES = 1000
-_coefficients = jax.jit(slab.coefficients)
 S, D, T = Kind.SPECULAR, Kind.DIFFUSE, Kind.REFRACTION
 SEQUENCES = [(), (S,), (T,), (D,), (S, T), (T, S, S), (S, D), (D, S, T), (T, D, D)]
 
 
 def random_chains(seed: int) -> Chains:
-    """Paths of every sequence that obey the law of reflection, in random places and directions."""
+    """Paths of every sequence that obey the law of reflection, at random positions and in random directions."""
     random = np.random.default_rng(seed)
     count, depth = len(SEQUENCES), max(map(len, SEQUENCES))
     kind = np.array([[*sequence, *[0] * (depth - len(sequence))] for sequence in SEQUENCES])
     vertex, normal = (
         np.full((count, depth, 3), 99.0),
         np.zeros((count, depth, 3)),
-    )  # 99: stale, as Sionna leaves it
+    )  # 99: unused entries, which Sionna does not clear
     source, direction = random.uniform(-9, 9, (count, 3)), unit(random.normal(size=(count, 3)))
-    here = source.copy()
+    position = source.copy()
     for step in range(depth):
         row = np.flatnonzero(kind[:, step])
-        here[row] += direction[row] * random.uniform(1, 9, (len(row), 1))
-        vertex[row, step] = here[row]
+        position[row] += direction[row] * random.uniform(1, 9, (len(row), 1))
+        vertex[row, step] = position[row]
         face = unit(random.normal(size=(len(row), 3)))
         normal[row, step] = face
         towards = face * -np.sign((face * direction[row]).sum(axis=1, keepdims=True))
@@ -61,7 +59,7 @@ def random_chains(seed: int) -> Chains:
         )
     return Chains(
         source=source,
-        target=here + direction * random.uniform(1, 9, (count, 1)),
+        target=position + direction * random.uniform(1, 9, (count, 1)),
         vertex=vertex,
         normal=normal,
         kind=kind,
@@ -104,9 +102,7 @@ def carried_in_space(chains: Chains, path: int) -> np.ndarray:
             te = unit(np.cross(k_in, n))
             tm, tm_out = np.cross(k_in, te), np.cross(k_out, te)
             cosine = abs(k_in @ n)
-            loss = slab.loss_term(WALL.conductivity, wavelength)
-            values = (cosine, WALL.relative_permittivity, loss, WALL.thickness, wavelength, kind == T)
-            c_te, c_tm = (complex(*pair) for pair in _coefficients(*values))
+            c_te, c_tm = reference_fields.slab(cosine, WALL, FREQUENCY)[kind == T]
             if kind == D:
                 reflected = np.hypot(abs(c_te * (field @ te)), abs(c_tm * (field @ tm)))
                 gamma = reflected / np.linalg.norm(field)
@@ -142,6 +138,7 @@ def as_paths(geometry: Geometry, count: int) -> Paths:
         arrival=zenith_azimuth(-geometry.arrival_direction),
         tx_field=turned(geometry.departure_rotation),
         rx_field=turned(geometry.arrival_rotation * [1, -1]),
+        vertex=np.zeros((len(geometry.kind), 3), dtype=np.float32),
         **{name: getattr(geometry, name) for name in shared},
     )
 
@@ -149,10 +146,10 @@ def as_paths(geometry: Geometry, count: int) -> Paths:
 @pytest.mark.parametrize("seed", range(5))
 def test_chain_of_frames_equals_the_field_carried_in_space(seed: int) -> None:
     chains = random_chains(seed)
-    found = path_gains(as_paths(compile_chains(chains), len(SEQUENCES)))
+    gains = reference_fields.gains(as_paths(compile_chains(chains), len(SEQUENCES)))
     for path, sequence in enumerate(SEQUENCES):
         expected = carried_in_space(chains, path)
-        np.testing.assert_allclose(found[path], expected, rtol=1e-9, atol=1e-12, err_msg=str(sequence))
+        np.testing.assert_allclose(gains[path], expected, rtol=1e-9, atol=1e-12, err_msg=str(sequence))
 
 
 def assert_same(one: Geometry, other: Geometry) -> None:
@@ -162,7 +159,7 @@ def assert_same(one: Geometry, other: Geometry) -> None:
             np.testing.assert_allclose(a, b, atol=1e-9, err_msg=entry.name)
 
 
-def test_either_side_of_a_surface_may_be_called_its_front() -> None:
+def test_normals_may_point_to_either_side() -> None:
     chains = random_chains(1)
     assert_same(compile_chains(chains), compile_chains(replace(chains, normal=-chains.normal)))
 
@@ -181,9 +178,11 @@ def test_scene_may_be_moved_and_turned_about_the_vertical() -> None:
         vertex=moved(chains.vertex),
         normal=moved(chains.normal, by=0.0),
     )
-    here, there = compile_chains(chains), compile_chains(other)
+    original, transformed = compile_chains(chains), compile_chains(other)
     for name in ("delay", "spreading", "cos_incidence", "rotation", "departure_rotation", "arrival_rotation"):
-        np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(original, name), getattr(transformed, name), atol=1e-9, err_msg=name
+        )
 
 
 def test_lengths_delays_and_solid_angles() -> None:
@@ -210,7 +209,7 @@ INSIDE_OUT = st.floats(0.05, 0.95)
 
 
 @given(st.floats(1.05, 1.95), INSIDE_OUT, INSIDE_OUT, st.floats(-2, 2), st.integers(0, 99))
-def test_angles_of_a_wedge_are_those_it_was_built_with(
+def test_angles_of_a_wedge_equal_those_of_its_construction(
     exterior: float, share_in: float, share_out: float, along: float, seed: int
 ) -> None:
     """A wedge with its edge through the origin, turned at random; exterior angle in units of pi."""
@@ -224,21 +223,21 @@ def test_angles_of_a_wedge_are_those_it_was_built_with(
     source, target = around(azimuth[0], before, -along * before), around(azimuth[1], after, along * after)
     # Faces along azimuth 0 and azimuth `exterior`, normals into the exterior.
     normal_0, normal_n = np.array([0.0, 1, 0]), np.array([np.sin(exterior), -np.cos(exterior), 0.0])
-    place = [
+    placed = [
         turn.apply(vector)[None] for vector in (source, target, normal_0, normal_n, np.array([0.0, 0, 1]))
     ]
     sine = 1 / np.sqrt(1 + along**2)
     chains = Chains(
-        source=place[0],
-        target=place[1],
+        source=placed[0],
+        target=placed[1],
         vertex=np.zeros((1, 1, 3)),
-        normal=place[2][None],
+        normal=placed[2][None],
         kind=np.array([[Kind.DIFFRACTION]]),
         material=np.zeros((1, 1), dtype=int),
         probability=np.ones((1, 1)),
         samples=SAMPLES,
-        edge=place[4],  # n_0 x edge points along the 0-face, away from the edge
-        normal_n=place[3],
+        edge=placed[4],  # n_0 x edge points along the 0-face, away from the edge
+        normal_n=placed[3],
         edge_lengths=np.array([[before, after]]) / sine,
     )
     geometry = compile_chains(chains)
@@ -259,7 +258,7 @@ def test_angles_of_a_wedge_are_those_it_was_built_with(
 
 
 @given(st.integers(0, 1000))
-def test_spherical_basis_is_that_of_the_angles(seed: int) -> None:
+def test_spherical_basis_follows_from_the_angles(seed: int) -> None:
     direction = unit(np.random.default_rng(seed).normal(size=3))
     zenith, azimuth = zenith_azimuth(direction)
     np.testing.assert_allclose(
@@ -270,7 +269,7 @@ def test_spherical_basis_is_that_of_the_angles(seed: int) -> None:
     np.testing.assert_allclose(spherical_basis(direction), theta_phi(direction)[0], atol=1e-12)
 
 
-def test_reference_next_to_the_poles_is_sionnas() -> None:
+def test_reference_near_the_poles_equals_sionnas() -> None:
     for tilt in (0.0, 1e-7, 1e-4, 5e-4):
         for sign in (1, -1):
             direction = np.array([np.sin(tilt), 0.0, sign * np.cos(tilt)])

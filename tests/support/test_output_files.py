@@ -50,7 +50,7 @@ def test_an_output_may_be_replaced_unless_it_was_changed(tmp_path):
 def test_path_files_are_recognised_without_a_signature(tmp_path):
     file = tmp_path / "paths.h5"
     with h5py.File(file, "w") as content:
-        content.attrs["schema"] = "calibray/paths"
+        content.attrs["format"] = "calibray/paths"
     assert not is_unchanged_output(file)
     seal(file)
     (tmp_path / SIGNATURES).unlink()

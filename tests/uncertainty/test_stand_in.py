@@ -14,9 +14,6 @@ from calibray.calibration.result import Result
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.optimizers import LeastSquares, VectorSurrogate
-from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.discrepancy import Seen
-from calibray.optimizers.multifidelity.sampled_functions import drawn, surprise
 from calibray.reporting import result_tables as tables
 from calibray.result.wording import reason_text
 from calibray.study import Setup, Study

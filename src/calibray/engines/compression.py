@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
@@ -170,13 +169,13 @@ def _evaluate_all(
     totals, errors = [], []
     for values in candidates:
         tables = parameters.constants_of(values, paths.materials).astype(np.float32)
-        loss, error = path_losses(plan.program, jnp.asarray(tables))
+        loss, error = path_losses(plan.program, tables)
         totals.append(10 ** (-np.asarray(loss, dtype=float) / 10))
         errors.append(error)
     strength = np.zeros(paths.num_paths)
     for candidate, total in zip(candidates[0][:RANKING], totals[0], strict=False):
         table = parameters.constants_of(candidate[None], paths.materials)[0].astype(np.float32)
-        power = np.asarray(path_powers(plan.program, jnp.asarray(table)))
+        power = np.asarray(path_powers(plan.program, table))
         strength[plan.order] += power / np.where(total > 0, total, np.inf)[paths.link[plan.order]]
     return totals, strength, max(errors)
 
@@ -213,7 +212,7 @@ class _Powers:
     def at(self, set_index: int, paths: slice) -> NDArray[np.float64]:
         """Powers of some paths at one set of candidates [n, paths]."""
         if set_index not in self._powers:
-            tables = jnp.asarray(self._tables[set_index].astype(np.float32))
+            tables = self._tables[set_index].astype(np.float32)
             powers = [np.asarray(path_powers(self._program, table)) for table in tables]
             self._powers[set_index] = np.stack(powers)
         return self._powers[set_index][:, self._position[paths]].astype(float)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
@@ -70,14 +68,13 @@ class Replay:
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
         self._dtype, self._batch = dtype, batch
-        self._offsets = fields.check_combining(paths, combining, bandwidth)
-        self._combining = combining
+        self._combining = fields.Combining.make(combining, paths.link, paths.delay, bandwidth)
         # Row (material) and column (constant) of each parameter in the table of constants. Derivatives are computed for
         # the columns that occur, and then picked for each parameter.
         self._rows, self._columns = parameters.matrix_indices(list(paths.materials))
         used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
         self._used_columns = tuple(int(column) for column in used_columns)
-        self._base = fields.material_table(paths).astype(dtype)
+        self._base = paths.material_table().astype(dtype)
         self._intervals = None if tabulate is False else self._table_intervals(force=tabulate is True)
         self._program = self._compile()
 
@@ -103,14 +100,16 @@ class Replay:
         loss, jacobian = self._run(self._path_losses_and_jacobian, candidates)
         return loss, jacobian
 
-    def _path_losses(self, tables: jax.Array, count: int) -> tuple[jax.Array, float]:
-        return fields.path_losses(self._program, tables, self._combining, self._offsets, count)
+    def _path_losses(self, tables: NDArray[np.floating], count: int) -> tuple[NDArray[np.floating], float]:
+        return fields.path_losses(self._program, tables, self._combining, count)
 
-    def _path_losses_and_jacobian(self, tables: jax.Array, count: int) -> tuple[jax.Array, jax.Array, float]:
+    def _path_losses_and_jacobian(
+        self, tables: NDArray[np.floating], count: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
         loss, slope, error = fields.path_losses_and_slopes(
-            self._program, tables, self._used_columns, self._combining, self._offsets, count
+            self._program, tables, self._used_columns, self._combining, count
         )
-        return loss, _pick(slope, self._rows, self._used_column), error
+        return loss, slope[:, :, self._rows, self._used_column], error
 
     def _run(self, function: Callable, candidates: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         values = check_candidates(candidates, len(self.parameters)).astype(self._dtype)
@@ -121,11 +120,11 @@ class Replay:
             # The program is compiled for `size` candidates: the rest of the tables keep the base values.
             tables = np.repeat(self._base[None], size, axis=0)
             tables[: len(batch), self._rows, self._columns] = batch
-            *answers, table_error = function(jnp.asarray(tables), len(batch))
+            *answers, table_error = function(tables, len(batch))
             if table_error > TABLE_TOLERANCE:
                 self._refine_tables()
                 continue
-            batches.append([np.asarray(answer, dtype=float)[: len(batch)] for answer in answers])
+            batches.append([np.asarray(answer, dtype=float) for answer in answers])
             start += len(batch)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
@@ -148,7 +147,7 @@ class Replay:
         self._program = self._compile()
 
     def _compile(self) -> fields.GroupedProgram:
-        return fields.layout(self.paths, self._dtype, self._intervals, self._combining != "power").program
+        return fields.layout(self.paths, self._dtype, self._intervals, self._combining.kind != "power").program
 
     def _batch_size(self) -> int:
         """Candidates in one call: a power of two within the limits, or one if tables are filled for each candidate."""
@@ -157,8 +156,3 @@ class Replay:
         per_candidate = self.paths.num_links * len(self.materials) * len(self._used_columns)
         most = max(MOST_DERIVATIVES // max(per_candidate, 1), 1)
         return min(self._batch, 1 << most.bit_length() - 1)
-
-
-@jax.jit
-def _pick(slope: jax.Array, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> jax.Array:
-    return slope[:, :, rows, columns]

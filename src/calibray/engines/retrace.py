@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from threading import Event
 from typing import final
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,11 +86,7 @@ class Retrace:
         tracer = carrier.tracer
         materials = self.parameters.materials(candidate, tracer.scene.materials, tracer.frequency)
         solution = tracer.solve(carrier.links, materials)
-        gain, link, delay = solution.gain, solution.link, solution.delay
-        offsets = fields.band_quadrature(link, delay, self._bandwidth) if self._combining == "band" else None
-        # Sionna's arrays are [paths, receive, transmit]; the field functions expect paths last.
-        real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
-        power = fields.link_power(
-            (real, imaginary), link, delay, len(carrier.links), tracer.frequency, self._combining, offsets
+        combining = fields.Combining.make(self._combining, solution.link, solution.delay, self._bandwidth)
+        return fields.path_loss_of_gains(
+            solution.gain, solution.link, solution.delay, len(carrier.links), tracer.frequency, combining
         )
-        return np.asarray(fields.decibel(power))

@@ -1,28 +1,15 @@
 """Fields along stored paths, for any materials: pure JAX, batched over candidates, with derivatives.
 
-A path's gain is (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx. Complex numbers are pairs of real arrays, a form that
-compilers vectorize. Precision follows the program: float64 by default, as `jax_enable_x64` is switched on here.
+The gain of a path is a = (lambda / 4 pi) A E_rx^H J_K ... J_1 E_tx, with amplitude spreading A, antenna fields E and
+one Jones matrix J for each interaction.
+
+Programs are in double precision by default, single on request. Functions compute under their own JAX settings
+(`calibray.fields.jax_settings`); importing the package changes none of JAX's.
 """
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-# Programs run where they are called from: to hand a small one to another thread takes longer than to run it. Large ones
-# share their work out to threads all the same.
-jax.config.update("jax_cpu_enable_async_dispatch", False)
-
-from calibray.fields.xla_cache import keep_compiled  # noqa: E402
-
-keep_compiled()
-
-from calibray.fields.combining import (  # noqa: E402
-    COMBINING,
-    band_quadrature,
-    check_combining,
-    decibel,
-    link_power,
-)
-from calibray.fields.evaluation import (  # noqa: E402
+from calibray.fields.coefficient_tables import FINEST, table_intervals
+from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
+from calibray.fields.evaluation import (
     path_gains,
     path_loss,
     path_losses,
@@ -30,22 +17,20 @@ from calibray.fields.evaluation import (  # noqa: E402
     path_powers,
     program_path_loss,
 )
-from calibray.fields.program import GroupedProgram, Layout, layout, material_table  # noqa: E402
-from calibray.fields.resolution import FINEST, table_intervals  # noqa: E402
+from calibray.fields.jax_context import jax_settings
+from calibray.fields.program import GroupedProgram, Layout, layout
 
 __all__ = [
     "COMBINING",
     "FINEST",
+    "Combining",
     "GroupedProgram",
     "Layout",
-    "band_quadrature",
-    "check_combining",
-    "decibel",
+    "jax_settings",
     "layout",
-    "link_power",
-    "material_table",
     "path_gains",
     "path_loss",
+    "path_loss_of_gains",
     "path_losses",
     "path_losses_and_slopes",
     "path_powers",

@@ -1,7 +1,8 @@
-"""What else stored paths tell about a link, for any materials: delays, angles and power delay profiles.
+"""Delays, angles and power delay profiles of links, for any materials.
 
-All are weighted means over a link's paths with the paths' powers as weights, so they follow the materials as smoothly
-as path loss does. `statistics` and `delay_profile` are pure JAX, differentiable through `calibray.fields.path_powers`.
+All are means over a link's paths weighted by the paths' powers, so they depend on the materials as smoothly as path
+loss does. `statistics` and `delay_profile` are pure JAX; with `calibray.fields.path_powers` they can be differentiated
+by the materials, within `calibray.fields.jax_settings`.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray import fields
 from calibray.errors import InputError
-from calibray.fields import GroupedProgram, path_powers
+from calibray.fields.evaluation import path_powers
+from calibray.fields.jax_context import jax_settings
+from calibray.fields.program import GroupedProgram, layout
 from calibray.materials import Material
 from calibray.paths import Paths
 
@@ -33,9 +35,9 @@ class ChannelStatistics:
 
     Attributes:
         mean_delay: Mean delay [L], [s].
-        delay_spread: Root mean square delay spread [L], [s] (ITU-R P.1407-8 eq. 3).
+        delay_spread: Root mean square delay spread [L], [s].
         k_factor_db: Power of the strongest path over that of all others [L], [dB]; +inf for a single path.
-        departure_spread: Azimuth spread of departure [L], [rad] (3GPP TR 38.901 annex A.1).
+        departure_spread: Azimuth spread of departure [L], [rad].
         arrival_spread: Azimuth spread of arrival [L], [rad].
     """
 
@@ -46,6 +48,7 @@ class ChannelStatistics:
     arrival_spread: jax.Array
 
 
+@jax_settings()
 def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = None) -> ChannelStatistics:
     """Delay spread, K-factor and angular spreads of every link for any materials.
 
@@ -59,10 +62,9 @@ def channel_statistics(paths: Paths, materials: Mapping[str, Material] | None = 
     Raises:
         InputError: A material is unknown.
     """
-    plan = fields.layout(paths)
-    azimuth = jnp.asarray(paths.departure[plan.order, 1]), jnp.asarray(paths.arrival[plan.order, 1])
-    found = _statistics(plan.program, jnp.asarray(fields.material_table(paths, materials)), *azimuth)
-    return jax.tree.map(np.asarray, found)
+    plan, table = layout(paths), jnp.asarray(paths.material_table(materials))
+    azimuths = jnp.asarray(paths.departure[plan.order, 1]), jnp.asarray(paths.arrival[plan.order, 1])
+    return jax.tree.map(np.asarray, _statistics(plan.program, table, *azimuths))
 
 
 @jax.jit
@@ -88,32 +90,34 @@ def statistics(
     """
     link, delay = program.phases
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=program.num_links)
-    whole = total(power)
-    reached = whole > 0
-    divisor = jnp.where(reached, whole, 1.0)
+    link_power = total(power)
+    reached = link_power > 0
+    divisor = jnp.where(reached, link_power, 1.0)
 
     def mean(value: jax.Array) -> jax.Array:
         return jnp.where(reached, total(power * value) / divisor, jnp.nan)
 
     mean_delay = mean(delay)
-    late = delay - jnp.nan_to_num(mean_delay)[link]
+    excess_delay = delay - jnp.nan_to_num(mean_delay)[link]
     strongest = jax.ops.segment_max(power, link, program.num_links)
-    rest = whole - strongest
+    rest = link_power - strongest
     ratio = jnp.where(rest > 0, strongest / jnp.where(rest > 0, rest, 1.0), jnp.inf)
 
-    def spread(angle: jax.Array) -> jax.Array:
+    def azimuth_spread(angle: jax.Array) -> jax.Array:
+        # 3GPP TR 38.901 annex A.1: sqrt(-2 ln |sum P e^{j phi} / sum P|)
         resultant = jnp.hypot(mean(jnp.cos(angle)), mean(jnp.sin(angle)))
         return jnp.sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
 
     return ChannelStatistics(
         mean_delay=mean_delay,
-        delay_spread=jnp.sqrt(mean(late**2)),
+        delay_spread=jnp.sqrt(mean(excess_delay**2)),  # ITU-R P.1407-8 eq. 3
         k_factor_db=jnp.where(reached, 10 * jnp.log10(ratio), jnp.nan),
-        departure_spread=spread(departure),
-        arrival_spread=spread(arrival),
+        departure_spread=azimuth_spread(departure),
+        arrival_spread=azimuth_spread(arrival),
     )
 
 
+@jax_settings()
 def power_delay_profile(
     paths: Paths, delays: NDArray[np.float64], materials: Mapping[str, Material] | None = None
 ) -> NDArray[np.float64]:
@@ -132,9 +136,11 @@ def power_delay_profile(
     """
     edges = np.asarray(delays, dtype=float)
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
-        raise InputError(f"delays: {len(edges)} edges, must be two or more increasing numbers [s]")
-    program = fields.layout(paths).program
-    power = path_powers(program, jnp.asarray(fields.material_table(paths, materials)))
+        raise InputError(
+            f"delays: an array of shape {edges.shape}; must be two or more increasing bin edges [s]"
+        )
+    program = layout(paths).program
+    power = path_powers(program, paths.material_table(materials))
     return np.asarray(delay_profile(program, power, jnp.asarray(edges)))
 
 
@@ -150,9 +156,10 @@ def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -
         Power gains [L, n].
     """
     link, delay = program.phases
-    bins = edges.shape[0] - 1
-    place = jnp.searchsorted(edges, delay, side="right") - 1
-    inside = (place >= 0) & (place < bins)
-    target = jnp.where(inside, link * bins + place, 0)
-    total = jax.ops.segment_sum(jnp.where(inside, power, 0.0), target, program.num_links * bins)
-    return total.reshape(program.num_links, bins)
+    num_bins = edges.shape[0] - 1
+    index = jnp.searchsorted(edges, delay, side="right") - 1
+    inside = (index >= 0) & (index < num_bins)
+    # Paths outside the edges add 0 to the first bin.
+    segment = jnp.where(inside, link * num_bins + index, 0)
+    total = jax.ops.segment_sum(jnp.where(inside, power, 0.0), segment, program.num_links * num_bins)
+    return total.reshape(program.num_links, num_bins)

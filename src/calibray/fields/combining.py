@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -11,87 +12,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.fields import slab
-from calibray.fields.trigonometry import circle
-from calibray.paths import Paths
-
-Offsets = jax.Array | NDArray[np.float64] | None
-"""Frequencies relative to the carrier [Hz] and weights [2, q]; None where the sum is at the carrier alone."""
+from calibray.fields.arithmetic import Pair, cosine_and_sine, multiply, squared_magnitude
+from calibray.fields.jax_context import jax_settings
 
 COMBINING: Final = ("power", "coherent", "band")
+"""Names of the ways of combining paths."""
 
 
-def path_power(gain: slab.Pair) -> jax.Array:
-    """Power gain of every path, summed over receive ports and averaged over transmit ports.
+@partial(jax.tree_util.register_dataclass, data_fields=["nodes"], meta_fields=["kind"])
+@dataclass(frozen=True)
+class Combining:
+    """How the paths of a link combine.
 
-    Args:
-        gain: Path gains, real and imaginary part [R, T, P].
-
-    Returns:
-        Power gains [P].
+    Attributes:
+        kind: "power": sum |a|^2; "coherent": |sum a e^{-j 2 pi f tau}|^2; "band": the average of the coherent power
+            over a band.
+        nodes: For "band": frequencies relative to the carrier [Hz] and weights [2, q]; else None.
     """
-    return slab.power(gain).sum(axis=(0, 1)) / gain[0].shape[1]
+
+    kind: str = "power"
+    nodes: NDArray[np.float64] | None = None
+
+    @classmethod
+    def make(
+        cls,
+        kind: str,
+        link: NDArray[np.integer],
+        delay: NDArray[np.float64],
+        bandwidth: float | None = None,
+    ) -> Combining:
+        """Check a way of combining and prepare it for some paths.
+
+        Args:
+            kind: "power", "coherent" or "band".
+            link: Link of every path, non-decreasing [P].
+            delay: Delay of every path [P], [s].
+            bandwidth: Bandwidth [Hz], for "band".
+
+        Returns:
+            The way of combining.
+
+        Raises:
+            InputError: The kind is unknown, or the bandwidth is missing or not positive.
+        """
+        if kind not in COMBINING:
+            raise InputError(f"combining = {kind!r}: must be one of {', '.join(COMBINING)}")
+        return cls(kind, _band_nodes(link, delay, bandwidth) if kind == "band" else None)
 
 
-def link_power(
-    gain: slab.Pair,
-    link: jax.Array | NDArray[np.integer],
-    delay: jax.Array | NDArray[np.float64],
-    num_links: int,
-    frequency: jax.Array | float,
-    combining: str = "power",
-    offsets: Offsets = None,
-) -> jax.Array:
-    """Power gain of every link from its path gains.
-
-    With several ports the power is summed over receive ports and averaged over transmit ports.
-
-    Args:
-        gain: Path gains, real and imaginary part [R, T, P].
-        link: Link of every path [P].
-        delay: Delay of every path [P], [s].
-        num_links: Number of links L.
-        frequency: Carrier frequency [Hz].
-        combining: "power": sum |a|^2; "coherent": |sum a e^{-j 2 pi f tau}|^2; "band": the average of the coherent
-            power over a band.
-        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
-
-    Returns:
-        Power gain [L]; 0 where a link has no path.
-    """
-    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
-    if combining == "power":
-        return total(path_power(gain))
-    ports = gain[0].shape[1]
-    nodes = jnp.array([[0.0], [1.0]]) if offsets is None else jnp.asarray(offsets)
-    phase = -2 * jnp.pi * jnp.asarray(delay)[:, None] * (frequency + nodes[0])  # [P, q]
-    turn = circle(phase)
-    rotated = slab.multiply((gain[0][..., None], gain[1][..., None]), turn)  # [R, T, P, q]
-    real, imaginary = (total(jnp.moveaxis(part, 2, 0)) for part in rotated)  # [L, R, T, q]
-    return (slab.power((real, imaginary)) * nodes[1]).sum(axis=(1, 2, 3)) / ports
+POWER: Final = Combining()
+"""The sum of powers."""
 
 
-def decibel(power: jax.Array) -> jax.Array:
-    """Path loss [dB] of power gains; +inf where the power is 0."""
-    reached = power > 0
-    return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
-
-
-def band_quadrature(
+def _band_nodes(
     link: NDArray[np.integer], delay: NDArray[np.float64], bandwidth: float | None
 ) -> NDArray[np.float64]:
-    """Gauss-Legendre nodes over a band, enough for the largest spread of delays within a link.
+    """Gauss-Legendre nodes and weights over a band [2, q], enough for the largest spread of delays within a link.
 
-    The average of |H|^2 over the band holds oscillations e^{j 2 pi f (tau_i - tau_j)}; a rule with n nodes integrates
-    them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
-
-    Args:
-        link: Link of every path, non-decreasing [P].
-        delay: Delay of every path [P], [s].
-        bandwidth: Bandwidth [Hz].
-
-    Returns:
-        Frequencies relative to the carrier [Hz] and weights that sum to 1 [2, q].
+    The average of |H|^2 over the band contains oscillations e^{j 2 pi f (tau_i - tau_j)}. A rule with n nodes
+    integrates them to machine precision once n exceeds about a quarter of their phase [rad] plus ten.
 
     Raises:
         InputError: The bandwidth is not positive.
@@ -106,20 +85,80 @@ def band_quadrature(
     return np.stack([nodes * bandwidth / 2, weights / 2])
 
 
-def check_combining(paths: Paths, combining: str, bandwidth: float | None) -> NDArray[np.float64] | None:
-    """The quadrature that a way of combining needs.
+def path_power(gain: Pair) -> jax.Array:
+    """Power gain of every path, summed over receive ports and averaged over transmit ports.
 
     Args:
-        paths: The path program.
-        combining: "power", "coherent" or "band".
-        bandwidth: Bandwidth [Hz], for "band".
+        gain: Path gains, real and imaginary part [R, T, P].
 
     Returns:
-        Nodes and weights for "band" [2, q], else None.
-
-    Raises:
-        InputError: The combining is unknown, or the bandwidth is missing.
+        Power gains [P].
     """
-    if combining not in COMBINING:
-        raise InputError(f"combining = {combining!r}: must be one of {', '.join(COMBINING)}")
-    return band_quadrature(paths.link, paths.delay, bandwidth) if combining == "band" else None
+    return squared_magnitude(gain).sum(axis=(0, 1)) / gain[0].shape[1]
+
+
+def link_power(
+    gain: Pair,
+    link: jax.Array | NDArray[np.integer],
+    delay: jax.Array | NDArray[np.float64],
+    num_links: int,
+    frequency: jax.Array | float,
+    combining: Combining = POWER,
+) -> jax.Array:
+    """Power gain of every link from its path gains.
+
+    With several ports the power is summed over receive ports and averaged over transmit ports.
+
+    Args:
+        gain: Path gains, real and imaginary part [R, T, P].
+        link: Link of every path [P].
+        delay: Delay of every path [P], [s].
+        num_links: Number of links L.
+        frequency: Carrier frequency [Hz].
+        combining: How the paths combine.
+
+    Returns:
+        Power gain [L]; 0 where a link has no path.
+    """
+    total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
+    if combining.kind == "power":
+        return total(path_power(gain))
+    ports = gain[0].shape[1]
+    nodes = jnp.array([[0.0], [1.0]]) if combining.nodes is None else jnp.asarray(combining.nodes)
+    phase = -2 * jnp.pi * jnp.asarray(delay)[:, None] * (frequency + nodes[0])  # -2 pi f tau [P, q]
+    turn = cosine_and_sine(phase)
+    turned = multiply((gain[0][..., None], gain[1][..., None]), turn)  # a e^{-j 2 pi f tau} [R, T, P, q]
+    real, imaginary = (total(jnp.moveaxis(part, 2, 0)) for part in turned)  # [L, R, T, q]
+    return (squared_magnitude((real, imaginary)) * nodes[1]).sum(axis=(1, 2, 3)) / ports
+
+
+def decibel(power: jax.Array) -> jax.Array:
+    """Path loss -10 log10(power) of power gains [dB]; +inf where the power is 0."""
+    reached = power > 0
+    return jnp.where(reached, -10 * jnp.log10(jnp.where(reached, power, 1.0)), jnp.inf)
+
+
+@jax_settings()
+def path_loss_of_gains(
+    gain: NDArray[np.complex128],
+    link: NDArray[np.integer],
+    delay: NDArray[np.float64],
+    num_links: int,
+    frequency: float,
+    combining: Combining = POWER,
+) -> NDArray[np.float64]:
+    """Path loss of every link from complex path gains.
+
+    Args:
+        gain: Path gains [P, R, T].
+        link: Link of every path [P].
+        delay: Delay of every path [P], [s].
+        num_links: Number of links L.
+        frequency: Carrier frequency [Hz].
+        combining: How the paths combine.
+
+    Returns:
+        Path loss [L], [dB]; +inf where a link has no path.
+    """
+    real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
+    return np.asarray(decibel(link_power((real, imaginary), link, delay, num_links, frequency, combining)))

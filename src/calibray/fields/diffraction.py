@@ -1,8 +1,8 @@
-"""First-order diffraction at wedges: the uniform theory's part that does not depend on the materials.
+"""First-order diffraction at wedges: the part of the uniform theory (UTD) that does not depend on the materials.
 
 The Jones matrix of a diffracted ray is affine in the reflection coefficients of the wedge's two faces,
-J = C_0 + R_te(0) C_1 + R_tm(0) C_2 + R_te(n) C_3 + R_tm(n) C_4, with constant matrices C_k: the same form as a
-reflection, with four coefficients in place of two.
+J = C_0 + R_te(0) C_1 + R_tm(0) C_2 + R_te(n) C_3 + R_tm(n) C_4, with constant matrices C_k. It therefore has the form
+of a reflection with four coefficients instead of two.
 """
 
 from __future__ import annotations
@@ -29,26 +29,28 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
     exterior, phi_in, phi_out = table.exterior_angle[row], table.azimuth_in[row], table.azimuth_out[row]
     wavenumber = 2 * np.pi * frequency / speed_of_light
     n = exterior / np.pi
+    # Common factor of the four terms: -e^{-j pi/4} / (2 n sqrt(2 pi k) sin beta_0)
     scale = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * wavenumber) * table.sin_edge[row])
     size = wavenumber * table.distance[row]  # k L
     difference, total = phi_out - phi_in, phi_out + phi_in
 
     def term(sign: int, beta: NDArray[np.float64]) -> NDArray[np.complex128]:
         """One of the four terms D_i (Kouyoumjian and Pathak 1974, eq. 25; ITU-R P.526-15 eqs. 66-69)."""
+        # a(beta) = 2 cos^2((2 n pi N - beta) / 2), N the integer that best meets 2 pi n N - beta = +-pi
         turns = np.round((beta + sign * np.pi) / (2 * exterior))
         a = 2 * np.cos(exterior * turns - beta / 2) ** 2
         return scale * _cotangent_times_transition((np.pi + sign * beta) / (2 * n), size * a, n, size)
 
-    zero = term(1, difference) - term(-1, total)
-    other = term(-1, difference) - term(1, total)
+    zero_face = term(1, difference) - term(-1, total)
+    n_face = term(-1, difference) - term(1, total)
     in_0, out_0, in_n, out_n = (_matrix(table.rotations[row, k]) for k in range(4))
-    wide = exterior > np.pi + phi_in  # the n-face is not lit: R_n = -1
-    lit = np.where(wide, 0.0, other)
+    unlit = exterior > np.pi + phi_in  # the n-face is not lit: R_n = -1
+    lit_n_face = np.where(unlit, 0.0, n_face)
     form = np.zeros((5, 2, 2, len(row)), dtype=complex)
-    form[0] = np.where(wide, -other, 0.0) * np.eye(2)[:, :, None]
+    form[0] = np.where(unlit, -n_face, 0.0) * np.eye(2)[:, :, None]
     for component in range(2):
-        form[1 + component] = zero * out_0[:, None, component] * in_0[None, component, :]
-        form[3 + component] = lit * out_n[:, None, component] * in_n[None, component, :]
+        form[1 + component] = zero_face * out_0[:, None, component] * in_0[None, component, :]
+        form[3 + component] = lit_n_face * out_n[:, None, component] * in_n[None, component, :]
     return form
 
 
@@ -68,7 +70,7 @@ def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
 def _cotangent_times_transition(
     psi: NDArray[np.float64], x: NDArray[np.float64], n: NDArray[np.float64], size: NDArray[np.float64]
 ) -> NDArray[np.complex128]:
-    """cot(psi) F(x), finite where the cotangent's pole meets F's zero, on shadow and reflection boundaries."""
+    """cot(psi) F(x). On shadow and reflection boundaries a pole meets a zero of F, and the limit is finite."""
     sine = np.sin(psi)
     pole = np.abs(sine) < 1e-9
     limit = np.where(sine >= 0, 1.0, -1.0) * n * np.sqrt(2 * np.pi * size) * np.exp(0.25j * np.pi)
@@ -76,6 +78,6 @@ def _cotangent_times_transition(
 
 
 def _matrix(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(cos, sin) as the matrix that turns a Jones vector's frame [2, 2, n]."""
+    """(cos, sin) as the matrix that rotates a Jones vector's frame [2, 2, n]."""
     cos, sin = rotation.T
     return np.array([[cos, sin], [-sin, cos]])

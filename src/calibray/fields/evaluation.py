@@ -1,10 +1,12 @@
 """Path loss of every link of a program, and its derivatives, for batches of candidates.
 
-Where coefficients are evaluated by the formula, a batch is one compiled loop over its candidates: the numbers of one
-candidate stay in a core's nearest cache, and fewer candidates cost less. Within it, stages are held apart
-(`slab.keep`): XLA on CPU would otherwise fuse each into all its uses and repeat it there. Large programs, whose
-coefficients lie in tables, are evaluated in stages compiled apart; looking them up, carrying the fields along and
-taking the power are one of these, which reads every constant once and writes one number a path.
+With the slab formula, a batch is one compiled loop over its candidates: the numbers of one candidate stay in a core's
+nearest cache, and fewer candidates cost less. Within it, the stages are materialized
+(`calibray.fields.arithmetic.materialize`), because XLA on CPU would otherwise fuse each stage into all its uses and
+repeat it there.
+
+Large programs with tables are evaluated in stages that are compiled separately. Looking coefficients up, carrying the
+fields along and taking the power form one stage, which reads every constant once and writes one number a path.
 """
 
 from __future__ import annotations
@@ -17,23 +19,35 @@ from typing import Final, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from calibray.fields import slab, tabulation
-from calibray.fields.combining import Offsets, check_combining, decibel, link_power, path_power
-from calibray.fields.contributions import Contributions, Pieces, contributions, pieces, tangents
-from calibray.fields.program import Formula, GroupedProgram, layout, material_table
+from calibray.fields import coefficient_tables
+from calibray.fields.arithmetic import materialize
+from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
+from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
+from calibray.fields.grouping import COEFFICIENT
+from calibray.fields.jax_context import jax_settings
+from calibray.fields.material_response import (
+    GroupResponse,
+    MaterialResponse,
+    material_response,
+    response_and_derivatives,
+    split_by_step,
+)
+from calibray.fields.program import FormulaArguments, GroupedProgram, layout
 from calibray.fields.propagation import path_fields
-from calibray.fields.segments import total
+from calibray.fields.segment_sums import segment_sums
 from calibray.materials import Material
 from calibray.paths import Paths
 
-WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
-"""How formulas are compiled, in bits: XLA prefers 256 even where a processor takes eight numbers at once. A processor
-without such instructions is given those that it has; the numbers are the same."""
+_WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
+"""Compile for vectors of 512 bits. XLA prefers 256 even on processors with wider instructions; on others the option has
+no effect. The numbers are the same."""
 
 
+@jax_settings()
 def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
     """Path gains for any materials, equal to Sionna RT's `Paths.a` for the same materials.
 
@@ -48,11 +62,11 @@ def path_gains(paths: Paths, materials: Mapping[str, Material] | None = None) ->
         InputError: A material is unknown.
     """
     plan = layout(paths)
-    local = _contributions(plan.program, jnp.asarray(material_table(paths, materials)))
-    real, imaginary = _gains(plan.program, local)
-    found = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
-    found[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
-    return found[:, 0, 0] if found.shape[1:] == (1, 1) else found
+    response = _material_response(plan.program, jnp.asarray(paths.material_table(materials)))
+    real, imaginary = _gains(plan.program, response)
+    gains = np.empty((paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1]), dtype=complex)
+    gains[plan.order] = np.moveaxis(np.asarray(real) + 1j * np.asarray(imaginary), -1, 0)
+    return gains[:, 0, 0] if gains.shape[1:] == (1, 1) else gains
 
 
 def path_loss(
@@ -76,31 +90,32 @@ def path_loss(
     Raises:
         InputError: The combining or a material is unknown, or the bandwidth missing.
     """
-    offsets = check_combining(paths, combining, bandwidth)
-    tables = jnp.asarray(material_table(paths, materials))[None]
-    return np.asarray(path_losses(layout(paths).program, tables, combining, offsets)[0][0])
+    prepared = Combining.make(combining, paths.link, paths.delay, bandwidth)
+    tables = paths.material_table(materials)[None]
+    return path_losses(layout(paths).program, tables, prepared)[0][0]
 
 
-def program_path_loss(
-    program: GroupedProgram, table: jax.Array, combining: str = "power", offsets: Offsets = None
-) -> jax.Array:
+@jax_settings()
+def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
     """Path loss of every link of a program, as one pure function.
+
+    To differentiate or compile it, do so within `calibray.fields.jax_settings`.
 
     Args:
         program: The program.
         table: Material constants [M, 8].
-        combining: "power", "coherent" or "band".
-        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
+        combining: How the paths combine.
 
     Returns:
         Path loss [L], [dB]; +inf where a link has no path.
     """
-    found = slab.keep(contributions(program, table), program.wavelength)
-    return decibel(_power(program, pieces(program, found), combining, offsets))
+    response = materialize(material_response(program, table), program.wavelength)
+    return decibel(_power(program, split_by_step(program, response), combining))
 
 
-def path_powers(program: GroupedProgram, table: jax.Array) -> jax.Array:
-    """Power gain of every path, summed over receive ports and averaged over transmit ports.
+@jax_settings()
+def path_powers(program: GroupedProgram, table: ArrayLike) -> jax.Array:
+    """Power gain of every path, summed over receive ports and averaged over transmit ports, as one pure function.
 
     Args:
         program: The program.
@@ -109,101 +124,102 @@ def path_powers(program: GroupedProgram, table: jax.Array) -> jax.Array:
     Returns:
         Power gains in the order of the program [P].
     """
-    return _path_powers(program, _pieces(program, _contributions(program, table)))
+    return _path_powers(program, _split_by_step(program, _material_response(program, jnp.asarray(table))))
 
 
+@jax_settings()
 def path_losses(
     program: GroupedProgram,
-    tables: jax.Array,
-    combining: str = "power",
-    offsets: Offsets = None,
+    tables: NDArray[np.floating],
+    combining: Combining = POWER,
     count: int | None = None,
-) -> tuple[jax.Array, float]:
+) -> tuple[NDArray[np.floating], float]:
     """Path loss of every link for a batch of candidates.
 
     Args:
         program: The program.
         tables: Material constants [n, M, 8].
-        combining: "power", "coherent" or "band".
-        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
-        count: How many of the candidates are wanted, the first ones; what is told of the others means nothing.
+        combining: How the paths combine.
+        count: Number of candidates to evaluate, from the first on; all by default. A function is compiled for the
+            number of tables, so that a partly filled batch saves a compilation.
 
     Returns:
-        Path loss [n, L], [dB], +inf where a link has no path; and the largest error of a tabulated coefficient.
+        Path loss [count, L], [dB], +inf where a link has no path; and the largest error of a tabulated coefficient.
     """
-    if isinstance(program.coefficients, Formula):
-        return _each_loss(program, tables, len(tables) if count is None else count, combining, offsets), 0.0
-    # Coefficients are looked up where they are used, which is quickest where they are used once.
-    once = all(set(group.signature) <= {"c"} for group in program.groups)
+    count = len(tables) if count is None else count
+    if isinstance(program.coefficients, FormulaArguments):
+        return np.asarray(_losses_by_formula(program, jnp.asarray(tables), count, combining))[:count], 0.0
+    # Tables are looked up where coefficients are used, which is fastest if each is used once.
+    single_use = all(set(group.signature) <= {COEFFICIENT} for group in program.groups)
     powers, errors = [], []
-    for table in tables:
-        found = _contributions(program, table)
-        power = _link_power if once else _link_power_of_pieces
-        powers.append(power(program, found if once else _wide_pieces(program, found), combining, offsets))
-        errors.append(_table_error(program, found))
-    return _decibel(jnp.stack(powers)), float(jnp.stack(errors).max())
+    for table in tables[:count]:
+        response = _material_response(program, jnp.asarray(table))
+        if single_use:
+            powers.append(_link_power(program, response, combining))
+        else:
+            responses = _split_by_step_wide(program, response)
+            powers.append(_link_power_of_steps(program, responses, combining))
+        # Waits for the candidate, so that the intermediate numbers of one at a time are in memory.
+        errors.append(float(_table_error(program, response)))
+    return np.asarray(_decibel(jnp.stack(powers))), float(np.max(errors))
 
 
+@jax_settings()
 def path_losses_and_slopes(
     program: GroupedProgram,
-    tables: jax.Array,
+    tables: NDArray[np.floating],
     columns: tuple[int, ...],
-    combining: str = "power",
-    offsets: Offsets = None,
+    combining: Combining = POWER,
     count: int | None = None,
-) -> tuple[jax.Array, jax.Array, float]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
     """Path loss of every link for a batch of candidates, and its derivatives by the materials' constants.
 
     Args:
         program: The program.
         tables: Material constants [n, M, 8].
-        columns: Columns of the tables to derive by.
-        combining: "power", "coherent" or "band".
-        offsets: For "band": frequencies relative to the carrier [Hz] and weights [2, q].
-        count: How many of the candidates are wanted, the first ones; what is told of the others means nothing.
+        columns: Columns of the tables to differentiate by.
+        combining: How the paths combine.
+        count: Number of candidates to evaluate, as for `path_losses`.
 
     Returns:
-        Path loss [n, L], [dB], its derivatives [n, L, M, columns], [dB] per unit, 0 where a link has no path; and the
-        largest error of a tabulated coefficient.
+        Path loss [count, L], [dB], its derivatives [count, L, M, columns], [dB] per unit, 0 where a link has no path;
+        and the largest error of a tabulated coefficient.
     """
-    if isinstance(program.coefficients, Formula):
-        number = len(tables) if count is None else count
-        return *_each_slope(program, tables, number, columns, combining, offsets), 0.0
+    count = len(tables) if count is None else count
+    if isinstance(program.coefficients, FormulaArguments):
+        loss, slope = _slopes_by_formula(program, jnp.asarray(tables), count, columns, combining)
+        return np.asarray(loss)[:count], np.asarray(slope)[:count], 0.0
     powers, slopes, errors = [], [], []
-    for table in tables:
-        found, rates = _tangents(program, table, columns)
-        power, slope = _power_and_slope(program, _wide_pieces(program, found), combining, offsets)
+    for table in tables[:count]:
+        response, derivatives = _response_and_derivatives(program, jnp.asarray(table), columns)
+        power, by_step = _power_and_slope(program, _split_by_step_wide(program, response), combining)
         powers.append(power)
-        slopes.append(_decibel_slope(program, power, slope, rates, table.shape[0]))
-        errors.append(_table_error(program, found))
-    return _decibel(jnp.stack(powers)), jnp.stack(slopes), float(jnp.stack(errors).max())
+        slopes.append(_path_loss_slope(program, power, by_step, derivatives, table.shape[0]))
+        errors.append(float(_table_error(program, response)))
+    return np.asarray(_decibel(jnp.stack(powers))), np.asarray(jnp.stack(slopes)), float(np.max(errors))
 
 
 def _power(
-    program: GroupedProgram,
-    found: tuple[Pieces, ...],
-    combining: str,
-    offsets: Offsets,
-    keep: bool = False,
+    program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining, keep: bool = False
 ) -> jax.Array:
-    """Power gain of every link [L]; `keep` holds the field after every interaction, for a reverse pass."""
-    held = partial(slab.keep, positive=program.wavelength)
-    gain = path_fields(program, found, held if keep else lambda field: field)
-    if combining == "power":
-        return total(program.by_link, held(path_power(gain)))
+    """Power gain of every link [L]; `keep` stores the field after every interaction for a reverse pass."""
+    stored = partial(materialize, positive=program.wavelength)
+    gain = path_fields(program, responses, stored if keep else lambda field: field)
+    if combining.kind == "power":
+        return segment_sums(program.by_link, stored(path_power(gain)))
     link, delay = program.phases
     frequency = speed_of_light / program.wavelength
-    return link_power(gain, link, delay, program.num_links, frequency, combining, offsets)
+    return link_power(gain, link, delay, program.num_links, frequency, combining)
 
 
 def _slope(
-    program: GroupedProgram, found: tuple[Pieces, ...], combining: str, offsets: Offsets
-) -> tuple[jax.Array, tuple[Pieces, ...]]:
-    """Power gain of every link, and its derivative by every piece.
+    program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining
+) -> tuple[jax.Array, tuple[GroupResponse, ...]]:
+    """Power gain of every link, and its derivative by the response at every step.
 
     Every path belongs to one link, so one reverse pass over the summed power gives the derivatives of all links.
     """
-    power, pull = jax.vjp(lambda found: _power(program, found, combining, offsets, keep=True), found)
+    power, pull = jax.vjp(lambda responses: _power(program, responses, combining, keep=True), responses)
     (slope,) = pull(jnp.ones_like(power))
     return power, slope
 
@@ -211,90 +227,92 @@ def _slope(
 def _contract(
     program: GroupedProgram,
     power: jax.Array,
-    slope: tuple[Pieces, ...],
-    rates: tuple[Contributions, ...],
+    slope: tuple[GroupResponse, ...],
+    derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns] from both passes.
+    """Derivatives of path loss [L, M, columns]: those of the power by the response times those of the response.
 
     Every interaction belongs to one material, so one tangent per column serves all materials at once: the cost does not
     grow with their number.
     """
-    parts = []
-    for rate in rates:
-        rises = [[], []]
-        for group, rate_of_group in zip(slope, pieces(program, rate, blank=0.0), strict=True):
-            for rise, outer, inner in zip(rises, group, rate_of_group, strict=True):
-                rise += [_dot(a, b).ravel() for a, b in zip(outer, inner, strict=True)]
+    by_column = []
+    for derivative in derivatives:
+        products = ([], [])  # of coefficients, of diffuse amplitudes
+        inner_groups = split_by_step(program, derivative, blank=0.0)
+        for outer_group, inner_group in zip(slope, inner_groups, strict=True):
+            for product, outer, inner in zip(products, outer_group, inner_group, strict=True):
+                product += [_dot(a, b).ravel() for a, b in zip(outer, inner, strict=True)]
         sums = [
-            total(segments, slab.keep(jnp.concatenate(rise), program.wavelength))
-            for segments, rise in zip(program.by_material, rises, strict=True)
-            if rise
+            segment_sums(segments, materialize(jnp.concatenate(product), program.wavelength))
+            for segments, product in zip(program.by_material, products, strict=True)
+            if product
         ]
-        parts.append(sum(sums, jnp.zeros(program.num_links * num_materials, power.dtype)))
+        by_column.append(sum(sums, jnp.zeros(program.num_links * num_materials, power.dtype)))
     inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
-    by_material = jnp.stack(parts, axis=-1).reshape(program.num_links, num_materials, len(rates))
+    by_material = jnp.stack(by_column, axis=-1).reshape(program.num_links, num_materials, len(derivatives))
     return -10 / np.log(10) * inverse[:, None, None] * by_material
 
 
 def _dot(a: object, b: object) -> jax.Array:
-    """The sum of the products of two trees' numbers, entry by entry."""
+    """Sum of the products of two trees' arrays."""
     return reduce(add, (x * y for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)))
 
 
 _decibel = jax.jit(decibel)
-_contributions = jax.jit(contributions)
-_pieces = jax.jit(pieces)  # where it may be part of what is compiled as a whole, which takes no options
-_wide_pieces = jax.jit(pieces, compiler_options=WIDE)
-_tangents = jax.jit(tangents, static_argnums=2)
-_gains = jax.jit(lambda program, found: path_fields(program, pieces(program, found)))
-_path_powers = jax.jit(lambda program, found: path_power(path_fields(program, found)))
-_link_power_of_pieces = jax.jit(_power, static_argnums=2, compiler_options=WIDE)
-_power_and_slope = jax.jit(_slope, static_argnums=2, compiler_options=WIDE)
-_decibel_slope = jax.jit(_contract, static_argnums=4, compiler_options=WIDE)
+_material_response = jax.jit(material_response)
+# The functions of `path_powers` have no compiler options, because a user may compile them as part of another function.
+_split_by_step = jax.jit(split_by_step)
+_split_by_step_wide = jax.jit(split_by_step, compiler_options=_WIDE)
+_response_and_derivatives = jax.jit(response_and_derivatives, static_argnums=2)
+_gains = jax.jit(lambda program, response: path_fields(program, split_by_step(program, response)))
+_path_powers = jax.jit(lambda program, responses: path_power(path_fields(program, responses)))
+_link_power_of_steps = jax.jit(_power, compiler_options=_WIDE)
+_power_and_slope = jax.jit(_slope, compiler_options=_WIDE)
+_path_loss_slope = jax.jit(_contract, static_argnums=4, compiler_options=_WIDE)
 
 
 @jax.jit
-def _table_error(program: GroupedProgram, found: Contributions) -> jax.Array:
-    # Asked for only where coefficients lie in tables.
-    tables = cast(tabulation.Nodes, found.coefficients)
-    return tabulation.table_error(tables, cast(tabulation.Lookup, program.coefficients))
+def _table_error(program: GroupedProgram, response: MaterialResponse) -> jax.Array:
+    tables = cast(CoefficientTables, response.coefficients)
+    return coefficient_tables.table_error(tables, cast(TableLayout, program.coefficients))
 
 
-@partial(jax.jit, static_argnums=2, compiler_options=WIDE)
-def _link_power(program: GroupedProgram, found: Contributions, combining: str, offsets: Offsets) -> jax.Array:
-    return _power(program, pieces(program, found), combining, offsets)
+@partial(jax.jit, compiler_options=_WIDE)
+def _link_power(program: GroupedProgram, response: MaterialResponse, combining: Combining) -> jax.Array:
+    return _power(program, split_by_step(program, response), combining)
 
 
-@partial(jax.jit, static_argnums=3, compiler_options=WIDE)
-def _each_loss(
-    program: GroupedProgram, tables: jax.Array, count: int, combining: str, offsets: Offsets
+@partial(jax.jit, compiler_options=_WIDE)
+def _losses_by_formula(
+    program: GroupedProgram, tables: jax.Array, count: int, combining: Combining
 ) -> jax.Array:
-    """One candidate after the other, so that the numbers of each stay in a core's nearest cache."""
+    """Path loss [n, L] of the first candidates, one after the other."""
 
-    def one(place: jax.Array, loss: jax.Array) -> jax.Array:
-        return loss.at[place].set(program_path_loss(program, tables[place], combining, offsets))
+    def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
+        loss = program_path_loss(program, tables[index], combining)
+        return losses.at[index].set(loss.astype(losses.dtype))
 
-    return jax.lax.fori_loop(0, count, one, jnp.zeros((len(tables), program.num_links), tables.dtype))
+    return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=(3, 4), compiler_options=WIDE)
-def _each_slope(
-    program: GroupedProgram,
-    tables: jax.Array,
-    count: int,
-    columns: tuple[int, ...],
-    combining: str,
-    offsets: Offsets,
+@partial(jax.jit, static_argnums=3, compiler_options=_WIDE)
+def _slopes_by_formula(
+    program: GroupedProgram, tables: jax.Array, count: int, columns: tuple[int, ...], combining: Combining
 ) -> tuple[jax.Array, jax.Array]:
-    held = partial(slab.keep, positive=program.wavelength)
+    """Path loss [n, L] and derivatives [n, L, M, columns] of the first candidates, one after the other."""
+    stored = partial(materialize, positive=program.wavelength)
 
-    def one(place: jax.Array, told: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        found, rates = held(tangents(program, tables[place], columns))
-        power, slope = held(_slope(program, pieces(program, found), combining, offsets))
-        rise = _contract(program, power, slope, rates, tables.shape[1])
-        return told[0].at[place].set(decibel(power)), told[1].at[place].set(rise)
+    def evaluate(index: jax.Array, results: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        losses, slopes = results
+        response, derivatives = stored(response_and_derivatives(program, tables[index], columns))
+        power, by_step = stored(_slope(program, split_by_step(program, response), combining))
+        slope = _contract(program, power, by_step, derivatives, tables.shape[1])
+        return (
+            losses.at[index].set(decibel(power).astype(losses.dtype)),
+            slopes.at[index].set(slope.astype(slopes.dtype)),
+        )
 
-    loss = jnp.zeros((len(tables), program.num_links), tables.dtype)
-    rise = jnp.zeros((*loss.shape, tables.shape[1], len(columns)), tables.dtype)
-    return jax.lax.fori_loop(0, count, one, (loss, rise))
+    losses = jnp.zeros((len(tables), program.num_links), tables.dtype)
+    slopes = jnp.zeros((*losses.shape, tables.shape[1], len(columns)), tables.dtype)
+    return jax.lax.fori_loop(0, count, evaluate, (losses, slopes))

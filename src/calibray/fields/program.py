@@ -1,19 +1,18 @@
 """A path program laid out for evaluation.
 
-Paths are grouped by the kinds of their interactions, so that each group is a dense array and each kind costs only where
-it occurs. What the materials act through lies flat, over all interactions of all groups.
+Paths are grouped by the kinds of their interactions (`calibray.fields.grouping`), so that each group is a dense array.
+The arguments of the coefficients of all groups are stored in one flat array, because the slab formula is evaluated for
+all of them at once.
 
-A large program is laid out without padding. In a small one, whose evaluation takes less time than compiling it, paths
-that differ only in how many reflections or transmissions stand in a row are one group: the shorter rows are filled up
-with interactions that change nothing, and one compiled body serves the whole row.
+A large program is laid out without padding. A small one takes less time to evaluate than to compile. There, shorter
+runs of reflections and transmissions are filled up, so that fewer groups have to be compiled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import jax
 import jax.numpy as jnp
@@ -22,18 +21,22 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
-from calibray.fields import tabulation
+from calibray.fields.coefficient_tables import (
+    Intervals,
+    TableLayout,
+    coefficient_arguments,
+    spacing_roots,
+    table_layout,
+)
 from calibray.fields.diffraction import affine_form
-from calibray.fields.segments import Segments, make_segments
-from calibray.fields.steps import Step, Steps
-from calibray.materials import Material, constants_matrix
+from calibray.fields.grouping import DIFFRACTION, SCATTERING, PathGroup, exact_groups, padded_groups
+from calibray.fields.jax_context import jax_settings
+from calibray.fields.segment_sums import Segments, make_segments
+from calibray.fields.slab import Mode
 from calibray.paths import Kind, Paths
 
-_MODE: Final = {Kind.REFRACTION: tabulation.TRANSMITTED, Kind.DIFFUSE: tabulation.RAW}
-
-
 PADDED: Final = 50_000
-"""Interactions up to which a program with tables is filled up."""
+"""Largest number of interactions at which a program with tables is padded."""
 
 
 @partial(
@@ -48,11 +51,10 @@ class Group:
     Attributes:
         tx: Transmit field, real and imaginary part [2, T, 2, n]; the real part alone if all are real [1, T, 2, n].
         rx: Receive field times A lambda / 4 pi, likewise [2 or 1, R, 2, n].
-        rotation: Per step (cos, sin) into the frame of the interaction [2, n], of each of a row [k, 2, n].
+        rotation: Per step (cos, sin) into the frame of the interaction [2, n]; for a run of k [k, 2, n].
         turn: Per step (cos, sin) from the frame of incidence into the basis (theta, phi) [2, n], or None.
         wedge: Per step the matrices C_0 .. C_4, real and imaginary part [2, 5, 2, 2, n], or None.
-        signature: One letter a step: c coefficient (reflection or transmission), r several of them in a row,
-            s scattering, d diffraction.
+        signature: One letter for each step, see `calibray.fields.grouping`.
         size: Number of paths n.
     """
 
@@ -67,35 +69,70 @@ class Group:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["material", "cosine", "transmitted", "raw", "blank"],
+    data_fields=["material", "cosine", "transmitted", "unreduced", "blank"],
     meta_fields=["shapes", "lines", "any_transmitted"],
 )
 @dataclass(frozen=True)
-class Formula:
-    """What the formula of the coefficients takes, for K places of the groups' steps, one after the other.
+class FormulaArguments:
+    """Arguments of the slab formula at K positions, in the order in which the groups' steps use the coefficients.
 
-    Coefficients are evaluated where they stand: to gather them from elsewhere would take nearly as long as the formula.
-    Places at the end of a line at which nothing stands are left out.
+    Gathering coefficients from another order would take nearly as long as the formula itself. Empty positions at the
+    end of a line are left out.
 
     Attributes:
         material: Material [K].
         cosine: Cosine of the angle of incidence [K].
-        transmitted: Whether it is a transmission [K].
-        raw: Whether it is a reflection that keeps the scattered energy, as a diffuse one does [K].
-        blank: Whether nothing stands there, and the coefficient is 1 [K]; None where there is no such place.
-        shapes: Of the places at each step of each group, (n,) or (k, n).
-        lines: How many are evaluated in each line of each step, of the one or the k lines; the last line comes first.
+        transmitted: Whether the coefficient is a transmission [K].
+        unreduced: Whether it is a reflection that keeps the scattered energy, as for a diffuse one [K].
+        blank: Whether the position is empty, and the coefficient 1 [K]; None if no position is.
+        shapes: Shape of the positions at each step of each group, (n,) or (k, n).
+        lines: Number of positions stored of each line (one, or k for a run) of each step; the last line comes first.
         any_transmitted: Whether any coefficient is a transmission.
     """
 
     material: jax.Array
     cosine: jax.Array
     transmitted: jax.Array
-    raw: jax.Array
+    unreduced: jax.Array
     blank: jax.Array | None
     shapes: tuple[tuple[int, ...], ...]
     lines: tuple[tuple[int, ...], ...]
     any_transmitted: bool
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "material",
+        "solid_angle",
+        "cos_scattered",
+        "cos_incidence",
+        "cos_specular",
+        "cos_backward",
+    ],
+    meta_fields=["patterns"],
+)
+@dataclass(frozen=True)
+class DiffuseArguments:
+    """Arguments of the scattering patterns of D diffuse interactions, in the order in which groups use them.
+
+    Attributes:
+        material: Material [D].
+        solid_angle: Solid angle of the ray tube over its sampling probability [D], [sr].
+        cos_scattered: Cosine between scattered direction and normal [D].
+        cos_incidence: Cosine of the angle of incidence [D]; empty if every material is Lambertian.
+        cos_specular: Cosine between scattered and specular direction [D]; empty likewise.
+        cos_backward: Cosine between scattered direction and the direction back to the source [D]; empty likewise.
+        patterns: Scattering pattern of every material.
+    """
+
+    material: jax.Array
+    solid_angle: jax.Array
+    cos_scattered: jax.Array
+    cos_incidence: jax.Array
+    cos_specular: jax.Array
+    cos_backward: jax.Array
+    patterns: tuple[str, ...]
 
 
 @partial(
@@ -110,25 +147,22 @@ class Formula:
         "diffuse",
         "by_material",
     ],
-    meta_fields=["patterns"],
+    meta_fields=[],
 )
 @dataclass(frozen=True)
 class GroupedProgram:
     """A path program laid out for evaluation: P paths, J coefficients, D diffuse interactions, M materials.
 
     Attributes:
-        groups: The paths by kind of interactions.
-        by_link: Which paths belong to which link.
-        link: Link of every path, in the order of the groups [P]; None where only powers are added.
+        groups: The paths, grouped by kind of interactions.
+        by_link: Segments of the paths by link.
+        link: Link of every path, in the order of the groups [P]; None for sums of powers only.
         delay: Delay of every path, in the order of the groups [P], [s]; None likewise.
         wavelength: [m].
-        coefficients: What the coefficients are evaluated from: the formula's arguments, or places in tables.
-        diffuse: Material, solid angle, and the cosines of the scattered direction to the normal, of incidence, of the
-            scattered direction to the specular direction and to the way back, of every diffuse interaction (each [D];
-            the last three are empty where every material scatters by Lambert's law).
-        by_material: Which coefficients, and which diffuse interactions, belong to which link and material
-            (segment: link x M + material).
-        patterns: Scattering pattern of every material.
+        coefficients: Arguments of the slab formula, or positions in tables.
+        diffuse: Arguments of the scattering patterns.
+        by_material: Segments of the coefficients and of the diffuse interactions by link and material (segment:
+            link x M + material).
     """
 
     groups: tuple[Group, ...]
@@ -136,10 +170,9 @@ class GroupedProgram:
     link: jax.Array | None
     delay: jax.Array | None
     wavelength: jax.Array
-    coefficients: Formula | tabulation.Lookup
-    diffuse: tuple[jax.Array, ...]
+    coefficients: FormulaArguments | TableLayout
+    diffuse: DiffuseArguments
     by_material: tuple[Segments, Segments]
-    patterns: tuple[str, ...]
 
     @property
     def num_links(self) -> int:
@@ -159,27 +192,28 @@ class GroupedProgram:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the arrays take."""
+        """Size of the arrays [bytes]."""
         return sum(array.nbytes for array in jax.tree.leaves(self))
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A program and the order in which it holds the paths.
+    """A grouped program and the order of its paths.
 
     Attributes:
         program: The program.
-        order: Path of the path program at each place [P].
+        order: Index in the path program of every path of the grouped program [P].
     """
 
     program: GroupedProgram
     order: NDArray[np.int64]
 
 
+@jax_settings()
 def layout(
     paths: Paths,
     dtype: type = np.float64,
-    intervals: tabulation.Intervals | None = None,
+    intervals: Intervals | None = None,
     phases: bool = True,
 ) -> Layout:
     """Lay a path program out for evaluation.
@@ -187,199 +221,160 @@ def layout(
     Args:
         paths: The path program.
         dtype: Precision of the constants, `numpy.float64` or `numpy.float32`.
-        intervals: Tabulate the coefficients over the angle of incidence with so many intervals, in all or by material
-            and mode [M, 3]; None evaluates every coefficient by itself.
-        phases: Keep the delays, which nothing but the sum of powers can do without.
+        intervals: Tabulate the coefficients over the angle of incidence with this number of intervals, one for all or
+            by material and mode [M, 3]; None evaluates the slab formula at every interaction.
+        phases: Keep links and delays of the paths. Only sums of powers can be computed without.
 
     Returns:
         The grouped program, on JAX's default device.
     """
-    small = intervals is None or paths.num_interactions <= PADDED
-    steps = Steps.padded(paths) if small else Steps.exact(paths)
-    index = steps.index
-    order = np.concatenate(index) if index else np.zeros(0, dtype=np.int64)
-    flat = _Flat(paths)
-    groups = tuple(_group(paths, some, each, flat, dtype) for some, each in zip(index, steps.of, strict=True))
-    places, rows = flat.places, _joined(flat.scattered, np.int64)
-    depth, materials = np.diff(paths.first), len(paths.materials)
-    segment = np.repeat(paths.link, depth).astype(np.int64) * materials + paths.material
-    # What fills a row up changes nothing, and adds nothing to the segment that it is counted with.
-    of_coefficient = np.concatenate([segment, segment[flat.faces], [0]])
-    count = paths.num_links * materials
+    padded = intervals is None or paths.num_interactions <= PADDED
+    path_groups = padded_groups(paths) if padded else exact_groups(paths)
+    order = _joined([group.paths for group in path_groups])
+    numbering = _Numbering(paths, path_groups)
+    num_materials = len(paths.materials)
+    link = np.repeat(paths.link, np.diff(paths.first)).astype(np.int64)
+    segment = link * num_materials + paths.material
+    # Padding is counted with segment 0. It adds nothing there, because its derivatives are 0.
+    segment_of_coefficient = np.concatenate([segment, segment[numbering.wedges], [0]])
+    num_segments = paths.num_links * num_materials
     program = GroupedProgram(
-        groups=groups,
+        groups=tuple(_group(paths, group, numbering.table_row, dtype) for group in path_groups),
         by_link=make_segments(paths.link[order], paths.num_links),
         link=jnp.asarray(paths.link[order]) if phases else None,
         delay=jnp.asarray(paths.delay[order]) if phases else None,
         wavelength=jnp.asarray(speed_of_light / paths.frequency, dtype=dtype),
-        coefficients=_coefficients(paths, flat, dtype, intervals),
-        diffuse=_diffuse(paths, rows, flat.table_row[rows], dtype),
+        coefficients=_coefficients(paths, numbering, dtype, intervals),
+        diffuse=_diffuse(paths, numbering.scattered, numbering.table_row[numbering.scattered], dtype),
         by_material=(
-            make_segments(of_coefficient[_joined([place.ravel() for place in places], np.int64)], count),
-            make_segments(segment[rows], count),
+            make_segments(
+                segment_of_coefficient[_joined([step.ravel() for step in numbering.steps])], num_segments
+            ),
+            make_segments(segment[numbering.scattered], num_segments),
         ),
-        patterns=tuple(material.scattering_pattern for material in paths.materials.values()),
     )
     return Layout(program, order)
 
 
-def material_table(paths: Paths, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
-    """The matrix of material constants that evaluation takes.
+class _Numbering:
+    """Numbers of the coefficients in the order in which the steps of all groups use them.
 
-    Args:
-        paths: A path program.
-        materials: Constants by name; materials not named keep those of the trace.
+    Coefficients are numbered by interaction; those of the n-faces of diffracting wedges follow.
 
-    Returns:
-        Constants in the order of `paths.materials` and `calibray.materials.FIELDS` [M, 8].
-
-    Raises:
-        InputError: A name is not a material of the paths, or a material's scattering pattern differs from the trace's.
-    """
-    materials = materials or {}
-    unknown = set(materials) - set(paths.materials)
-    if unknown:
-        raise InputError(
-            f"no material {sorted(unknown)[0]!r} in the traced scene; it has {', '.join(paths.materials)}"
-        )
-    for name, material in materials.items():
-        traced = paths.materials[name].scattering_pattern
-        if material.scattering_pattern != traced:
-            raise InputError(
-                f"material {name!r}: scattering_pattern {material.scattering_pattern!r} differs from the traced "
-                f"{traced!r}; trace again with it in [materials]"
-            )
-    return constants_matrix({**paths.materials, **materials})
-
-
-class _Flat:
-    """Which coefficients and diffuse rows stand where, collected step by step.
-
-    Coefficients are numbered by interaction; those of the other faces of diffracting wedges follow.
+    Attributes:
+        wedges: The diffractions [W].
+        count: Number of coefficients; as a number of a coefficient it denotes an empty position.
+        table_row: Row of each interaction in the table of its kind, -1 for reflections and transmissions [I].
+        steps: Coefficients at each step of each group, [n] or [k, n]; a diffraction has two steps.
+        scattered: Diffuse interactions in the order of use [D].
     """
 
-    def __init__(self, paths: Paths) -> None:
-        self.faces = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
-        self.count = paths.num_interactions + len(self.faces)
-        self.places: list[NDArray[np.int64]] = []
-        self.scattered: list[NDArray[np.int64]] = []
-        self._interactions = paths.num_interactions
-        self.table_row = np.maximum(_row_of(paths.kind, Kind.DIFFUSE), _row_of(paths.kind, Kind.DIFFRACTION))
-
-    def add(self, interaction: NDArray[np.int64], letter: str) -> None:
-        """Append one step's interactions, -1 where there is none."""
-        self.places.append(np.where(interaction < 0, self.count, interaction))
-        if letter == "d":
-            self.places.append(self._interactions + self.table_row[interaction])
-        if letter == "s":
-            self.scattered.append(interaction)
-
-
-def _joined(parts: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
-    return np.concatenate(parts) if parts else np.zeros(0, dtype=dtype)
+    def __init__(self, paths: Paths, groups: list[PathGroup]) -> None:
+        self.wedges = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
+        self.count = paths.num_interactions + len(self.wedges)
+        self.table_row = np.full(paths.num_interactions, -1)
+        for kind in (Kind.DIFFUSE, Kind.DIFFRACTION):
+            of_kind = np.flatnonzero(paths.kind == kind)
+            self.table_row[of_kind] = np.arange(len(of_kind))
+        self.steps: list[NDArray[np.int64]] = []
+        scattered = []
+        for letter, interaction in [step for group in groups for step in group.steps]:
+            self.steps.append(np.where(interaction < 0, self.count, interaction))
+            if letter == DIFFRACTION:
+                self.steps.append(paths.num_interactions + self.table_row[interaction])
+            elif letter == SCATTERING:
+                scattered.append(interaction)
+        self.scattered = _joined(scattered)
 
 
-def _row_of(kind: NDArray[np.integer], which: Kind) -> NDArray[np.int64]:
-    chosen = kind == which
-    return np.where(chosen, np.cumsum(chosen) - 1, -1)
-
-
-def coefficients_of(
-    paths: Paths,
-) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]:
-    """Material, mode and cosine of incidence of every coefficient.
-
-    Args:
-        paths: The path program.
-
-    Returns:
-        The three, of all interactions, then of the other faces of diffracting wedges (each [J]).
-    """
-    faces = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
-    kind, material = (np.concatenate([column, column[faces]]) for column in (paths.kind, paths.material))
-    mode = np.select([kind == one for one in _MODE], list(_MODE.values()), 0)
-    return material, mode, np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
+def _joined(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
 
 def _coefficients(
-    paths: Paths, flat: _Flat, dtype: type, intervals: tabulation.Intervals | None
-) -> Formula | tabulation.Lookup:
-    material, mode, cosine = coefficients_of(paths)
+    paths: Paths, numbering: _Numbering, dtype: type, intervals: Intervals | None
+) -> FormulaArguments | TableLayout:
+    material, mode, cosine = coefficient_arguments(paths)
     if intervals is not None:
-        root = tabulation.roots(material_table(paths), speed_of_light / paths.frequency)
-        return tabulation.make_lookup(material, mode, cosine, root, flat.places, intervals, dtype)
-    lines = [[_filled(line, flat.count) for line in np.atleast_2d(place)] for place in flat.places]
-    at = _joined([line for step in lines for line in reversed(step)], np.int64)
-    blank = at == flat.count
-    # Where nothing stands, something is evaluated and left out.
-    material, mode, cosine = np.append(material, 0)[at], np.append(mode, 0)[at], np.append(cosine, 1.0)[at]
-    return Formula(
+        root = spacing_roots(paths.material_table(), speed_of_light / paths.frequency)
+        return table_layout(material, mode, cosine, root, numbering.steps, intervals, dtype)
+    lines = [
+        [_without_empty_end(line, numbering.count) for line in np.atleast_2d(step)]
+        for step in numbering.steps
+    ]
+    position = _joined([line for step in lines for line in reversed(step)])
+    blank = position == numbering.count
+    # At empty positions the formula is evaluated for arbitrary arguments; the result is replaced by 1.
+    material, mode, cosine = (
+        np.append(column, filler)[position] for column, filler in ((material, 0), (mode, 0), (cosine, 1.0))
+    )
+    return FormulaArguments(
         material=jnp.asarray(material.astype(np.int32)),
         cosine=jnp.asarray(cosine.astype(dtype)),
-        transmitted=jnp.asarray(mode == tabulation.TRANSMITTED),
-        raw=jnp.asarray(mode == tabulation.RAW),
+        transmitted=jnp.asarray(mode == Mode.TRANSMISSION),
+        unreduced=jnp.asarray(mode == Mode.FULL_REFLECTION),
         blank=jnp.asarray(blank) if blank.any() else None,
-        shapes=tuple(place.shape for place in flat.places),
+        shapes=tuple(step.shape for step in numbering.steps),
         lines=tuple(tuple(len(line) for line in step) for step in lines),
-        any_transmitted=bool((mode == tabulation.TRANSMITTED).any()),
+        any_transmitted=bool((mode == Mode.TRANSMISSION).any()),
     )
 
 
-def _filled(line: NDArray[np.int64], nothing: int) -> NDArray[np.int64]:
-    """A line without the places at its end at which nothing stands."""
-    return line[: int(np.flatnonzero(line != nothing).max(initial=-1)) + 1]
+def _without_empty_end(line: NDArray[np.int64], empty: int) -> NDArray[np.int64]:
+    return line[: int(np.flatnonzero(line != empty).max(initial=-1)) + 1]
 
 
 def _diffuse(
     paths: Paths, interaction: NDArray[np.int64], row: NDArray[np.int64], dtype: type
-) -> tuple[jax.Array, ...]:
+) -> DiffuseArguments:
     table = paths.diffuse
-    lobes = slice(
-        None if any(one.scattering_pattern != "lambertian" for one in paths.materials.values()) else 0
+    patterns = tuple(material.scattering_pattern for material in paths.materials.values())
+    lobes = slice(0 if all(pattern == "lambertian" for pattern in patterns) else None)
+
+    def column(values: NDArray[np.float64]) -> jax.Array:
+        return jnp.asarray(values.astype(dtype))
+
+    return DiffuseArguments(
+        material=jnp.asarray(paths.material[interaction].astype(np.min_scalar_type(len(paths.materials)))),
+        solid_angle=column(table.solid_angle[row]),
+        cos_scattered=column(table.cos_scattered[row]),
+        cos_incidence=column(paths.cos_incidence[interaction][lobes]),
+        cos_specular=column(table.cos_specular[row][lobes]),
+        cos_backward=column(table.cos_backward[row][lobes]),
+        patterns=patterns,
     )
-    columns = (
-        table.solid_angle[row],
-        table.cos_scattered[row],
-        paths.cos_incidence[interaction][lobes],
-        table.cos_specular[row][lobes],
-        table.cos_backward[row][lobes],
-    )
-    index = paths.material[interaction].astype(np.min_scalar_type(len(paths.materials)))
-    return jnp.asarray(index), *(jnp.asarray(column.astype(dtype)) for column in columns)
 
 
-def _group(
-    paths: Paths, index: NDArray[np.int64], steps: tuple[Step, ...], flat: _Flat, dtype: type
-) -> Group:
+def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: type) -> Group:
     rotation, turn, wedge = [], [], []
-    for letter, at in steps:  # interactions [n] or [k, n]
-        flat.add(at, letter)
-        rows = flat.table_row[at]
-        straight = np.where((at < 0)[..., None], [1.0, 0.0], paths.rotation[at])
-        rotation.append(jnp.asarray(np.moveaxis(straight, -1, -2).astype(dtype)))
-        turn.append(jnp.asarray(paths.diffuse.rotation[rows].T.astype(dtype)) if letter == "s" else None)
-        form = affine_form(paths.diffraction, rows, paths.frequency) if letter == "d" else None
-        wedge.append(None if form is None else _parts(form, dtype))
-    scale = paths.spreading[index] * speed_of_light / paths.frequency / (4 * np.pi)
+    for letter, interaction in group.steps:  # [n] or [k, n]
+        row = table_row[interaction]
+        cos_sin = np.where((interaction < 0)[..., None], [1.0, 0.0], paths.rotation[interaction])
+        rotation.append(jnp.asarray(np.moveaxis(cos_sin, -1, -2).astype(dtype)))
+        scatters, diffracts = letter == SCATTERING, letter == DIFFRACTION
+        turn.append(jnp.asarray(paths.diffuse.rotation[row].T.astype(dtype)) if scatters else None)
+        wedge.append(
+            _parts(affine_form(paths.diffraction, row, paths.frequency), dtype) if diffracts else None
+        )
+    # (lambda / 4 pi) A of the gain of a path
+    scale = paths.spreading[group.paths] * speed_of_light / paths.frequency / (4 * np.pi)
+    tx, rx = paths.tx_field[group.paths], paths.rx_field[group.paths] * scale[:, None, None]
     return Group(
-        tx=_parts(np.moveaxis(paths.tx_field[index], 0, -1), dtype, _parts_needed(paths.tx_field)),
-        rx=_parts(
-            np.moveaxis(paths.rx_field[index] * scale[:, None, None], 0, -1),
-            dtype,
-            _parts_needed(paths.rx_field),
-        ),
+        tx=_parts(np.moveaxis(tx, 0, -1), dtype, _num_parts(paths.tx_field)),
+        rx=_parts(np.moveaxis(rx, 0, -1), dtype, _num_parts(paths.rx_field)),
         rotation=tuple(rotation),
         turn=tuple(turn),
         wedge=tuple(wedge),
-        signature="".join(letter for letter, _ in steps),
-        size=len(index),
+        signature="".join(letter for letter, _ in group.steps),
+        size=len(group.paths),
     )
 
 
-def _parts_needed(field: NDArray[np.complex128]) -> int:
-    """1 where every field is real, as those of linearly polarized antennas mostly are, else 2."""
+def _num_parts(field: NDArray[np.complex128]) -> int:
+    """1 if all fields are real, as with most linearly polarized antennas, else 2."""
     return 2 if field.imag.any() else 1
 
 
-def _parts(value: NDArray[np.complex128], dtype: type, needed: int = 2) -> jax.Array:
-    return jnp.asarray(np.stack([value.real, value.imag][:needed]).astype(dtype))
+def _parts(value: NDArray[np.complex128], dtype: type, count: int = 2) -> jax.Array:
+    """Real and imaginary part, or the real part alone."""
+    return jnp.asarray(np.stack([value.real, value.imag][:count]).astype(dtype))

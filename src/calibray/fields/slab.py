@@ -1,25 +1,37 @@
-"""Coefficients of a homogeneous slab in air (ITU-R P.2040-3 section 2.2.2.2), in real arithmetic.
-
-Complex numbers are pairs (real, imaginary): compilers vectorize that form, and it runs several times faster than
-complex types. All functions are elementwise and differentiable.
-"""
+"""Reflection and transmission coefficients of a homogeneous slab in air (ITU-R P.2040-3 section 2.2.2.2)."""
 
 from __future__ import annotations
 
-from typing import TypeVar
+from enum import IntEnum
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 from scipy.constants import epsilon_0, speed_of_light
 
-from calibray.fields.trigonometry import circle
+from calibray.fields.arithmetic import Pair, cosine_and_sine, divide, materialize, multiply, safe_sqrt
+from calibray.materials import FIELDS
 
-Pair = tuple[jax.Array, jax.Array]
-Values = TypeVar("Values")
+FIELD_COLUMN: Final = {name: column for column, name in enumerate(FIELDS)}
+"""Column of each material constant in a table of materials."""
+
+_SELECTED_MATERIALS: Final = 12
+"""Up to this number of materials a constant is selected by comparing indices, beyond it is gathered. XLA gathers
+numbers one after the other, but vectorizes comparisons."""
+
+
+class Mode(IntEnum):
+    """How a coefficient is used."""
+
+    REFLECTION = 0
+    """Specular reflection or wedge face: reduced by the energy that is scattered."""
+    TRANSMISSION = 1
+    FULL_REFLECTION = 2
+    """Reflection of a diffuse interaction: not reduced."""
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """Sigma / (2 pi f eps_0), the negative imaginary part of eta (ITU-R P.2040-3 eq. 9).
+    """Negative imaginary part of the complex relative permittivity.
 
     Args:
         conductivity: [S/m].
@@ -28,25 +40,8 @@ def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
     Returns:
         The term [1].
     """
+    # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0), f = c / lambda.
     return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
-
-
-def keep(values: Values, positive: jax.Array) -> Values:
-    """The same values, computed once.
-
-    XLA on CPU fuses a computation into each of its uses, and so repeats sines and exponentials many times over; it
-    also drops `optimization_barrier`. It cannot look through a branch on a value that it does not know.
-
-    Args:
-        values: Arrays.
-        positive: Any positive number known at run time only.
-
-    Returns:
-        The values.
-    """
-    return jax.lax.cond(
-        positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
-    )
 
 
 def coefficients(
@@ -65,96 +60,114 @@ def coefficients(
         loss: `loss_term` [...].
         thickness: Thickness d [...], [m].
         wavelength: [m].
-        transmitted: Where the transmission coefficient is wanted in place of the reflection coefficient [...].
+        transmitted: True for the transmission coefficient, False for the reflection coefficient [...].
 
     Returns:
         The two coefficients, each as (real, imaginary) [...], in the precision of the cosine. They are computed in
-        double precision: the fourth power of a metal's permittivity is beyond the range of single precision.
+        double precision: the fourth power of a metal's permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (
         jnp.asarray(value, jnp.float64) for value in (cosine, permittivity, loss, thickness, wavelength)
     )
-    root = keep(_root((permittivity - 1) + cosine * cosine, loss), wavelength)  # sqrt(eta - sin^2 theta)
+    # sqrt(eta - sin^2 theta) of eqs. 37 and 44, with eta = eps_r - j loss (eq. 9)
+    root = materialize(_root((permittivity - 1) + cosine * cosine, loss), wavelength)
+    # eq. 44: q = (2 pi d / lambda) sqrt(eta - sin^2 theta)
     scale = 2 * jnp.pi * thickness / wavelength
-    decay, (cosine_q, sine_q) = jnp.exp(scale * root[1]), circle(scale * root[0])
-    phase = keep((decay * cosine_q, -decay * sine_q), wavelength)  # e^{-jq}, q of eq. 44
-    across = multiply(phase, phase)
+    decay, (cosine_q, sine_q) = jnp.exp(scale * root[1]), cosine_and_sine(scale * root[0])
+    phase = materialize((decay * cosine_q, -decay * sine_q), wavelength)  # e^{-jq}
+    phase_twice = multiply(phase, phase)  # e^{-j2q}
     eta_cosine = permittivity * cosine, -loss * cosine
-    te = _slab(
-        (cosine - root[0], -root[1]), (cosine + root[0], root[1]), phase, across, transmitted
-    )  # eq. 37a
+    # eq. 37a: R'_te = (cos theta - root) / (cos theta + root)
+    te = _slab((cosine - root[0], -root[1]), (cosine + root[0], root[1]), phase, phase_twice, transmitted)
+    # eq. 37b: R'_tm = (eta cos theta - root) / (eta cos theta + root)
     tm = _slab(
         (eta_cosine[0] - root[0], eta_cosine[1] - root[1]),
         (eta_cosine[0] + root[0], eta_cosine[1] + root[1]),
         phase,
-        across,
+        phase_twice,
         transmitted,
-    )  # eq. 37b
+    )
     return (te[0].astype(precision), te[1].astype(precision)), (
         tm[0].astype(precision),
         tm[1].astype(precision),
     )
 
 
-def safe_sqrt(value: jax.Array) -> jax.Array:
-    """Square root with derivative 0 instead of infinity at 0.
+def coefficients_of_materials(
+    cosine: jax.Array,
+    table: jax.Array,
+    material: jax.Array,
+    wavelength: jax.Array,
+    transmitted: jax.Array | bool,
+    unreduced: jax.Array,
+) -> tuple[Pair, Pair]:
+    """Coefficients from a table of materials; reflection is reduced by the energy that is scattered.
 
     Args:
-        value: At least 0 [...].
+        cosine: Cosine of the angle of incidence [...].
+        table: Material constants [M, 8].
+        material: Material of each coefficient [...].
+        wavelength: [m].
+        transmitted: True for the transmission coefficient [...].
+        unreduced: True where the coefficient is not reduced [...].
 
     Returns:
-        The root [...].
+        Transverse electric and magnetic coefficients, (real, imaginary) [...].
     """
-    positive = value > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
+    column = {name: table[:, index] for name, index in FIELD_COLUMN.items()}
+    te, tm = coefficients(
+        cosine,
+        _of_material(column["relative_permittivity"], material),
+        _of_material(loss_term(column["conductivity"], wavelength), material),
+        _of_material(column["thickness"], material),
+        wavelength,
+        transmitted,
+    )
+    # A reflection keeps sqrt(1 - S^2) of its amplitude (Degli-Esposti et al. 2007).
+    reduction = _of_material(safe_sqrt(1 - column["scattering_coefficient"] ** 2), material)
+    factor = jnp.where(unreduced, 1.0, reduction).astype(cosine.dtype)
+    return (te[0] * factor, te[1] * factor), (tm[0] * factor, tm[1] * factor)
 
 
-def multiply(a: Pair, b: Pair) -> Pair:
-    """Product of two complex numbers.
+def _of_material(constant: jax.Array, material: jax.Array) -> jax.Array:
+    """Constant [M] of each interaction's material [...]."""
+    if not 0 < len(constant) <= _SELECTED_MATERIALS:
+        return constant[material]
+    value = jnp.broadcast_to(constant[0], material.shape)
+    for number in range(1, len(constant)):
+        value = jnp.where(material == number, constant[number], value)
+    return value
 
-    Args:
-        a: The one, (real, imaginary) [...].
-        b: The other [...].
 
-    Returns:
-        The product [...].
+def _slab(
+    numerator: Pair, denominator: Pair, phase: Pair, phase_twice: Pair, transmitted: jax.Array | bool
+) -> Pair:
+    """Coefficient of a slab with the half-space coefficient R' = numerator / denominator.
+
+    Eqs. 43a and 43b are multiplied by the squared denominator of R', so that one division serves both.
     """
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def power(value: Pair) -> jax.Array:
-    """Squared magnitude of a complex number.
-
-    Args:
-        value: (real, imaginary) [...].
-
-    Returns:
-        The square [...].
-    """
-    return value[0] * value[0] + value[1] * value[1]
-
-
-def _slab(less: Pair, more: Pair, phase: Pair, across: Pair, transmitted: jax.Array | bool) -> Pair:
-    """Coefficient of a slab whose half space has R' = less / more, with one division for all."""
-    square, norm = multiply(less, less), multiply(more, more)
-    loop = multiply(square, across)
-    denominator = norm[0] - loop[0], norm[1] - loop[1]
-    wanted = multiply(multiply(less, more), (1 - across[0], -across[1]))  # eq. 43a
+    square, norm = multiply(numerator, numerator), multiply(denominator, denominator)
+    round_trip = multiply(square, phase_twice)
+    divisor = norm[0] - round_trip[0], norm[1] - round_trip[1]
+    # eq. 43a: R = R' (1 - e^{-j2q}) / (1 - R'^2 e^{-j2q})
+    dividend = multiply(multiply(numerator, denominator), (1 - phase_twice[0], -phase_twice[1]))
     if transmitted is not False:
-        through = multiply((norm[0] - square[0], norm[1] - square[1]), phase)  # eq. 43b
-        wanted = tuple(jnp.where(transmitted, t, r) for t, r in zip(through, wanted, strict=True))
-    return _divide((wanted[0], wanted[1]), denominator)
+        # eq. 43b: T = (1 - R'^2) e^{-jq} / (1 - R'^2 e^{-j2q})
+        through = multiply((norm[0] - square[0], norm[1] - square[1]), phase)
+        dividend = (
+            jnp.where(transmitted, through[0], dividend[0]),
+            jnp.where(transmitted, through[1], dividend[1]),
+        )
+    return divide(dividend, divisor)
 
 
 def _root(real: jax.Array, loss: jax.Array) -> Pair:
-    """Principal square root of real - j loss, both at least 0; 1e-30 at least, whose fourth power is a number."""
+    """Principal square root of real - j loss, both at least 0.
+
+    The result is at least 1e-30, so that its fourth power is not rounded to 0.
+    """
     size = jnp.maximum(real, 1e-60)
     modulus = jnp.sqrt(size * size + loss * loss)
     root = jnp.sqrt(0.5 * (modulus + size))
     return root, -0.5 * loss / root
-
-
-def _divide(a: Pair, b: Pair) -> Pair:
-    inverse = 1 / (b[0] * b[0] + b[1] * b[1])
-    return (a[0] * b[0] + a[1] * b[1]) * inverse, (a[1] * b[0] - a[0] * b[1]) * inverse

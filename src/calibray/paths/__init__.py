@@ -6,27 +6,27 @@ from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
     from calibray.paths.checksum import seal as seal
-    from calibray.paths.file_format import SCHEMA_VERSION as SCHEMA_VERSION
+    from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
     from calibray.paths.interactions import Diffraction as Diffraction
     from calibray.paths.interactions import Diffuse as Diffuse
     from calibray.paths.interactions import Kind as Kind
     from calibray.paths.program import Paths as Paths
-    from calibray.paths.program import concatenate as concatenate
-    from calibray.paths.program import join_links as join_links
-    from calibray.paths.program import take as take
-    from calibray.paths.program import take_links as take_links
+    from calibray.paths.selection import concatenate as concatenate
+    from calibray.paths.selection import join_links as join_links
+    from calibray.paths.selection import take as take
+    from calibray.paths.selection import take_links as take_links
 
 _HOMES = {
-    "SCHEMA_VERSION": "calibray.paths.file_format",
+    "FORMAT_VERSION": "calibray.paths.file_format",
     "Diffraction": "calibray.paths.interactions",
     "Diffuse": "calibray.paths.interactions",
     "Kind": "calibray.paths.interactions",
     "Paths": "calibray.paths.program",
-    "concatenate": "calibray.paths.program",
-    "join_links": "calibray.paths.program",
+    "concatenate": "calibray.paths.selection",
+    "join_links": "calibray.paths.selection",
     "seal": "calibray.paths.checksum",
-    "take": "calibray.paths.program",
-    "take_links": "calibray.paths.program",
+    "take": "calibray.paths.selection",
+    "take_links": "calibray.paths.selection",
 }
 
 __all__ = sorted(_HOMES)

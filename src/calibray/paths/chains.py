@@ -1,10 +1,10 @@
-"""Geometry of traced paths: vertices and normals in, the constants of the path program out.
+"""Geometry of traced paths: from vertices and normals to the constants of the path program.
 
-The field of a path is a Jones vector in a frame that each interaction turns into its own: first axis
-s = k x n / |k x n| (transverse electric), second axis k x s. Sionna RT writes the field between interactions in the
-basis (theta, phi) of the direction of travel; the two rotations, out of one frame and into the next, are merged here
-into one. Its conventions (reference near the poles, orientation of normals and wedges, the mirrored direction in
-place of the traced one after a reflection) are followed, so that path gains agree in phase as well.
+The field of a path is a Jones vector. Each interaction has its own frame for it: first axis s = k x n / |k x n|
+(transverse electric), second axis k x s. Sionna RT expresses the field between interactions in the basis (theta, phi)
+of the direction of travel; here the two rotations, out of one frame and into the next, are merged into one. Sionna's
+conventions are followed (reference near the poles, orientation of normals and wedges, the mirrored direction instead of
+the traced one after a reflection), so that path gains also agree in phase.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from calibray.paths.interactions import Diffraction, Diffuse, Kind
 
 @dataclass(frozen=True)
 class Chains:
-    """Paths as a tracer gives them, padded to the largest depth D.
+    """Paths as a tracer finds them, padded to the largest depth D.
 
     Attributes:
         source: Start of every path [P, 3], [m].
         target: End of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].
-        normal: Normals of the surfaces hit, either side [P, D, 3].
+        normal: Normals of the surfaces hit, on either side [P, D, 3].
         kind: Kinds of interaction, 0 beyond the last one [P, D].
         material: Material of every interaction [P, D].
         probability: Probability with which the tracer chose the kind of interaction [P, D].
-        samples: Rays sent out per source.
+        samples: Rays launched per source.
         edge: Direction of the diffracting edge [P, 3]; empty [0, 3] without diffraction.
         normal_n: Normal of the wedge's n-face [P, 3]; empty [0, 3] without diffraction.
         edge_lengths: Lengths s' before and s after the edge [P, 2], [m]; empty [0, 2] without diffraction.
@@ -86,7 +86,7 @@ class Geometry:
 
 
 def compile_chains(chains: Chains) -> Geometry:
-    """Compute what the fields of traced paths depend on, apart from the materials.
+    """Compute the geometry that the fields of traced paths depend on.
 
     Args:
         chains: Traced paths.
@@ -98,29 +98,29 @@ def compile_chains(chains: Chains) -> Geometry:
     present = chains.kind != 0
     length = present.sum(axis=1)
     stop = np.concatenate([chains.vertex, np.zeros((count, 1, 3))], axis=1)
-    # The target follows the last interaction.
+    # the target follows the last interaction
     stop[np.arange(count), length] = chains.target
     ahead = np.concatenate([stop[:, :1] - chains.source[:, None], np.diff(stop, axis=1)], axis=1)
     segment = np.linalg.norm(ahead, axis=2) * (np.arange(depth + 1) <= length[:, None])
     total = segment.sum(axis=1)
     direction = ahead / np.where(segment > 0, segment, 1.0)[..., None]
 
-    # Rotation from the last interaction's frame into the basis (theta, phi).
+    # (cos, sin) from the frame of the latest interaction into the basis (theta, phi)
     out_of = np.tile([1.0, 0.0], (count, 1))
     departure_rotation = np.tile([1.0, 0.0], (count, 1))
     rotation, cosine = np.zeros((count, depth, 2)), np.zeros((count, depth))
     tables: dict[int, list[tuple[NDArray[Any], ...]]] = {Kind.DIFFUSE: [], Kind.DIFFRACTION: []}
     solid_angle = np.full(count, 4 * np.pi / chains.samples)
-    # Length already travelled when the present ray tube began.
+    # A diffuse reflection starts a new ray tube; length travelled up to there.
     tube_start = np.zeros(count)
-    # Set where an edge diffracts.
+    # 1/sqrt(s s' (s + s')) where an edge diffracts, else 0
     spread = np.zeros(count)
     travelled = segment[:, 0].copy()
     for step in range(depth):
         row = np.flatnonzero(present[:, step])
         incident, leaving = direction[row, step], direction[row, step + 1]
         normal = chains.normal[row, step]
-        # Normals point towards the incident wave.
+        # The normal shall point towards the incident wave.
         normal = normal * _sign(_dot(normal, -incident))[:, None]
         cosine[row, step] = np.abs(_dot(incident, normal))
         solid_angle[row] *= _inverse(chains.probability[row, step])
@@ -132,26 +132,26 @@ def compile_chains(chains: Chains) -> Geometry:
 
         diffuse = kind == Kind.DIFFUSE
         if diffuse.any():
-            some, k_in, k_out = row[diffuse], incident[diffuse], leaving[diffuse]
+            rows, k_in, k_out = row[diffuse], incident[diffuse], leaving[diffuse]
             tables[Kind.DIFFUSE].append(
                 (
-                    some,
-                    np.full(len(some), step),
+                    rows,
+                    np.full(len(rows), step),
                     *_diffuse(k_in, k_out, normal[diffuse], entering[diffuse]),
-                    solid_angle[some],
+                    solid_angle[rows],
                 )
             )
             exiting[diffuse], onward[diffuse] = spherical_basis(k_out, pole_reference=False), k_out
-            solid_angle[some] = 2 * np.pi
-            tube_start[some] = travelled[some]
+            solid_angle[rows] = 2 * np.pi
+            tube_start[rows] = travelled[rows]
 
         wedge = kind == Kind.DIFFRACTION
         if wedge.any():
-            some, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
-            edge, (before, after) = chains.edge[some], chains.edge_lengths[some].T
-            spread[some] = 1 / np.sqrt(before * after * (before + after))
-            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[some], edge, before, after)
-            tables[Kind.DIFFRACTION].append((some, np.full(len(some), step), *constants))
+            rows, k_in, k_out = row[wedge], incident[wedge], leaving[wedge]
+            edge, (before, after) = chains.edge[rows], chains.edge_lengths[rows].T
+            spread[rows] = 1 / np.sqrt(before * after * (before + after))
+            constants = _wedge(k_in, k_out, normal[wedge], chains.normal_n[rows], edge, before, after)
+            tables[Kind.DIFFRACTION].append((rows, np.full(len(rows), step), *constants))
             entering[wedge] = _unit(_cross(k_in, edge))
             exiting[wedge], onward[wedge] = -_unit(_cross(k_out, edge)), k_out
 
@@ -164,6 +164,7 @@ def compile_chains(chains: Chains) -> Geometry:
         travelled[row] += segment[row, step + 1]
 
     last = direction[np.arange(count), length]
+    # 1 / r from the start of the ray tube, or that of the diffraction
     spread = np.where(spread > 0, spread, 1 / (total - tube_start))
     flat = present.reshape(-1)
     return Geometry(
@@ -188,7 +189,7 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 
     Args:
         direction: Unit vectors [..., 3].
-        pole_reference: Use Sionna's fixed reference -x next to the poles instead of the limit of theta.
+        pole_reference: Near the poles, use Sionna's fixed reference -x instead of the limit of theta.
 
     Returns:
         Unit vectors orthogonal to `direction` [..., 3].
@@ -205,7 +206,7 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
         return theta
     reference = np.array([-1.0, 0.0, 0.0])
     fallback = reference - _dot(direction, reference)[..., None] * direction
-    # The bound is met in single precision, as Sionna computes it.
+    # Sionna compares in single precision.
     near = np.abs(np.float32(z)) > np.float32(1 - 5e-7)
     return np.where(near[..., None], _unit(np.where(near[..., None], fallback, reference)), theta)
 
@@ -213,8 +214,8 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """First axis of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
 
-    At normal incidence any transverse vector serves: there the transverse electric and magnetic coefficients describe
-    the same reflection.
+    At normal incidence any transverse vector will do, because the transverse electric and magnetic coefficients then
+    describe the same reflection.
 
     Args:
         direction: Directions of travel [..., 3].
@@ -239,8 +240,8 @@ def rotate(
 
     Args:
         direction: Directions of travel [..., 3].
-        current: First axis of the frame that the vector is in [..., 3].
-        target: First axis of the frame wanted [..., 3].
+        current: First axis of the vector's frame [..., 3].
+        target: First axis of the new frame [..., 3].
 
     Returns:
         Cosine and sine [..., 2].
@@ -285,7 +286,10 @@ def _wedge(
     before: NDArray[np.float64],
     after: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], ...]:
-    """Constants of a wedge diffraction as Sionna RT has them (Kouyoumjian and Pathak 1974; ITU-R P.526-15, 4.5)."""
+    """Constants of a wedge diffraction, with Sionna RT's conventions.
+
+    The columns are those of `Diffraction` (Kouyoumjian and Pathak 1974; ITU-R P.526-15 section 4.5).
+    """
     exterior = 2 * np.pi - np.arccos(np.clip(-_dot(normal_0, normal_n), -1, 1))
     cos_edge = np.abs(_dot(incident, edge))
     tangent = _unit(_cross(normal_0, edge))
@@ -315,7 +319,7 @@ def _wedge(
 def _azimuth(
     away: NDArray[np.float64], tangent: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Angle of a direction pointing away from the edge, counted from the 0-face [0, 2 pi)."""
+    """Angle of a direction that points away from the edge, from the 0-face in [0, 2 pi)."""
     angle = np.pi - np.arccos(np.clip(_dot(away, tangent), -1, 1))
     return np.pi - angle * _sign(_dot(away, normal))
 
@@ -329,13 +333,13 @@ def _compose(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray
 def _in_path_order(
     parts: list[tuple[NDArray[Any], ...]], empty: Diffuse | Diffraction
 ) -> list[NDArray[np.float64]]:
-    """Columns of a table gathered step by step, put into path order (the order of the flat interactions)."""
+    """Columns of a table that was collected step by step, in the order of the interactions."""
     if not parts:
         return list(vars(empty).values())
     path, step, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((step, path))
     columns = [column[order] for column in columns]
-    # The solid angle was gathered last, after the directions.
+    # The solid angle was collected last, and is the second column of the table.
     if isinstance(empty, Diffuse):
         rotation, scattered, specular, backward, solid_angle = columns
         return [rotation, solid_angle, scattered, specular, backward]

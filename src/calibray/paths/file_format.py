@@ -1,6 +1,6 @@
-"""What a path file holds: every dataset with its shape, type and range, checked in full when it is read.
+"""Content of a path file: every dataset with its shape, type and range, all checked when a file is read.
 
-`docs/path-file.md` says what the datasets mean.
+`docs/path-file.md` explains the datasets.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from calibray.errors import InputError
 from calibray.materials import FIELDS
 from calibray.paths.interactions import Kind
 
-SCHEMA: Final = "calibray/paths"
-SCHEMA_VERSION: Final = 1
+FORMAT: Final = "calibray/paths"
+FORMAT_VERSION: Final = 1
 
-FREQUENCIES: Final = (1e6, 1e12)
-"""The carriers [Hz] that a path file may have."""
+_FREQUENCIES: Final = (1e6, 1e12)
+"""Range of the carrier frequency [Hz]."""
 
-SETTING: Final = "setting_"
-"""What the names of the attributes begin with that say how the paths were traced."""
+_SETTING: Final = "setting_"
+"""Prefix of the attributes that record how the paths were traced."""
 
-_SLACK: Final = 1e-3
-"""How far beyond its range a number may lie that was rounded to single precision."""
+_ROUNDING: Final = 1e-3
+"""Tolerance of the ranges, for numbers that were rounded to single precision."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Dataset:
     """One dataset of a path file.
 
     Attributes:
-        shape: Its sizes, numbers or the letters of `docs/path-file.md`.
-        kind: "f" for numbers, "i" for whole numbers, "O" for text.
-        lower: Least value.
+        shape: Its sizes: numbers, or the letters of `docs/path-file.md`.
+        kind: "f" for numbers, "i" for integers, "O" for text.
+        lower: Smallest value.
         upper: Largest value.
     """
 
@@ -51,7 +51,7 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Content:
-    """What was read from a path file.
+    """Content of a path file.
 
     Attributes:
         frequency: Carrier frequency [Hz].
@@ -60,13 +60,13 @@ class Content:
     """
 
     frequency: float
-    settings: dict[str, object]
-    arrays: dict[str, NDArray]
+    settings: Mapping[str, object]
+    arrays: Mapping[str, NDArray[Any]]
 
 
-_COSINE = (-1 - _SLACK, 1 + _SLACK)
-_ANGLE = (-2 * pi - _SLACK, 2 * pi + _SLACK)
-# Far beyond any antenna (120 dB), scene and path, and far from where sums of powers overflow.
+_COSINE = (-1 - _ROUNDING, 1 + _ROUNDING)
+_ANGLE = (-2 * pi - _ROUNDING, 2 * pi + _ROUNDING)
+# Far beyond any antenna (120 dB), scene and path, and far below numbers whose sum of powers overflows.
 _FIELD = (-1e6, 1e6)
 _LENGTH = 1e9  # [m]
 _POSITION = (-_LENGTH, _LENGTH)
@@ -90,6 +90,7 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
         "interactions/material": Dataset(("I",), "i"),
         "interactions/cos_incidence": Dataset(("I",), "f", *_COSINE),
         "interactions/rotation": Dataset(("I", 2), "f", *_COSINE),
+        "interactions/vertex": Dataset(("I", 3)),
         "diffuse/rotation": Dataset(("D", 2), "f", *_COSINE),
         "diffuse/solid_angle": Dataset(("D",), "f", 0.0, 1e9),
         "diffuse/cos_scattered": Dataset(("D",), "f", *_COSINE),
@@ -105,9 +106,19 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
-VERTEX: Final = "interactions/vertex"
-OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType({VERTEX: Dataset(("I", 3))})
-"""What a file may lack."""
+
+def write(file: h5py.File, content: Content) -> None:
+    """Write the content of a path file.
+
+    Args:
+        file: The open, empty file.
+        content: Its content, with every dataset of `DATASETS`.
+    """
+    file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
+    file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
+    for name, dataset in DATASETS.items():
+        values = content.arrays[name]
+        file[name] = np.array(values, dtype=h5py.string_dtype()) if dataset.kind == "O" else values
 
 
 def read(file: h5py.File) -> Content:
@@ -117,26 +128,22 @@ def read(file: h5py.File) -> Content:
         file: The open file.
 
     Returns:
-        What it holds.
+        Its content.
 
     Raises:
-        InputError: It is of another kind or version, or something in it is missing, of another shape or type, or
-            out of range; the message lacks the file's name.
+        InputError: It has another format or version, or a dataset is missing, has another shape or type, or is out
+            of range; the message lacks the file's name.
     """
-    if (schema := file.attrs.get("schema")) != SCHEMA:
-        raise InputError(f"is no Calibray path file (schema {schema!r})")
-    if (version := _attribute(file, "version")) != SCHEMA_VERSION:
-        raise InputError(f"has schema version {version}, need {SCHEMA_VERSION}; trace again")
+    if (name := file.attrs.get("format")) != FORMAT:
+        raise InputError(f"is not a Calibray path file (attribute format = {name!r}, must be {FORMAT!r})")
+    if (version := _attribute(file, "version")) != FORMAT_VERSION:
+        raise InputError(f"has version {version} of the format, must be {FORMAT_VERSION}; trace again")
     frequency = _attribute(file, "frequency_hz")
-    if (
-        isinstance(frequency, str | bool | np.bool_)
-        or not FREQUENCIES[0] <= float(frequency) <= FREQUENCIES[1]
-    ):
-        damage = f"frequency_hz = {frequency!r}, must lie in {FREQUENCIES[0]:g} to {FREQUENCIES[1]:g} Hz"
-        refusal = _damaged(damage)
-        raise refusal
-    present = dict(DATASETS) | {name: entry for name, entry in OPTIONAL.items() if name in file}
-    arrays = {name: _array(file, name, entry) for name, entry in present.items()}
+    lower, upper = _FREQUENCIES
+    if isinstance(frequency, str | bool | np.bool_) or not lower <= float(frequency) <= upper:
+        fault = _damaged(f"frequency_hz = {frequency!r}, must lie in {lower:g} to {upper:g} Hz")
+        raise fault
+    arrays = {name: _array(file, name, dataset) for name, dataset in DATASETS.items()}
     _check_shapes(arrays)
     _check_values(arrays)
     _check_indices(arrays)
@@ -153,40 +160,36 @@ def _attribute(file: h5py.File, name: str) -> Any:
         isinstance(value, np.number) and value.dtype.kind in "iuf" and isfinite(value)
     ):
         return value
-    raise _damaged(f"attribute {name} is no text and no finite number")
+    raise _damaged(f"attribute {name} is neither text nor a finite number")
 
 
 def _settings(file: h5py.File) -> Iterator[tuple[str, object]]:
     for key in file.attrs:
-        if key.startswith(SETTING):
+        if key.startswith(_SETTING):
             value = _attribute(file, key)
-            yield key.removeprefix(SETTING), value.item() if isinstance(value, np.generic) else value
+            yield key.removeprefix(_SETTING), value.item() if isinstance(value, np.generic) else value
 
 
-def _array(file: h5py.File, name: str, entry: Dataset) -> NDArray:
-    """One dataset, which lies in this file in one piece and is no larger than it."""
+def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
+    """One dataset. It must be stored in this file, contiguously, and not exceed the file's size."""
     item, length = file.get(name), file.id.get_filesize()
     link = file.get(name, getlink=True)
     if not isinstance(item, h5py.Dataset) or not isinstance(link, h5py.HardLink):
         raise _damaged(f"no dataset {name}")
     if item.chunks is not None or item.is_virtual or item.external is not None or item.nbytes > length:
-        raise _damaged(f"dataset {name} is not stored in one piece")
-    if item.ndim != len(entry.shape):
+        raise _damaged(f"dataset {name} is not stored contiguously")
+    if item.ndim != len(dataset.shape):
         raise _damaged(f"dataset {name} has the shape {item.shape}")
-    if entry.kind == "O":
+    if dataset.kind == "O":
         if h5py.check_string_dtype(item.dtype) is None:
-            raise _damaged(f"dataset {name} holds no text")
+            raise _damaged(f"dataset {name} is not text")
         return np.array(item.asstr()[()], dtype=object)
-    if item.dtype.kind not in {"i": "iu", "f": "f"}[entry.kind]:
-        raise _damaged(f"dataset {name} holds {item.dtype}")
+    if item.dtype.kind not in {"i": "iu", "f": "f"}[dataset.kind]:
+        raise _damaged(f"dataset {name} has the type {item.dtype}")
     return item[()]
 
 
-def _entry(name: str) -> Dataset:
-    return DATASETS[name] if name in DATASETS else OPTIONAL[name]
-
-
-def _check_shapes(arrays: Mapping[str, NDArray]) -> None:
+def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     kinds = arrays["interactions/kind"]
     sizes = {
         "L": len(arrays["links/tx_position"]),
@@ -204,39 +207,38 @@ def _check_shapes(arrays: Mapping[str, NDArray]) -> None:
             raise _damaged(f"{sizes[port]} ports, must be 1 or 2")
     if not sizes["L"]:
         raise _damaged("no links")
-    for name in arrays:
-        entry = _entry(name)
-        expected = tuple(sizes[size] if isinstance(size, str) else size for size in entry.shape)
+    for name, dataset in DATASETS.items():
+        expected = tuple(sizes[size] if isinstance(size, str) else size for size in dataset.shape)
         if arrays[name].shape != expected:
-            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}, must have {expected}")
+            raise _damaged(f"dataset {name} has the shape {arrays[name].shape}, must be {expected}")
 
 
-def _check_values(arrays: Mapping[str, NDArray]) -> None:
-    for name, values in arrays.items():
-        entry = _entry(name)
-        if entry.kind == "O":
+def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
+    for name, dataset in DATASETS.items():
+        values = arrays[name]
+        if dataset.kind == "O":
             continue
-        # A number that is not finite fails the first comparison, an infinite one the second.
-        if not ((values >= entry.lower) & (values <= entry.upper)).all() or not np.isfinite(values).all():
+        # NaN fails the comparisons, infinity may pass them.
+        if not ((values >= dataset.lower) & (values <= dataset.upper)).all() or not np.isfinite(values).all():
             raise _damaged(f"dataset {name} has a number that is not finite or out of range")
     for name in ("interactions/rotation", "diffuse/rotation", "diffraction/rotations"):
-        if (abs((arrays[name] ** 2).sum(axis=-1) - 1) > 10 * _SLACK).any():
-            raise _damaged(f"dataset {name} has a pair that is no cosine and sine")
+        if (abs((arrays[name] ** 2).sum(axis=-1) - 1) > 10 * _ROUNDING).any():
+            raise _damaged(f"dataset {name} has a pair that is not a cosine and sine")
     if not np.isin(arrays["interactions/kind"], list(Kind)).all():
         raise _damaged("interactions/kind has an unknown kind")
     names = arrays["materials/name"].tolist()
     if len(set(names)) != len(names) or "" in names:
-        raise _damaged("a material is without a name, or two have the same")
+        raise _damaged("a material has no name, or two have the same name")
 
 
-def _check_indices(arrays: Mapping[str, NDArray]) -> None:
+def _check_indices(arrays: Mapping[str, NDArray[Any]]) -> None:
     first, link = arrays["paths/first"].astype(np.int64), arrays["paths/link"].astype(np.int64)
     if first[0] != 0 or first[-1] != len(arrays["interactions/kind"]) or (np.diff(first) < 0).any():
-        raise _damaged("paths/first does not part the interactions")
+        raise _damaged("paths/first does not divide the interactions among the paths")
     if (np.diff(link) < 0).any():
         raise _damaged("paths/link is not in order")
-    ranges = {"paths/link": "links/tx_position", "interactions/material": "materials/name"}
-    for name, target in ranges.items():
+    indexed = {"paths/link": "links/tx_position", "interactions/material": "materials/name"}
+    for name, target in indexed.items():
         index, count = arrays[name], len(arrays[target])
         if not ((index >= 0) & (index < count)).all():
             raise _damaged(f"dataset {name} has an index outside 0 to {count - 1}")

@@ -1,4 +1,4 @@
-"""Kinds of interaction, and the tables of what diffuse reflections and diffractions need beyond the common arrays."""
+"""Kinds of interaction, and the tables of the constants that only diffuse reflections and diffractions have."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Diffuse:
-    """What a diffuse reflection needs beyond the common arrays; one row per diffuse interaction, in their order.
+    """Further constants of the diffuse interactions, one row each, in their order.
 
     Attributes:
         rotation: (cos, sin) of the rotation from the transverse electric frame into the spherical basis (theta, phi)
             of the incident direction, in which the XPD matrix acts [D, 2].
-        solid_angle: Ray tube's solid angle over the sampling probability at trace time [D], [sr].
+        solid_angle: Solid angle of the ray tube over its sampling probability at trace time [D], [sr].
         cos_scattered: Cosine between the scattered direction and the normal [D].
         cos_specular: Cosine between the scattered and the specular direction [D].
-        cos_backward: Cosine between the scattered direction and the way back to the source [D].
+        cos_backward: Cosine between the scattered direction and the direction back to the source [D].
     """
 
     rotation: NDArray[np.float64]
@@ -39,15 +39,15 @@ class Diffuse:
 
     @classmethod
     def empty(cls) -> Diffuse:
-        """No diffuse interaction."""
+        """A table without rows."""
         return cls(np.zeros((0, 2)), *(np.zeros(0) for _ in range(4)))
 
 
 @dataclass(frozen=True)
 class Diffraction:
-    """What a diffraction needs beyond the common arrays; one row per diffraction, in their order.
+    """Further constants of the diffractions, one row each, in their order.
 
-    The 0-face's cosine of incidence is in `Paths.cos_incidence`.
+    The cosine of incidence on the 0-face is in `Paths.cos_incidence`.
 
     Attributes:
         cos_incidence_n: Cosine of the angle of incidence on the n-face [W].
@@ -70,6 +70,5 @@ class Diffraction:
 
     @classmethod
     def empty(cls) -> Diffraction:
-        """No diffraction."""
-        none = np.zeros(0)
-        return cls(none, none, none, none, none, none, np.zeros((0, 4, 2)))
+        """A table without rows."""
+        return cls(*(np.zeros(0) for _ in range(6)), np.zeros((0, 4, 2)))

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Paths, take
 from calibray.result.record import Record
@@ -58,7 +57,7 @@ def rays(result: Record, progress: Progress | None = None) -> Rays:
         EngineError: The tracer failed.
     """
     paths = result.paths
-    if paths is None or paths.vertex is None:
+    if paths is None:
         paths = Setup.open(result.study).trace(progress=progress)
     return strongest(paths, result)
 
@@ -72,12 +71,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
 
     Returns:
         The paths that are shown.
-
-    Raises:
-        InputError: The paths do not tell where they interact, as those of older files.
     """
-    if paths.vertex is None:
-        raise InputError("the paths hold no points of interaction; trace again")
     gain = path_gains(paths, result.materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as path loss is.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
@@ -97,7 +91,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     shown = take(paths, chosen)
     return Rays(
         shown,
-        paths.vertex[:0] if shown.vertex is None else shown.vertex,
+        shown.vertex,
         gain_db[chosen],
         per_link,
         paths.num_paths,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.paths import SCHEMA_VERSION, Paths
+from calibray.paths import FORMAT_VERSION, Paths
 from calibray.scenes import Scene
 from calibray.support.cache_folder import cache_folder
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -55,7 +55,7 @@ def trace_digest(
     """
     record = {
         "calibray": version("calibray"),
-        "schema": [SCHEMA_VERSION, "sealed", "vertices"],
+        "format": FORMAT_VERSION,
         "tracer": dict(versions),
         "frequency": frequency,
         "settings": settings.record(),

@@ -340,7 +340,7 @@ def buildings(problem: Problem) -> Buildings | None:
 
 def _apart(engine: Replay, scene: Scene, combining: str, bandwidth: float | None) -> Buildings | None:
     paths, parameters = engine.paths, engine.parameters
-    if paths.vertex is None or not 0 < paths.num_interactions <= INTERACTIONS:
+    if not 0 < paths.num_interactions <= INTERACTIONS:
         return None
     whole = _building(paths, scene)
     known = list(paths.materials)

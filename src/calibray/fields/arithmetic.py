@@ -1,0 +1,159 @@
+"""Complex numbers as pairs of real arrays, and the functions of them that fields need.
+
+Compilers vectorize pairs of real arrays, which makes them several times faster than complex types. All functions work
+element by element and are differentiable.
+"""
+
+from __future__ import annotations
+
+from typing import Final, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+Pair = tuple[jax.Array, jax.Array]
+"""A complex number: real and imaginary part."""
+
+Values = TypeVar("Values")
+
+_QUARTER: Final = (1.5707963267341256, 6.077100506506192e-11)
+"""Pi / 2 as the sum of two numbers (Cody and Waite, Software Manual for the Elementary Functions, 1980, ch. 8). The
+first has 33 bits, so its product with the number of quarter turns is exact up to a million turns."""
+
+_SINE: Final = (
+    1.58969099521155010221e-10,
+    -2.50507602534068634195e-08,
+    2.75573137070700676789e-06,
+    -1.98412698298579493134e-04,
+    8.33333333332248946124e-03,
+    -1.66666666666666324348e-01,
+    1.0,
+)
+"""Minimax polynomial of sin(x) / x on [-pi / 4, pi / 4] in powers of x^2, highest first."""
+
+_COSINE: Final = (
+    -1.13596475577881948265e-11,
+    2.08757232129817482790e-09,
+    -2.75573143513906633035e-07,
+    2.48015872894767294178e-05,
+    -1.38888888888741095749e-03,
+    4.16666666666666019037e-02,
+    -0.5,
+    1.0,
+)
+"""Minimax polynomial of cos(x), likewise."""
+
+
+def multiply(a: Pair, b: Pair) -> Pair:
+    """Product of two complex numbers.
+
+    Args:
+        a: First factor, (real, imaginary) [...].
+        b: Second factor [...].
+
+    Returns:
+        The product [...].
+    """
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def divide(a: Pair, b: Pair) -> Pair:
+    """Quotient of two complex numbers.
+
+    Args:
+        a: Dividend, (real, imaginary) [...].
+        b: Divisor [...].
+
+    Returns:
+        The quotient [...].
+    """
+    inverse = 1 / (b[0] * b[0] + b[1] * b[1])
+    return (a[0] * b[0] + a[1] * b[1]) * inverse, (a[1] * b[0] - a[0] * b[1]) * inverse
+
+
+def squared_magnitude(value: Pair) -> jax.Array:
+    """Squared magnitude of a complex number.
+
+    Args:
+        value: (real, imaginary) [...].
+
+    Returns:
+        The squared magnitude [...].
+    """
+    return value[0] * value[0] + value[1] * value[1]
+
+
+def safe_sqrt(value: jax.Array) -> jax.Array:
+    """Square root whose derivative at 0 is 0 instead of infinity.
+
+    Args:
+        value: At least 0 [...].
+
+    Returns:
+        The root [...].
+    """
+    positive = value > 0
+    # The inner selection keeps the infinite derivative out of the branch that is not taken.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
+
+
+def materialize(values: Values, positive: jax.Array) -> Values:
+    """The same values, computed once and stored.
+
+    XLA on CPU fuses a computation into each of its uses, so it repeats sines and exponentials many times over; it also
+    drops `optimization_barrier`. It cannot fuse across a branch on a value that is unknown when it compiles.
+
+    Args:
+        values: Arrays.
+        positive: Any positive number that is known at run time only.
+
+    Returns:
+        The values.
+    """
+    return jax.lax.cond(
+        positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
+    )
+
+
+@jax.custom_jvp
+def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
+    """Cosine and sine of many angles at once.
+
+    In double precision, XLA on CPU calls the system's functions for one number after the other, some 30 ns for both.
+    The same polynomials without a branch are vectorized and take 2 ns.
+
+    Args:
+        angle: Angles [...], [rad].
+
+    Returns:
+        Cosine and sine [...], each within 2.3e-16 of the true value; beyond a million turns within the effect of the
+        angle's own rounding.
+    """
+    angle_as_given = jnp.asarray(angle)
+    angle = angle_as_given.astype(jnp.float64)
+    quarters = jnp.round(angle * (2 / jnp.pi))
+    rest = (angle - quarters * _QUARTER[0]) - quarters * _QUARTER[1]
+    square = rest * rest
+    sine, cosine = rest * _polynomial(_SINE, square), _polynomial(_COSINE, square)
+    quadrant = quarters - 4 * jnp.floor(quarters / 4)  # 0, 1, 2 or 3
+    odd = (quadrant == 1) | (quadrant == 3)
+    across, along = jnp.where(odd, sine, cosine), jnp.where(odd, cosine, sine)
+    cosine = jnp.where((quadrant == 1) | (quadrant == 2), -across, across)
+    sine = jnp.where(quadrant >= 2, -along, along)
+    return cosine.astype(angle_as_given.dtype), sine.astype(angle_as_given.dtype)
+
+
+@cosine_and_sine.defjvp
+def _cosine_and_sine_jvp(primals: tuple, tangents: tuple) -> tuple:
+    (angle,), (rate,) = primals, tangents
+    cosine, sine = cosine_and_sine(angle)
+    return (cosine, sine), (-sine * rate, cosine * rate)
+
+
+def _polynomial(factors: tuple[float, ...], x: jax.Array) -> jax.Array:
+    """Value of a polynomial by Horner's scheme, factors from the highest power down."""
+    value = jnp.full_like(x, factors[0])
+    for factor in factors[1:]:
+        value = value * x + factor
+    return value

@@ -1,0 +1,319 @@
+"""Tables of the slab coefficients over the angle of incidence, for programs with many interactions.
+
+A coefficient depends on the geometry through the cosine of incidence alone. If a program has many more interactions
+than its tables have nodes, each candidate's coefficients are computed at the nodes and interpolated by cubics through
+four of them: some 10 ns an interaction instead of 100. The position of an interaction in its table does not depend on
+the materials, so it is computed once. Each pair of material and mode has its own row of nodes.
+
+Nodes are evenly spaced in a root of the cosine: the square root, or the sixth root for metals, whose Brewster angle
+lies within a thousandth of grazing incidence. A sheet of plasterboard at 2 GHz needs some hundred intervals, a thick
+slab at 60 GHz thousands. `table_intervals` chooses their number from candidates that represent all others.
+`table_error` then bounds the error for every candidate, at Brewster angles, grazing incidence and slab resonances too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+
+from calibray.fields.arithmetic import Pair, materialize
+from calibray.fields.jax_context import jax_settings
+from calibray.fields.slab import FIELD_COLUMN, Mode, coefficients_of_materials, loss_term
+from calibray.paths import Kind, Paths
+
+Intervals = int | NDArray[np.integer]
+"""Number of intervals of every row, or by material and mode [M, 3]."""
+
+FINEST: Final = 65536
+"""Largest number of intervals of a row."""
+
+COARSEST: Final = 16
+"""Smallest number of intervals of a row."""
+
+_STAGES: Final = (1024, 8192, FINEST)
+"""Upper limits of the search for a number of intervals; a finer one is computed only if the coarser one fails."""
+
+_TOLERANCE_SHARE: Final = 0.1
+"""Share of the tolerance that the representative candidates may use."""
+
+_METAL_LOSS: Final = 1e3
+"""Loss term above which a material is treated as a metal."""
+
+_GRAZING: Final = 1e-9
+"""Cosine at the first node. At exactly 0 even air would reflect everything."""
+
+_EXTRA_NODES: Final = 3
+"""Nodes of a row beyond its intervals: one before the first, one at the end of the last, one behind it."""
+
+_STENCIL: Final = 3
+"""Nodes on either side that `table_error` needs."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["cell", "fraction", "cosine", "material", "mode", "inner"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class TableLayout:
+    """The position of each coefficient in the tables. Rows of all pairs of material and mode follow each other.
+
+    Attributes:
+        cell: Node below the coefficient, counted over all rows; one array for each step of each group, [n] or [k, n].
+        fraction: Distance from that node in units of the interval, likewise.
+        cosine: Cosine of incidence at every node [N].
+        material: Material of every node [N].
+        mode: Mode of every node [N].
+        inner: Nodes with at least three others of their row on either side [K].
+    """
+
+    cell: tuple[jax.Array, ...]
+    fraction: tuple[jax.Array, ...]
+    cosine: jax.Array
+    material: jax.Array
+    mode: jax.Array
+    inner: jax.Array
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes N of all rows."""
+        return self.cosine.shape[0]
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=[])
+@dataclass(frozen=True)
+class CoefficientTables:
+    """Tables of coefficients. The numbers of a cell are adjacent, so that a look-up costs one or two cache lines.
+
+    Attributes:
+        values: Cubic polynomials from every node to the next: real and imaginary part of the transverse electric and
+            of the transverse magnetic coefficient at the node, then their factors of the fraction, of its square and
+            of its cube [N + 4, 16]. The last four nodes have the coefficient 1.
+    """
+
+    values: jax.Array
+
+
+def coefficient_arguments(
+    paths: Paths,
+) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]:
+    """Material, mode and cosine of incidence of every coefficient of a path program.
+
+    Args:
+        paths: The path program.
+
+    Returns:
+        The three arrays (each [J]), first of all interactions, then of the n-faces of diffracting wedges.
+    """
+    wedge = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
+    kind, material = (np.concatenate([column, column[wedge]]) for column in (paths.kind, paths.material))
+    mode = np.select(
+        [kind == Kind.REFRACTION, kind == Kind.DIFFUSE], [Mode.TRANSMISSION, Mode.FULL_REFLECTION], 0
+    )
+    return material, mode, np.concatenate([paths.cos_incidence, paths.diffraction.cos_incidence_n])
+
+
+def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.int64]:
+    """The root of the cosine in which the nodes of each material are evenly spaced.
+
+    Args:
+        table: Material constants [M, 8].
+        wavelength: [m].
+
+    Returns:
+        6 for metals, else 2 [M].
+    """
+    loss = loss_term(jnp.asarray(table[:, FIELD_COLUMN["conductivity"]]), jnp.asarray(wavelength))
+    return np.where(np.asarray(loss) > _METAL_LOSS, 6, 2)
+
+
+def table_layout(
+    material: NDArray[np.integer],
+    mode: NDArray[np.integer],
+    cosine: NDArray[np.float64],
+    root: NDArray[np.integer],
+    steps: Sequence[NDArray[np.integer]],
+    intervals: Intervals,
+    dtype: type,
+) -> TableLayout:
+    """Find the position of every coefficient in the tables.
+
+    Args:
+        material: Material of every coefficient [J].
+        mode: Its mode [J].
+        cosine: Its cosine of incidence [J].
+        root: `spacing_roots` [M].
+        steps: Coefficients at each step of each group, of any shape; J where there is none, whose coefficient is 1.
+        intervals: Intervals of the rows.
+        dtype: Precision of the fractions.
+
+    Returns:
+        The positions.
+    """
+    rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
+    row = row.reshape(-1)
+    cells = np.broadcast_to(intervals, (len(rows),)) if np.ndim(intervals) == 0 else np.ravel(intervals)[rows]
+    ends = np.cumsum(cells + _EXTRA_NODES)
+    first, total = ends - cells - _EXTRA_NODES, int(ends[-1]) if len(ends) else 0
+    row_of_node = np.repeat(np.arange(len(rows)), cells + _EXTRA_NODES)
+    rank = np.arange(total) - first[row_of_node]  # of a node within its row
+    position = cosine ** (1 / root[material]) * cells[row]
+    below = np.minimum(position.astype(np.int64), cells[row] - 1)
+    # A step without a coefficient takes the cell of the four nodes of 1 at the end.
+    cell = np.append(first[row] + 1 + below, total + 1).astype(np.uint32)
+    fraction = np.append(position - below, 0.0).astype(dtype)
+    last, material_of_node = cells[row_of_node] + _EXTRA_NODES - 1, (rows // len(Mode))[row_of_node]
+    node_cosine = ((rank - 1) / cells[row_of_node]) ** root[material_of_node]
+    return TableLayout(
+        cell=tuple(jnp.asarray(cell[step]) for step in steps),
+        fraction=tuple(jnp.asarray(fraction[step]) for step in steps),
+        cosine=jnp.asarray(np.maximum(node_cosine, _GRAZING).astype(dtype)),
+        material=jnp.asarray(material_of_node.astype(np.int32)),
+        mode=jnp.asarray((rows % len(Mode))[row_of_node].astype(np.int32)),
+        inner=jnp.asarray(np.flatnonzero((rank >= _STENCIL) & (rank <= last - _STENCIL)).astype(np.int32)),
+    )
+
+
+def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) -> CoefficientTables:
+    """Compute the coefficients at all nodes.
+
+    Args:
+        layout: The layout of the tables.
+        table: Material constants [M, 8].
+        wavelength: [m].
+
+    Returns:
+        The tables.
+    """
+    te, tm = coefficients_of_materials(
+        layout.cosine,
+        table,
+        layout.material,
+        wavelength,
+        layout.mode == Mode.TRANSMISSION,
+        layout.mode != Mode.REFLECTION,
+    )
+    ones = jnp.broadcast_to(jnp.array([1.0, 0.0, 1.0, 0.0], dtype=table.dtype), (4, 4))
+    value = materialize(jnp.concatenate([jnp.stack([*te, *tm], axis=-1), ones]), wavelength)
+    return CoefficientTables(_cubics(value))
+
+
+def _cubics(value: jax.Array) -> jax.Array:
+    """Factors [N, 16] of the cubics from every node to the next, by Lagrange through both and their neighbours.
+
+    Cubics at nodes without these neighbours are meaningless, and not used.
+    """
+    before, after, beyond = (jnp.roll(value, -step, axis=0) for step in (-1, 1, 2))
+    linear = after - before / 3 - value / 2 - beyond / 6
+    square = (before + after) / 2 - value
+    cube = (beyond - before) / 6 + (value - after) / 2
+    return jnp.concatenate([value, linear, square, cube], axis=-1)
+
+
+def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
+    """Look coefficients up.
+
+    Args:
+        tables: The tables.
+        cell: Node below, counted over all rows [...].
+        fraction: Distance from that node in units of the interval [...].
+
+    Returns:
+        Transverse electric and magnetic coefficients, (real, imaginary) [...].
+    """
+
+    def value(part: int) -> jax.Array:
+        factors = [tables.values[:, part + 4 * k].at[cell].get(mode="promise_in_bounds") for k in range(4)]
+        return ((factors[3] * fraction + factors[2]) * fraction + factors[1]) * fraction + factors[0]
+
+    return (value(0), value(1)), (value(2), value(3))
+
+
+def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
+    """Upper bound of the interpolation error of any coefficient.
+
+    Every node is compared with the cubic through the nodes one and three steps away, which has twice the step. The
+    error of cubics falls with the fourth power of the step, so the tables' error is a sixteenth of the largest gap. The
+    bound is twice that.
+
+    Args:
+        tables: The tables.
+        layout: Their layout.
+
+    Returns:
+        Largest absolute error of a coefficient's real or imaginary part [1].
+    """
+    value = tables.values[:, :4]
+
+    def at(step: int) -> jax.Array:
+        return value.at[layout.inner + step].get(mode="promise_in_bounds")
+
+    gap = at(0) - 9 / 16 * (at(-1) + at(1)) + 1 / 16 * (at(-3) + at(3))
+    return jnp.abs(gap).max(initial=0.0) / 8
+
+
+@jax_settings()
+def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+    """Number of intervals that each row of the tables needs.
+
+    Args:
+        paths: The path program.
+        tables: Material constants of candidates that represent all others [n, M, 8].
+        tolerance: Largest error of a tabulated coefficient [1].
+
+    Returns:
+        Intervals by material and mode [M, 3], powers of two up to `FINEST`; 0 where there is no such row.
+    """
+    material, mode, _ = coefficient_arguments(paths)
+    needed = np.zeros((tables.shape[1], len(Mode)), dtype=np.int64)
+    wavelength = speed_of_light / paths.frequency
+    root = spacing_roots(paths.material_table(), wavelength)
+    for row in np.unique(material.astype(np.int64) * len(Mode) + mode).tolist():
+        number, row_mode = divmod(row, len(Mode))
+        needed[number, row_mode] = max(
+            _row_intervals(constants, row_mode, int(root[number]), wavelength, _TOLERANCE_SHARE * tolerance)
+            for constants in np.unique(tables[:, number], axis=0)
+        )
+    return needed
+
+
+def _row_intervals(
+    constants: NDArray[np.float64], mode: int, root: int, wavelength: float, tolerance: float
+) -> int:
+    """Intervals that a row needs for one material's constants [8]."""
+    for finest in _STAGES:
+        errors = np.asarray(_errors_by_intervals(constants[None], mode, root, wavelength, finest))
+        sufficient = np.flatnonzero(errors <= tolerance)
+        if len(sufficient):
+            return COARSEST << int(sufficient[0])
+    return FINEST
+
+
+@partial(jax.jit, static_argnums=4)
+def _errors_by_intervals(
+    table: jax.Array, mode: jax.Array, root: jax.Array, wavelength: jax.Array, finest: int
+) -> jax.Array:
+    """Largest error of a row with `COARSEST` intervals, with twice as many, and so on up to `finest`."""
+    cosine = jnp.maximum((jnp.arange(2 * finest + 1) / (2 * finest)) ** root, _GRAZING)
+    material = jnp.zeros(cosine.shape, dtype=jnp.int32)
+    te, tm = coefficients_of_materials(
+        cosine, table, material, wavelength, mode == Mode.TRANSMISSION, mode != Mode.REFLECTION
+    )
+    value = materialize(jnp.stack([*te, *tm], axis=-1), wavelength)
+    errors, step = [], finest // COARSEST
+    while step:
+        node, middle = value[:: 2 * step], value[step :: 2 * step]
+        # Coefficients are even functions of the root of the cosine, so the node before the first mirrors the second.
+        node = jnp.concatenate([node[1:2], node])
+        interpolated = 9 / 16 * (node[1:-2] + node[2:-1]) - 1 / 16 * (node[:-3] + node[3:])
+        errors.append(jnp.abs(middle[:-1] - interpolated).max())
+        step //= 2
+    return jnp.stack(errors)

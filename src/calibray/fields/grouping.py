@@ -1,0 +1,138 @@
+"""Groups of paths that are evaluated together, and the sequence of their interactions.
+
+Paths of a group have interactions of the same kinds in the same order, so that every step of a group is a dense array.
+With padding, paths that differ only in the length of a run of reflections and transmissions share a group, and the
+shorter runs are filled up with interactions that change nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.paths import Kind, Paths
+
+COEFFICIENT: Final = "c"
+"""A reflection or a transmission."""
+
+RUN: Final = "r"
+"""Several reflections or transmissions in succession."""
+
+SCATTERING: Final = "s"
+"""A diffuse reflection."""
+
+DIFFRACTION: Final = "d"
+
+_LETTERS: Final = ("?", COEFFICIENT, SCATTERING, DIFFRACTION)
+"""Letters by the numbers of `_numbers`."""
+
+_COEFFICIENT_NUMBER: Final = 1
+
+Step = tuple[str, NDArray[np.int64]]
+"""A letter, and the interactions of a group's n paths: [n], or [k, n] for a run of k, with -1 where a path has none."""
+
+
+@dataclass(frozen=True)
+class PathGroup:
+    """Paths that are evaluated together.
+
+    Attributes:
+        paths: Their indices [n].
+        steps: Their interactions, step by step.
+    """
+
+    paths: NDArray[np.int64]
+    steps: tuple[Step, ...]
+
+
+def exact_groups(paths: Paths) -> list[PathGroup]:
+    """Group paths with the same sequence of interactions.
+
+    Args:
+        paths: The path program.
+
+    Returns:
+        The groups; none has a run.
+    """
+    number = _numbers(paths)
+    groups = []
+    for members in _equal(_sequence_codes(paths, number)):
+        depth = int(np.diff(paths.first)[members[0]])
+        interactions = paths.first[members] + np.arange(depth)[:, None]  # [depth, n]
+        letters = [_LETTERS[value] for value in number[interactions[:, 0]]]
+        groups.append(PathGroup(members, tuple(zip(letters, interactions, strict=True))))
+    return groups
+
+
+def padded_groups(paths: Paths) -> list[PathGroup]:
+    """Group paths that agree once each run of reflections and transmissions is counted as one interaction.
+
+    Args:
+        paths: The path program.
+
+    Returns:
+        The groups. Within a group, the path with the most reflections and transmissions comes first; a run is as long
+        as the longest one of its paths.
+    """
+    number, interaction = _numbers(paths), np.arange(paths.num_interactions)
+    path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))
+    is_coefficient = number == _COEFFICIENT_NUMBER
+    # Run that an interaction belongs to, or ends: the number of other interactions before it on its path.
+    others_before = np.concatenate([[0], np.cumsum(~is_coefficient)])
+    run = others_before[:-1] - others_before[paths.first[path]]
+    last_other = np.maximum.accumulate(np.where(is_coefficient, -1, interaction))
+    rank = interaction - np.maximum(last_other + 1, paths.first[path])  # within its run
+    count = np.bincount(path, is_coefficient, paths.num_paths)
+    # Paths with short runs come last, so that most empty positions are at the end of a line.
+    members = [
+        group[np.argsort(-count[group], kind="stable")]
+        for group in _equal(_sequence_codes(paths, np.where(is_coefficient, 0, number)))
+    ]
+    group_of_path, column_of_path = np.zeros((2, paths.num_paths), dtype=np.int64)
+    for index, group in enumerate(members):
+        group_of_path[group], column_of_path[group] = index, np.arange(len(group))
+    groups = []
+    for index, group in enumerate(members):
+        inside = interaction[group_of_path[path] == index]
+        steps: list[Step] = []
+        for turn in range(int(run[inside].max(initial=-1)) + 2):
+            in_turn = inside[run[inside] == turn]
+            in_run, end = in_turn[is_coefficient[in_turn]], in_turn[~is_coefficient[in_turn]]
+            lines = np.full((int(rank[in_run].max(initial=-1)) + 1, len(group)), -1, dtype=np.int64)
+            lines[rank[in_run], column_of_path[path[in_run]]] = in_run
+            if len(lines):
+                steps.append((RUN, lines))
+            if len(end):  # every path of the group has it
+                ends = np.empty(len(group), dtype=np.int64)
+                ends[column_of_path[path[end]]] = end
+                steps.append((_LETTERS[number[end[0]]], ends))
+        groups.append(PathGroup(group, tuple(steps)))
+    return groups
+
+
+def _numbers(paths: Paths) -> NDArray[np.int64]:
+    """Index in `_LETTERS` of every interaction [I]."""
+    return np.select(
+        [paths.kind == Kind.DIFFUSE, paths.kind == Kind.DIFFRACTION], [2, 3], _COEFFICIENT_NUMBER
+    ).astype(np.int64)
+
+
+def _sequence_codes(paths: Paths, number: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each path [P], equal for equal sequences of numbers; zeros are skipped."""
+    depth, code = np.diff(paths.first), np.zeros(paths.num_paths, dtype=np.int64)
+    for step in range(int(depth.max(initial=0))):
+        deep = np.flatnonzero(depth > step)
+        digit = number[paths.first[:-1][deep] + step]
+        code[deep] = np.where(digit > 0, code[deep] * 4 + digit, code[deep])
+        if step % 16 == 15:
+            # Two bits a step: renumber before a long path exceeds 64 bits.
+            code = np.unique(code, return_inverse=True)[1].reshape(-1)
+    return code
+
+
+def _equal(code: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Indices with equal codes."""
+    return [np.flatnonzero(code == value) for value in np.unique(code)]

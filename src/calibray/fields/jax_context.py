@@ -1,0 +1,128 @@
+"""The JAX settings under which Calibray computes; outside of its calls JAX keeps the user's.
+
+Within `jax_settings` JAX computes in double precision, and takes compiled programs from a folder that outlives the
+process. A compiled program is machine code, so it is taken only from a folder that nobody but the user can write
+(`calibray.support.cache_folder.Store`). JAX's own cache on disk writes entries in place and does not check them. Its
+keys, which cover everything a program depends on, are used here, but reading and writing goes through the store.
+If the user named a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), that one is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from calibray.support import cache_folder
+
+_lock = threading.Lock()
+_calls = 0
+"""Calls in progress that use the store, over all threads."""
+_users_cache: Any = None
+"""JAX's cache on disk before the first of these calls."""
+
+
+@contextmanager
+def jax_settings() -> Iterator[None]:
+    """Compute in double precision and keep compiled programs; afterwards JAX has the user's settings again.
+
+    Every function of `calibray.fields` that computes does so within these settings. Enter them yourself to
+    differentiate or compile around one of the pure functions.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> with jax_settings():
+        ...     print(jnp.asarray(1.0).dtype)
+        float64
+        >>> jax.config.jax_enable_x64
+        False
+    """
+    with jax.enable_x64(True):
+        # A folder is set if the user named one, or within another call of Calibray.
+        programs = _kept_programs() if jax.config.values["jax_compilation_cache_dir"] is None else None
+        if programs is None:
+            yield
+        else:
+            with _cache_of_jax(programs):
+                yield
+
+
+@contextmanager
+def _cache_of_jax(programs: Any) -> Iterator[None]:
+    """Make the store the cache on disk of JAX.
+
+    JAX has one cache for all threads, but the folder is a setting of each thread. The store therefore answers only
+    threads in which its own folder is set, so that programs of the user are not kept.
+    """
+    global _calls, _users_cache
+    from jax._src import compilation_cache, config
+
+    with _lock:
+        if _calls == 0:
+            _users_cache, compilation_cache._cache = compilation_cache._cache, programs
+        _calls += 1
+    try:
+        with (
+            config.compilation_cache_dir(str(programs._path)),
+            config.persistent_cache_min_compile_time_secs(0.0),
+        ):
+            yield
+    finally:
+        with _lock:
+            _calls -= 1
+            if _calls == 0:
+                compilation_cache._cache = _users_cache
+
+
+@cache
+def _kept_programs() -> Any:
+    """The store as a cache for JAX; None if its folder cannot be trusted or JAX has no such interface."""
+    store = cache_folder.compiled_programs()
+    if store is None or not store.trusted:
+        return None
+    try:
+        # JAX has no public way to bring another storage.
+        from jax._src import compilation_cache, config
+        from jax._src.compilation_cache_interface import CacheInterface
+    except ImportError:
+        return None
+    needed = {"compilation_cache_dir", "persistent_cache_min_compile_time_secs"}
+    if not hasattr(compilation_cache, "_cache") or not needed <= vars(config).keys():
+        return None
+
+    class KeptPrograms(CacheInterface):
+        _path = store.path
+
+        def get(self, key: str) -> bytes | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+            return store.get(_entry_name(key)) if self._is_set() else None
+
+        def put(self, key: str, value: bytes) -> None:
+            if self._is_set():
+                store.put(_entry_name(key), value)
+
+        def _is_set(self) -> bool:
+            return config.compilation_cache_dir.value == str(self._path)
+
+    return KeptPrograms()
+
+
+def _entry_name(key: str) -> str:
+    """Name of an entry. It includes the processor, as its code may crash on another one that shares the folder."""
+    return hashlib.sha256(f"{key} {_processor()}".encode()).hexdigest()
+
+
+@cache
+def _processor() -> str:
+    """Model and instruction sets of this machine's processor, as far as the system reports them."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        features = {line for line in lines if line.startswith(("flags", "Features", "model name"))}
+        return " ".join(sorted(features))
+    return f"{platform.machine()} {platform.processor()} {platform.node()}"

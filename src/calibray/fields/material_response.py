@@ -1,0 +1,206 @@
+"""Response of the materials: the coefficients of all interactions, and the amplitudes of diffuse reflection.
+
+`material_response` computes them for all groups together, in flat arrays or as tables. `split_by_step` hands each step
+of each group its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from calibray.fields.arithmetic import Pair, safe_sqrt
+from calibray.fields.coefficient_tables import CoefficientTables, TableLayout, fill_tables, interpolate
+from calibray.fields.grouping import DIFFRACTION, SCATTERING
+from calibray.fields.program import FormulaArguments, GroupedProgram
+from calibray.fields.scattering import pattern_value
+from calibray.fields.slab import FIELD_COLUMN, coefficients_of_materials, loss_term
+
+Coefficients = tuple[Pair, Pair]
+"""Transverse electric and magnetic coefficient."""
+
+GroupResponse = tuple[tuple[Coefficients, ...], tuple[tuple[jax.Array, jax.Array], ...]]
+"""The coefficients at every step of a group (at a diffraction two), and both amplitudes at every diffuse reflection."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["coefficients", "co_polarized", "cross_polarized"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class MaterialResponse:
+    """All that the fields take from the materials.
+
+    Attributes:
+        coefficients: Transverse electric and magnetic coefficients, each (real, imaginary) [K]; or their tables.
+        co_polarized: S sqrt(f_s dOmega (1 - K_x)) of the diffuse interactions, which keep the polarization [D].
+        cross_polarized: S sqrt(f_s dOmega K_x), which turns it [D].
+    """
+
+    coefficients: Coefficients | CoefficientTables
+    co_polarized: jax.Array
+    cross_polarized: jax.Array
+
+
+def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResponse:
+    """Response of the materials.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+
+    Returns:
+        The response.
+    """
+    source = program.coefficients
+    if isinstance(source, FormulaArguments):
+        coefficients = coefficients_of_materials(
+            source.cosine,
+            table,
+            source.material,
+            program.wavelength,
+            source.transmitted if source.any_transmitted else False,
+            source.transmitted | source.unreduced,
+        )
+        if source.blank is not None:
+            te, tm = (
+                (jnp.where(source.blank, 1.0, real), jnp.where(source.blank, 0.0, imaginary))
+                for real, imaginary in coefficients
+            )
+            coefficients = te, tm
+    else:
+        coefficients = fill_tables(source, table, program.wavelength)
+    diffuse = program.diffuse
+    density = pattern_value(
+        table,
+        diffuse.material,
+        diffuse.cos_incidence,
+        diffuse.cos_scattered,
+        diffuse.cos_specular,
+        diffuse.cos_backward,
+        diffuse.patterns,
+    )
+    root = safe_sqrt(density * diffuse.solid_angle)  # sqrt(f_s dOmega)
+    scattering, xpd = (table[:, FIELD_COLUMN[name]] for name in ("scattering_coefficient", "xpd_coefficient"))
+    co_polarized, cross_polarized = (
+        (scattering * safe_sqrt(share)).at[diffuse.material].get(mode="promise_in_bounds") * root
+        for share in (1 - xpd, xpd)
+    )
+    return MaterialResponse(coefficients, co_polarized, cross_polarized)
+
+
+def response_and_derivatives(
+    program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
+) -> tuple[MaterialResponse, tuple[MaterialResponse, ...]]:
+    """Response of the materials, and its derivatives by a constant of each interaction's own material.
+
+    Args:
+        program: The program.
+        table: Material constants [M, 8].
+        columns: Columns of the table to differentiate by.
+
+    Returns:
+        The response, and its derivatives by each column.
+    """
+    response, push = jax.linearize(partial(material_response, program), table)
+    permittivity, conductivity = FIELD_COLUMN["relative_permittivity"], FIELD_COLUMN["conductivity"]
+    derivatives = {
+        column: push(jnp.zeros_like(table).at[:, column].set(1.0))
+        for column in columns
+        if not (column == conductivity and permittivity in columns)
+    }
+    if conductivity in columns and permittivity in columns:
+        derivatives[conductivity] = _by_conductivity(program, derivatives[permittivity])
+    return response, tuple(derivatives[column] for column in columns)
+
+
+def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse) -> MaterialResponse:
+    """Derivatives by the conductivity from those by the permittivity, which saves a pass.
+
+    Coefficients are analytic in eta = eps_r - j loss, and the loss is proportional to the conductivity. So the
+    derivative by the conductivity is -j times the loss per unit of conductivity times that by the permittivity.
+    """
+    loss_per_unit = loss_term(jnp.ones_like(program.wavelength), program.wavelength)
+
+    def by_loss(real: jax.Array, imaginary: jax.Array) -> Pair:
+        return loss_per_unit * imaginary, -loss_per_unit * real
+
+    coefficients = by_permittivity.coefficients
+    if isinstance(coefficients, CoefficientTables):
+        pairs = coefficients.values.reshape(len(coefficients.values), -1, 2)
+        derivatives = jnp.stack(by_loss(pairs[..., 0], pairs[..., 1]), axis=-1)
+        tables = CoefficientTables(derivatives.reshape(coefficients.values.shape))
+        return replace(by_permittivity, coefficients=tables)
+    te, tm = coefficients
+    return replace(by_permittivity, coefficients=(by_loss(*te), by_loss(*tm)))
+
+
+def split_by_step(
+    program: GroupedProgram, response: MaterialResponse, blank: float = 1.0
+) -> tuple[GroupResponse, ...]:
+    """The response cut into what each step of each group takes.
+
+    Reverse passes differentiate by these parts. By the flat arrays, every part would cost a pass over all of them.
+
+    Args:
+        program: The program.
+        response: The response, or its derivatives.
+        blank: Value of a coefficient at empty positions: 1, or 0 for derivatives.
+
+    Returns:
+        The parts, group by group.
+    """
+    groups, row = [], 0
+    step_coefficients = _coefficients_by_step(program, response, blank)
+    for group in program.groups:
+        coefficients, amplitudes = [], []
+        for letter in group.signature:
+            # A diffraction takes the coefficients of both faces of the wedge.
+            coefficients += [next(step_coefficients) for _ in range(2 if letter == DIFFRACTION else 1)]
+            if letter == SCATTERING:
+                rows = slice(row, row + group.size)
+                amplitudes.append((response.co_polarized[rows], response.cross_polarized[rows]))
+                row += group.size
+        groups.append((tuple(coefficients), tuple(amplitudes)))
+    return tuple(groups)
+
+
+def _coefficients_by_step(
+    program: GroupedProgram, response: MaterialResponse, blank: float
+) -> Iterator[Coefficients]:
+    """The coefficients of one step after the other."""
+    source = program.coefficients
+    if isinstance(source, TableLayout) and isinstance(response.coefficients, CoefficientTables):
+        for cell, fraction in zip(source.cell, source.fraction, strict=True):
+            yield interpolate(response.coefficients, cell, fraction)
+    elif not isinstance(response.coefficients, CoefficientTables):
+        start, (te, tm) = 0, response.coefficients
+        source = cast(FormulaArguments, source)
+        for shape, lines in zip(source.shapes, source.lines, strict=True):
+            yield (
+                (_unpacked(te[0], start, lines, shape, blank), _unpacked(te[1], start, lines, shape)),
+                (_unpacked(tm[0], start, lines, shape, blank), _unpacked(tm[1], start, lines, shape)),
+            )
+            start += sum(lines)
+
+
+def _unpacked(
+    values: jax.Array, start: int, lines: tuple[int, ...], shape: tuple[int, ...], blank: float = 0.0
+) -> jax.Array:
+    """The numbers of one step of a group, with `blank` at positions that are not stored.
+
+    A line is read beyond its end into the next one and the excess is replaced, which needs no pass of its own.
+    """
+    parts, size = [], shape[-1]
+    for length in reversed(lines):  # the last line is stored first
+        part = values[start : start + size]
+        part = jnp.pad(part, (0, size - len(part)))
+        parts.append(part if length == size else jnp.where(jnp.arange(size) < length, part, blank))
+        start += length
+    return jnp.stack(parts[::-1]) if len(shape) > 1 else parts[0]

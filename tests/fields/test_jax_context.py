@@ -1,0 +1,185 @@
+"""Calibray computes under its own JAX settings and leaves the user's unchanged."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax._src import compilation_cache
+
+from calibray.fields import jax_settings
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _jax_settings() -> None:
+    """Unlike other tests of this room, these begin under the user's settings."""
+
+
+GLOBAL_STATE = """
+import locale, logging, os, random, signal, sys, warnings
+from importlib import import_module
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# These packages change global settings themselves when they are imported.
+import rich.console, scipy.sparse, scipy.special, threadpoolctl
+
+
+def state():
+    root = logging.getLogger()
+    return {
+        **{f"JAX's {name}": repr(value) for name, value in jax.config.values.items()},
+        "JAX's cache on disk": repr(jax._src.compilation_cache._cache),
+        "types of JAX": [str(jnp.asarray(1.0).dtype), str(jax.jit(lambda x: 2 * x)(1.0).dtype)],
+        "names in the environment": set(os.environ),
+        "values in the environment": sorted(os.environ.items()),
+        "warnings": list(map(str, warnings.filters)),
+        "floating-point errors": np.geterr(),
+        "printing": np.get_printoptions(),
+        "random numbers": [repr(random.getstate()), repr(np.random.get_state())],
+        "logging": [root.level, list(map(str, root.handlers))],
+        "signals": [str(signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)],
+        "process": [os.getcwd(), list(sys.path), sys.getrecursionlimit(), str(sys.excepthook)],
+        "locale": locale.setlocale(locale.LC_ALL),
+    }
+
+
+def check(step, before):
+    after = state()
+    for name, value in before.items():
+        assert after[name] == value, f"{step} changed {name} from {value} to {after[name]}"
+
+
+before = state()
+import calibray
+# Not the room of Sionna RT: Dr.Jit takes the path of libLLVM from the environment when it is imported.
+left_out = {"templates", "__main__", "sionna"}
+source = Path(calibray.__file__).parent
+modules = [file.relative_to(source.parent).with_suffix("").parts for file in source.rglob("*.py")]
+modules = [".".join(parts).removesuffix(".__init__") for parts in modules if not left_out & set(parts)]
+for name in modules:
+    import_module(name)
+check("importing all modules", before)
+
+import synthetic
+from calibray.engines import Replay
+from calibray.parameters import Parameter, Parameters
+
+paths = synthetic.program([(synthetic.Kind.SPECULAR,), ()], materials={"walls": calibray.Material(4.3, 0.08, 0.18)})
+engine = Replay(paths, Parameters((Parameter("walls.thickness", 0.1, 0.5, start=0.2),)))
+calls = {
+    "path_loss": lambda: calibray.path_loss(paths, combining="band", bandwidth=1e6),
+    "path_gains": lambda: calibray.path_gains(paths).real,
+    "channel_statistics": lambda: calibray.channel_statistics(paths).delay_spread,
+    "power_delay_profile": lambda: calibray.power_delay_profile(paths, np.array([0.0, 1.0])),
+    "Replay.path_loss": lambda: engine.path_loss(np.array([[0.2]])),
+    "Replay.path_loss_and_jacobian": lambda: engine.path_loss_and_jacobian(np.array([[0.2]]))[1],
+}
+for name, call in calls.items():
+    result = call()
+    assert (type(result), result.dtype) == (np.ndarray, np.float64), name
+    check(name, before)
+print(len(modules))
+"""
+
+
+def run(program: str, **environment: str) -> str:
+    """Output of a program in a process of its own, which must not write to stderr."""
+    inherited = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=inherited | environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stderr == ""
+    assert done.returncode == 0
+    return done.stdout
+
+
+def test_importing_and_calling_calibray_changes_nothing_global(tmp_path: Path) -> None:
+    search = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    assert int(run(GLOBAL_STATE, PYTHONPATH=search, CALIBRAY_CACHE=str(tmp_path))) > 100
+    assert list((tmp_path / "compiled").iterdir())  # the calls did use the store
+
+
+COMPILED = """
+import json
+from collections import Counter
+
+import jax
+from jax import monitoring
+
+from calibray.fields import jax_settings
+
+seen = Counter()
+monitoring.register_event_listener(lambda event, **_: seen.update([event.rpartition("/")[2]]))
+with jax_settings():
+    value = float(jax.jit(lambda x: jax.numpy.sin(x) * 3)(2.0))
+inside = seen["cache_hits"], seen["cache_misses"]
+jax.jit(lambda x: jax.numpy.cos(x) * 5)(2.0)
+assert inside == (seen["cache_hits"], seen["cache_misses"]), "a program of the user was kept"
+print(json.dumps([value, *inside]))
+"""
+
+
+def test_a_second_process_compiles_nothing_and_damage_breaks_nothing(tmp_path: Path) -> None:
+    def outcome() -> list[float]:
+        return json.loads(run(COMPILED, CALIBRAY_CACHE=str(tmp_path)))
+
+    value, hits, misses = outcome()
+    assert (hits, misses > 0) == (0, True)
+    assert outcome() == [value, misses, 0]
+    for path in (tmp_path / "compiled").iterdir():
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    assert outcome() == [value, 0, misses]
+    # negative control: others could put code into a folder that they can write
+    (tmp_path / "compiled").chmod(0o777)
+    assert outcome() == [value, 0, 0]
+
+
+def test_settings_are_those_of_one_thread() -> None:
+    inside, leave, types = threading.Barrier(3), threading.Barrier(3), {}
+
+    def compute(name: str) -> None:
+        with jax_settings():
+            inside.wait()
+            types[name] = str(jnp.ones(3).dtype)
+            leave.wait()
+
+    threads = [threading.Thread(target=compute, args=(name,)) for name in ("first", "second")]
+    for thread in threads:
+        thread.start()
+    inside.wait()
+    types["user"] = str(jax.jit(lambda: jnp.zeros(3))().dtype)
+    leave.wait()
+    for thread in threads:
+        thread.join()
+    assert types == {"first": "float64", "second": "float64", "user": "float32"}
+    assert compilation_cache._cache is None
+
+
+def test_a_cache_that_the_user_named_is_used(tmp_path: Path) -> None:
+    named, own = tmp_path / "user", tmp_path / "calibray"
+    run(
+        COMPILED, CALIBRAY_CACHE=str(own), JAX_COMPILATION_CACHE_DIR=str(named),
+        JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="100",
+    )  # fmt: skip
+    assert not (own / "compiled").exists() or not list((own / "compiled").iterdir())
+
+
+def test_settings_are_restored_after_an_error() -> None:
+    with pytest.raises(KeyboardInterrupt), jax_settings():
+        raise KeyboardInterrupt
+    assert not jax.config.jax_enable_x64
+    assert jax.config.jax_compilation_cache_dir is None
+    assert compilation_cache._cache is None
