@@ -65,6 +65,7 @@ def program(interactions: int, diffuse: bool, seed: int = 0) -> Paths:
         material=random.integers(3, size=count).astype(np.int32),
         cos_incidence=random.random(count),
         rotation=rotations(random, count),
+        vertex=np.zeros((count, 3), np.float32),
         diffuse=Diffuse(
             rotations(random, rows), random.uniform(1, 6, rows), *(random.random(rows) for _ in range(3))
         ),

@@ -23,32 +23,33 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+from problem_families.problems import landscape_problem
+
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
-from calibray.comparison.comparison import compare
+from calibray.comparison.compare import compare
+from calibray.comparison.comparison import table
 from calibray.comparison.comparison_files import figure
-from calibray.comparison.problems import Arena, study_arena
-from calibray.comparison.tables import table
+from calibray.comparison.problem import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
 from calibray.support.output_files import write_table, write_text
 from calibray.tables import markdown
-from problem_families.arenas import landscape_arena
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (
     "vector-surrogate", "sgwo-im", "gwo", "gwo@600", "gaussian-process", "dfo-ls", "cma-es",
     "differential-evolution", "random", "least-squares",
 )  # fmt: skip
-PROBLEMS: dict[str, tuple[str, Callable[[], Arena]]] = {
-    "demo": ("The demo district, 3 permittivities", partial(study_arena, demo_study_path())),
-    "boulder": ("Boulder at 28.5 GHz (NIST)", partial(study_arena, ROOT / "examples/nist_boulder.toml")),
-    "auckland": ("Auckland at 1.88 GHz", partial(study_arena, ROOT / "examples/auckland_tower.toml")),
+PROBLEMS: dict[str, tuple[str, Callable[[], ComparisonProblem]]] = {
+    "demo": ("The demo district, 3 permittivities", partial(study_problem, demo_study_path())),
+    "boulder": ("Boulder at 28.5 GHz (NIST)", partial(study_problem, ROOT / "examples/nist_boulder.toml")),
+    "auckland": ("Auckland at 1.88 GHz", partial(study_problem, ROOT / "examples/auckland_tower.toml")),
     "hall": (
         "Thick resonating panes, 3 parameters, hundreds of local minima",
-        partial(landscape_arena, "hall"),
+        partial(landscape_problem, "hall"),
     ),
-    "blocks": ("8 parameters, 60 links", partial(landscape_arena, "blocks")),
+    "blocks": ("8 parameters, 60 links", partial(landscape_problem, "blocks")),
 }
 
 
@@ -71,10 +72,10 @@ def main() -> None:
     sections = ["# Methods compared\n\nWritten by `benchmarks/methods.py`; "
                 f"{chosen.seeds} seeds, {chosen.budget} RT calls unless the method's name says otherwise."]  # fmt: skip
     for name in chosen.problems:
-        title, arena = PROBLEMS[name]
+        title, open_problem = PROBLEMS[name]
         with progress_bars(log()) as progress:
             finished = compare(
-                arena, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
+                open_problem, chosen.methods, seeds=chosen.seeds, budget=chosen.budget,
                 out=chosen.runs / name, workers=chosen.workers, progress=progress,
             )  # fmt: skip
         write_table(chosen.out / f"{name}.csv", finished.table())

@@ -24,17 +24,16 @@ for library in ("OMP", "OPENBLAS", "MKL"):
 
 import numpy as np
 from numpy.typing import NDArray
+from problem_families.family_comparison import seed_range
+from problem_families.problems import planted_problem
 
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
-from calibray.comparison.contestant import Contender, code, run_contender
-from calibray.comparison.problems import Arena
-from calibray.comparison.run_log import MethodRun, Runs
+from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, code_fingerprint
+from calibray.comparison.problem import ComparisonProblem
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, markdown, numbers
-from problem_families.arenas import family_arena
-from problem_families.comparison import seed_range
 
 ROOT = Path(__file__).resolve().parents[1]
 TOLERANCES_DB = (0.05, 0.02)
@@ -156,49 +155,49 @@ class Noise:
         return self.size * np.array([np.random.default_rng(row).standard_normal(shape) for row in bits])
 
 
-def scrambled(arena: Arena) -> CheapModel:
-    """The arena's cheap model, scrambled."""
-    model = own(arena)
+def scrambled(problem: ComparisonProblem) -> CheapModel:
+    """The problem's cheap model, scrambled."""
+    model = own(problem)
     order = np.random.default_rng(0).permutation(len(model.known))
-    return Scrambled(model, arena.lower + arena.upper, order)
+    return Scrambled(model, problem.lower + problem.upper, order)
 
 
-def tones(arena: Arena, count: int = 20) -> CheapModel:
+def tones(problem: ComparisonProblem, count: int = 20) -> CheapModel:
     """Tones of about one period over the box, as large as the residuals in its middle."""
-    rng, (size, links) = np.random.default_rng(0), in_the_middle(arena)
-    wave = rng.normal(0.0, np.pi, (count, len(arena.lower))) / (arena.upper - arena.lower)
+    rng, (size, links) = np.random.default_rng(0), in_the_middle(problem)
+    wave = rng.normal(0.0, np.pi, (count, len(problem.lower))) / (problem.upper - problem.lower)
     weight = rng.standard_normal((count, links)) * np.sqrt(2.0 / count)
     return Tones(size, wave, rng.uniform(0.0, 2.0 * np.pi, count), weight)
 
 
-def noise(arena: Arena) -> CheapModel:
+def noise(problem: ComparisonProblem) -> CheapModel:
     """Noise as large as the residuals in the middle of the box."""
-    size, links = in_the_middle(arena)
-    return Noise(size, arena.upper - arena.lower, links)
+    size, links = in_the_middle(problem)
+    return Noise(size, problem.upper - problem.lower, links)
 
 
-def in_the_middle(arena: Arena) -> tuple[float, int]:
+def in_the_middle(problem: ComparisonProblem) -> tuple[float, int]:
     """Root mean square of the residuals in the middle of the box [dB], and their number."""
-    told = arena.evaluate(0.5 * (arena.lower + arena.upper)[None], False)
+    told = problem.evaluate(0.5 * (problem.lower + problem.upper)[None], False)
     return float(told.value[0]), told.residuals.shape[1]
 
 
-def own(arena: Arena) -> CheapModel:
-    """The arena's cheap model."""
-    if arena.model is None:
-        raise RuntimeError(f"{arena.name} has no cheap model")
-    return arena.model()
+def own(problem: ComparisonProblem) -> CheapModel:
+    """The problem's cheap model."""
+    if problem.cheap_model is None:
+        raise RuntimeError(f"{problem.name} has no cheap model")
+    return problem.cheap_model()
 
 
-MODELS: dict[str, Callable[[Arena], CheapModel] | None] = {
+MODELS: dict[str, Callable[[ComparisonProblem], CheapModel] | None] = {
     "none": None, "own": own, "scrambled": scrambled, "tones": tones, "noise": noise,
 }  # fmt: skip
 
 
-def with_model(arena: Arena, name: str) -> Arena:
-    """The arena with another cheap model."""
+def with_model(problem: ComparisonProblem, name: str) -> ComparisonProblem:
+    """The problem with another cheap model."""
     make = MODELS[name]
-    return replace(arena, model=None if make is None else lambda: make(arena))
+    return replace(problem, cheap_model=None if make is None else lambda: make(problem))
 
 
 def main() -> None:
@@ -217,25 +216,26 @@ def main() -> None:
         "--runs", type=Path, default=ROOT / "out/misleading", help="folder that keeps the runs"
     )
     chosen = parser.parse_args()
-    contender = Contender.parse("space-mapping", chosen.budget)
+    method = BudgetedMethod.parse("space-mapping", chosen.budget)
     places = [(kind, seed) for kind in chosen.families for seed in seed_range(chosen.seeds)]
     runs: dict[str, list[MethodRun]] = {name: [] for name in dict.fromkeys(["none", *chosen.models])}
     lowest: list[float] = []
     with progress_bars(log()) as progress:
         for done, (kind, seed) in enumerate(places):
             progress("problems", done, len(places))
-            arena = family_arena(kind, seed)
+            problem = planted_problem(kind, seed)
             found = []
             for name in runs:
-                store = Runs(
-                    chosen.runs / "runs.jsonl", f"{arena.fingerprint}-{code('space-mapping')}-{name}"
+                store = RunFile(
+                    chosen.runs / "runs.jsonl",
+                    f"{problem.fingerprint}-{code_fingerprint('space-mapping')}-{name}",
                 )
                 for repeat in range(chosen.repeats):
-                    kept = store.find(contender.method, contender.budget, repeat)
-                    run = kept or store.add(run_contender(with_model(arena, name), contender, repeat))
+                    kept = store.find(method.key(repeat))
+                    run = kept or store.add(method.run(with_model(problem, name), repeat))
                     runs[name].append(run)
                     found.append(run.at(run.evaluations))
-            lowest += [min(arena.minimum, *found)] * chosen.repeats
+            lowest += [min(problem.minimum, *found)] * chosen.repeats
     print(markdown.render(compared(runs, np.array(lowest))))
     for name, each in runs.items():
         for run in each:

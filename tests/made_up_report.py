@@ -13,8 +13,8 @@ from calibray.paths import Kind, Paths
 from calibray.reporting.link_survey import survey
 from calibray.reporting.page import Shown
 from calibray.reporting.rays import strongest
-from changed import changed
 from calibray.scenes import Scene, Triangles
+from changed import changed
 
 BLOCK = 40.0
 """Distance of the streets [m]."""

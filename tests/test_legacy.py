@@ -18,7 +18,6 @@ from calibray import engines
 from calibray.comparison import compare as comparison
 from calibray.comparison.method_runs import BudgetedMethod, RunFile
 from calibray.comparison.problem import study_problem
-from calibray.paths import Kind
 
 LEGACY = Path(__file__).parent / "legacy"
 EXPECTED = json.loads((LEGACY / "expected.json").read_text())

@@ -20,8 +20,8 @@ from calibray.errors import InputError
 from calibray.prediction import batches as shared_out
 from calibray.prediction.map_files import geotiff
 from calibray.reporting.link_map import footprints
-from changed import changed
 from calibray.scenes import Triangles, ground_heights
+from changed import changed
 
 LEGACY = Path(__file__).parents[1] / "legacy"
 TX = (0.0, 0.0, 12.0)

@@ -25,10 +25,10 @@ from calibray.reporting.rays import INTERACTIONS, PER_LINK, strongest
 from calibray.reporting.scene_mesh import Grid
 from calibray.reporting.value_list import values
 from calibray.reporting.wording import summary
-from calibray.uncertainty.linear_theory import Interval
-from changed import changed
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.building_outlines import _loops
+from calibray.uncertainty.linear_theory import Interval
+from changed import changed
 from small_scenes import block, write_scene
 
 SECTIONS = {

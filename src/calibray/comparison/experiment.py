@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from calibray.optimizers import label
 from calibray.calibration.result import Result
+from calibray.optimizers import label
 from calibray.result.wording import interval_text
 from calibray.tables import Column, Table, display, numbers
 

@@ -147,7 +147,9 @@ class Replay:
         self._program = self._compile()
 
     def _compile(self) -> fields.GroupedProgram:
-        return fields.layout(self.paths, self._dtype, self._intervals, self._combining.kind != "power").program
+        return fields.layout(
+            self.paths, self._dtype, self._intervals, self._combining.kind != "power"
+        ).program
 
     def _batch_size(self) -> int:
         """Candidates in one call: a power of two within the limits, or one if tables are filled for each candidate."""

@@ -71,4 +71,4 @@ class Diffraction:
     @classmethod
     def empty(cls) -> Diffraction:
         """A table without rows."""
-        return cls(*(np.zeros(0) for _ in range(6)), np.zeros((0, 4, 2)))
+        return cls(*(np.zeros(0) for _ in range(6)), rotations=np.zeros((0, 4, 2)))

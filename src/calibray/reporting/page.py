@@ -34,8 +34,8 @@ from calibray.reporting.scene_mesh import packed
 from calibray.reporting.value_list import values
 from calibray.reporting.wording import summary
 from calibray.result.record import Record
-from calibray.support import figure_style as style
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
+from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers

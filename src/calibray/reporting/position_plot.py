@@ -10,9 +10,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from calibray.support.figure_style import BLUE, FAINT, INK, LINE, ORANGE, dress, styled
 from calibray.scenes import read_meshes
 from calibray.scenes.triangles import LEVEL, is_ground
+from calibray.support.figure_style import BLUE, FAINT, INK, LINE, ORANGE, dress, styled
 
 
 @styled()

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from calibray.reporting.diagnostics import diagnostics
 from calibray.result.record import Record
 from calibray.support.figure_style import (
     BLUE,
@@ -46,7 +47,7 @@ def examined(result: Record) -> dict[str, Figure]:
     Returns:
         Figures by name.
     """
-    tables, figures = result.diagnostics, {}
+    tables, figures = diagnostics(result), {}
     if all(len(result.uncertainty.draws.get(name, ())) > 1 for name in result.parameters):
         figures["possible-values"] = possible_values(result)
     if result.held_out is not None:

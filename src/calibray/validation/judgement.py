@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.result.held_out import Judgement
+from calibray.result.held_out import Judgement, Model
 from calibray.validation.blocks import blocks
 
 CLUSTER_LINKS: Final = 4
@@ -22,7 +22,7 @@ RESAMPLES: Final = 2000
 
 def compare(
     errors: NDArray[np.float64],
-    baselines: Mapping[str, NDArray[np.float64]],
+    baselines: Mapping[Model, NDArray[np.float64]],
     position: NDArray[np.float64],
     seed: int = 0,
 ) -> Judgement:

@@ -94,7 +94,7 @@ def validated(
     blocks: int | None = None,
     by: str | None = None,
     progress: Progress | None = None,
-    known: Mapping[str, NDArray[np.float64]] = NOTHING,
+    known: Mapping[Model, NDArray[np.float64]] = NOTHING,
 ) -> Validation:
     """Judge models on a problem that is set up, over all its links.
 
@@ -156,7 +156,7 @@ def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 
 
 def models(
-    part: Problem, known: Mapping[str, NDArray[np.float64]] = NOTHING
+    part: Problem, known: Mapping[Model, NDArray[np.float64]] = NOTHING
 ) -> dict[str, NDArray[np.float64]]:
     """Every model, fitted to the links that count.
 

@@ -41,14 +41,14 @@ MOST: Final = 128
 TOLERANCE: Final = 1e-6
 """Relative decrease of the mean square below which a search has converged: predictions change by less."""
 
-NOTHING: Final[Mapping[str, NDArray[np.float64]]] = {}
+NOTHING: Final[Mapping[Model, NDArray[np.float64]]] = {}
 
 TX_OFFSET: Final = "offset of the transmitter"
 """Name of the term that gives each transmitter its offset."""
 
 
 def fitted(
-    part: Problem, known: Mapping[str, NDArray[np.float64]] = NOTHING
+    part: Problem, known: Mapping[Model, NDArray[np.float64]] = NOTHING
 ) -> dict[str, tuple[Problem, NDArray[np.float64]]]:
     """Every model that knows the scene, fitted to the links that count.
 
@@ -76,7 +76,7 @@ def fitted(
     return found
 
 
-def twins(part: Problem, best: NDArray[np.float64]) -> dict[str, Problem]:
+def twins(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
     """Every model that knows the scene.
 
     Args:
