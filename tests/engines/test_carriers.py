@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from calibray.engines.fingerprint import fingerprint
+from calibray.engines import fingerprint
 
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
