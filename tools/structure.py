@@ -1,9 +1,9 @@
-"""Measure how a checkout of Calibray is built: modules, rooms, arrows, lengths, and what one run reads.
+"""Measure the structure of a checkout: modules, rooms, imports, lengths, and the files that one run reads.
 
     python tools/structure.py [CHECKOUT] [--static]
 
-The second half runs the demo's study on replay in a process of its own, with counting put in front of what opens files,
-and needs an environment with Calibray's dependencies; `--static` leaves it out.
+Imports for type checking count as imports. The second half runs the demo's study on replay in another process, where
+file access is counted; it needs an environment with Calibray's dependencies. `--static` omits it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from statistics import median
 
 PACKAGE = "calibray"
 IMPORTS = 5
+
+Graph = dict[str, set[str]]
 
 COUNT = """
 import collections, functools, json, sys
@@ -79,53 +81,60 @@ def room(path: str) -> str:
     return Path(path).parts[0].removesuffix(".py")
 
 
-def run(tree: ast.AST) -> Iterator[ast.AST]:
-    """The nodes of a module, without what only type checkers look at."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            continue
-        yield node
-        yield from run(node)
+def dotted(path: str) -> str:
+    """The name that a file is imported by."""
+    return ".".join([PACKAGE, *Path(path).with_suffix("").parts]).removesuffix(".__init__")
 
 
-def targets(tree: ast.Module, path: str) -> Iterator[str]:
-    """Rooms and top-level modules that a module imports when it runs, wherever in it the import stands."""
+def imported(tree: ast.Module, path: str) -> Iterator[str]:
+    """Names that a module imports anywhere in it, imports for type checking included."""
     above = [PACKAGE, *Path(path).parent.parts]
-    for node in run(tree):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = above[: len(above) - node.level + 1] if node.level else []
             origin = ".".join([*base, *([node.module] if node.module else [])])
-            names = [f"{origin}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            parts = name.split(".")
-            if parts[0] == PACKAGE and len(parts) > 1:
-                yield parts[1]
+            yield from (f"{origin}.{alias.name}" for alias in node.names)
 
 
-def arrows(trees: dict[str, ast.Module]) -> set[tuple[str, str]]:
-    """Imports between rooms and top-level modules, as pairs of importer and imported."""
-    known = {room(path) for path in trees} - {"__init__"}
-    found = {(room(path), target) for path, tree in trees.items() for target in targets(tree, path)}
-    return {(a, b) for a, b in found if a != b and a in known and b in known}
+def dependencies(trees: dict[str, ast.Module]) -> Graph:
+    """Modules of the package that each module imports, by their paths."""
+    paths = {dotted(path): path for path in trees}
+
+    def module(name: str) -> str | None:
+        """The longest leading part of a name that is a module."""
+        parts = name.split(".")
+        return next(
+            (paths[key] for n in range(len(parts), 1, -1) if (key := ".".join(parts[:n])) in paths), None
+        )
+
+    return {
+        path: {target for name in imported(tree, path) if (target := module(name)) not in (None, path)}
+        for path, tree in trees.items()
+    }
 
 
-def circles(pairs: set[tuple[str, str]]) -> list[list[str]]:
-    """Groups of rooms that import one another, directly or around corners."""
-    graph: dict[str, set[str]] = {}
-    for a, b in pairs:
-        graph.setdefault(a, set()).add(b)
+def rooms_graph(graph: Graph) -> Graph:
+    """Rooms that each room imports."""
+    rooms: Graph = {}
+    for path, targets in graph.items():
+        if room(path) != "__init__":
+            others = {room(target) for target in targets} - {room(path), "__init__"}
+            rooms.setdefault(room(path), set()).update(others)
+    return rooms
+
+
+def circles(graph: Graph) -> list[list[str]]:
+    """Groups of nodes that import one another, directly or through others."""
 
     def reached(start: str) -> set[str]:
-        found: set[str] = set()
+        visited: set[str] = set()
         ends = set(graph.get(start, ()))
         while ends:
-            found |= ends
-            ends = set().union(*(graph.get(name, set()) for name in ends)) - found
-        return found
+            visited |= ends
+            ends = set().union(*(graph.get(name, set()) for name in ends)) - visited
+        return visited
 
     reach = {name: reached(name) for name in graph}
     groups = {
@@ -134,6 +143,60 @@ def circles(pairs: set[tuple[str, str]]) -> list[list[str]]:
         if name in reach[name]
     }
     return [list(group) for group in sorted(groups)]
+
+
+def single_importers(graph: Graph) -> int:
+    """Number of modules that exactly one other module imports, packages' `__init__` apart."""
+    importers: dict[str, set[str]] = {}
+    for path, targets in graph.items():
+        for target in targets:
+            importers.setdefault(target, set()).add(path)
+    return sum(len(by) == 1 for path, by in importers.items() if not path.endswith("__init__.py"))
+
+
+def constants(trees: dict[str, ast.Module]) -> int:
+    """Number of numeric constants at the top level of modules."""
+    return sum(
+        name.lstrip("_").isupper() and _numeric(value)
+        for tree in trees.values()
+        for name, value in _assignments(tree)
+    )
+
+
+def _assignments(tree: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    for node in tree.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
+            yield node.target.id, node.value
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            yield node.targets[0].id, node.value
+
+
+def _numeric(value: ast.expr) -> bool:
+    """Whether an expression is made of numbers, signs, arithmetic and tuples alone."""
+    allowed = (ast.Constant, ast.UnaryOp, ast.BinOp, ast.Tuple, ast.operator, ast.unaryop, ast.expr_context)
+    nodes = list(ast.walk(value))
+    numbers = (node.value for node in nodes if isinstance(node, ast.Constant))
+    return all(isinstance(node, allowed) for node in nodes) and any(type(n) in (int, float) for n in numbers)
+
+
+def many_arguments(trees: dict[str, ast.Module]) -> int:
+    """Number of functions with more than six arguments, `self` and `cls` apart."""
+    count = 0
+    for tree in trees.values():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                names = [
+                    argument.arg
+                    for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+                ]
+                count += len([name for name in names if name not in ("self", "cls")]) > 6
+    return count
+
+
+def comment_share(package: Path, trees: dict[str, ast.Module]) -> float:
+    """Share of lines that are comments."""
+    lines = [line.strip() for path in trees for line in (package / path).read_text("utf-8").splitlines()]
+    return sum(line.startswith("#") for line in lines) / len(lines)
 
 
 def functions(trees: dict[str, ast.Module]) -> list[tuple[int, str]]:
@@ -189,14 +252,20 @@ def table(checkout: Path, static: bool = False) -> list[tuple[str, str]]:
         path.name for path in package.iterdir() if path.suffix == ".py" and path.name != "__init__.py"
     )
     rooms = sorted(path.parent.name for path in package.glob("*/__init__.py"))
-    pairs = arrows(trees)
-    rings = circles(pairs)
+    graph = dependencies(trees)
+    rooms_imports = rooms_graph(graph)
     rows = [
         ("modules", f"{len(trees)}"),
+        ("lines", f"{sum(length for length, _ in lines):,}"),
         ("modules at the top level", f"{len(top)}: {', '.join(name.removesuffix('.py') for name in top)}"),
         ("rooms", f"{len(rooms)}: {', '.join(rooms)}"),
-        ("import arrows between rooms", f"{len(pairs)}"),
-        ("circles", "; ".join(" - ".join(ring) for ring in rings) or "none"),
+        ("import arrows between rooms", f"{sum(map(len, rooms_imports.values()))}"),
+        ("circles of rooms", f"{len(circles(rooms_imports))}"),
+        ("circles of files", f"{len(circles(graph))}"),
+        ("modules with one importer", f"{single_importers(graph)}"),
+        ("functions with more than six arguments", f"{many_arguments(trees)}"),
+        ("numeric constants", f"{constants(trees)}"),
+        ("comment lines", f"{comment_share(package, trees):.1%}"),
         ("median module", f"{median(length for length, _ in lines):g} lines"),
         ("longest module", f"{lines[-1][0]} lines, {lines[-1][1]}"),
         ("median function", f"{median(length for length, _ in lengths):g} lines"),
@@ -205,8 +274,8 @@ def table(checkout: Path, static: bool = False) -> list[tuple[str, str]]:
     if static:
         return rows
     rows += [(f"one run: {name}", str(count)) for name, count in sorted(counts(checkout).items())]
-    ratio = seconds_to_import("calibray.result", checkout) / seconds_to_import("pandas", checkout)
-    return [*rows, ("import calibray.result / import pandas", f"{ratio:.1f}")]
+    ratio = seconds_to_import("calibray.result.record", checkout) / seconds_to_import("pandas", checkout)
+    return [*rows, ("import calibray.result.record / import pandas", f"{ratio:.1f}")]
 
 
 def main() -> None:
