@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.constants import speed_of_light
 
-from calibray.fields import path_gains, slab
+from calibray.fields import jax_settings, path_gains, slab
 from calibray.materials import SCATTERING_PATTERNS, Material
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
@@ -335,10 +335,11 @@ def rounding(paths: Paths, materials: Mapping[str, Material]) -> np.ndarray:
     }
     wavelength = speed_of_light / paths.frequency
     transmitted = paths.kind == Kind.REFRACTION
-    exact = slab.coefficients(
-        paths.cos_incidence, column["relative_permittivity"],
-        slab.loss_term(column["conductivity"], wavelength), column["thickness"], wavelength, transmitted,
-    )  # fmt: skip
+    with jax_settings():
+        exact = slab.coefficients(
+            paths.cos_incidence, column["relative_permittivity"],
+            slab.loss_term(column["conductivity"], wavelength), column["thickness"], wavelength, transmitted,
+        )  # fmt: skip
     eta = complex_relative_permittivity(
         mi.Float(column["relative_permittivity"]),
         mi.Float(column["conductivity"]),

@@ -229,8 +229,8 @@ def test_a_study_is_traced_with_what_it_says(tmp_path: Path, monkeypatch: pytest
     ("arguments", "message"),
     [
         ({"frequency": 2e9}, r"the study .*study\.toml states frequency; change it there"),
-        ({"max_depth": 2}, "max_depth is given"),
-        ({"rx_antenna": "dipole"}, "rx_antenna is given"),
+        ({"max_depth": 2}, "states max_depth"),
+        ({"rx_antenna": "dipole"}, "states rx_antenna"),
         ({"measurements": LINKS}, "must be Measurements"),
         ({"materials": {"marbel": {"thickness": 0.1}}}, "marbel"),
     ],
@@ -244,7 +244,7 @@ def test_a_study_is_not_contradicted(tmp_path: Path, arguments: dict, message: s
 def test_a_scene_alone_is_not_enough() -> None:
     with pytest.raises(InputError, match="give measurements, the links"):
         cb.trace("sionna:box", frequency=1e9)
-    with pytest.raises(InputError, match="needs frequency, the carrier in Hz"):
+    with pytest.raises(InputError, match="give frequency, the carrier in Hz"):
         cb.trace("sionna:box", LINKS)
 
 
