@@ -35,7 +35,7 @@ import make_town as town  # noqa: E402
 
 from calibray import engines  # noqa: E402
 from calibray.fitting.methods import choose  # noqa: E402
-from calibray.fitting.noise_floor import heard  # noqa: E402
+from calibray.fitting.preliminary_fits import leave_out_near_floor  # noqa: E402
 from calibray.fitting.problem import Problem  # noqa: E402
 from calibray.fitting.search import search  # noqa: E402
 from calibray.measurements import (  # noqa: E402
@@ -220,7 +220,7 @@ def hill_walk(folder: Path) -> Walk:
 def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
     """What comes of the walk of a seed."""
     problem = walk.problem(seed)
-    problem = problem if keep_faint else heard(problem)
+    problem = problem if keep_faint else leave_out_near_floor(problem)
     trail = search(problem, choose(problem))
     told = certainty(problem, trail).intervals
     best = problem.parameters.named(trail.best)

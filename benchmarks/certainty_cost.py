@@ -18,6 +18,7 @@ from calibray import engines
 from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
+from calibray.result.held_out import Model
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
@@ -25,7 +26,6 @@ from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.choice import choose_model
 from calibray.validation.validate import validated
-from calibray.result.held_out import Model
 
 LIMIT = 10.0
 
@@ -43,7 +43,9 @@ def costs(problem: Problem) -> dict[str, tuple[float, int]]:
     for _ in range(2):  # the first compiles
         trail = timed("calibration", search, problem, choose(problem))
         timed("draws and verdicts", certainty, problem, trail)
-        validation = timed("validation", validated, problem, None, None, None, {Model.CALIBRATED: trail.minima})
+        validation = timed(
+            "validation", validated, problem, None, None, None, {Model.CALIBRATED: trail.minima}
+        )
         best = problem.parameters.to_search(trail.best)
         timed("choice", choose_model, problem, validation, best)
     return found

@@ -40,7 +40,7 @@ from scipy.cluster.vq import kmeans2
 
 import districts
 from calibray import engines
-from calibray.fitting.noise_level import weighed
+from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.result.held_out import FITTED, Model
 from calibray.scenarios import demo_study_path
@@ -63,7 +63,7 @@ def opened(file: str) -> Problem:
     """A study's problem over all its links, those that it holds out included."""
     setup = Study.load(file).opened()
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
-    return weighed(Problem.of(setup, engines.make(setup)))
+    return estimate_noise(Problem.of(setup, engines.make(setup)))
 
 
 LEAST = "least RMSE on the others"

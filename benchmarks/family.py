@@ -23,13 +23,12 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from problem_families.family_comparison import FamilyComparison, compare_family, seed_range, tables
-
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.optimizers import label
 from calibray.tables import Column, Table, markdown, numbers
+from problem_families.family_comparison import FamilyComparison, compare_family, seed_range, tables
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (
@@ -103,7 +102,9 @@ def shown(comparison: FamilyComparison) -> Table:
         ):
             if chosen.any():
                 share = comparison.part(chosen).solved(by_method["space-mapping"].name, calls, 0.02)
-                what = f"space mapping, cheap model with {constants} constants, share within 0.02 dB at {calls}"
+                what = (
+                    f"space mapping, cheap model with {constants} constants, share within 0.02 dB at {calls}"
+                )
                 row(what, "at least 0.8", share, share >= 0.8)
     without = [name for name in by_method if name != "space-mapping"]
     for calls in (30, 60, 120, 225):

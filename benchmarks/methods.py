@@ -23,8 +23,6 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-from problem_families.problems import landscape_problem
-
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.compare import compare
@@ -35,6 +33,7 @@ from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
 from calibray.support.output_files import write_table, write_text
 from calibray.tables import markdown
+from problem_families.problems import landscape_problem
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = (

@@ -24,8 +24,6 @@ for library in ("OMP", "OPENBLAS", "MKL"):
 
 import numpy as np
 from numpy.typing import NDArray
-from problem_families.family_comparison import seed_range
-from problem_families.problems import planted_problem
 
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
@@ -34,6 +32,8 @@ from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, 
 from calibray.comparison.problem import ComparisonProblem
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, markdown, numbers
+from problem_families.family_comparison import seed_range
+from problem_families.problems import planted_problem
 
 ROOT = Path(__file__).resolve().parents[1]
 TOLERANCES_DB = (0.05, 0.02)

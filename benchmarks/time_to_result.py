@@ -70,7 +70,7 @@ def once(name: str) -> dict[str, object]:
 
     from calibray.engines.kinds.replay import replay
     from calibray.fitting.methods import choose
-    from calibray.fitting.noise_level import weighed
+    from calibray.fitting.preliminary_fits import estimate_noise
     from calibray.fitting.problem import Problem
     from calibray.fitting.search import search
     from calibray.study import Setup, Study
@@ -87,7 +87,7 @@ def once(name: str) -> dict[str, object]:
     paths = tracer.trace(setup.links)
     clock.lap("trace")
     compiled.clear()
-    problem = weighed(Problem.of(setup, replay(setup, paths)))
+    problem = estimate_noise(Problem.of(setup, replay(setup, paths)))
     trail = search(problem, choose(problem))
     clock.lap("search")
     told = certainty(problem, trail)

@@ -175,7 +175,7 @@ def test_without_a_section_there_is_no_offset(tmp_path, exact):
 
 
 def test_a_group_held_out_as_a_whole_has_no_offset_to_be_judged_with(tmp_path, exact):
-    with pytest.raises(InputError, match="group 'east' is held out but has no link to calibrate"):
+    with pytest.raises(InputError, match="group 'east' has held-out links but no calibration link"):
         run(tmp_path, exact, offset={"per": "half"}, holdout={"where": "half == 'east'"})
 
 
@@ -231,7 +231,7 @@ def test_a_link_without_a_path_is_not_judged_either(blocked):
 
 def test_a_study_without_any_path_is_refused(tmp_path):
     measured = planted.campaign(blocked=True).replace(np.inf, 75.0)
-    with pytest.raises(InputError, match="no path leads to any of 1 links to calibrate on; raise"):
+    with pytest.raises(InputError, match="no path reaches any of the 1 calibration links; raise"):
         calibrate(
             planted.study(tmp_path, measured, holdout={"where": "rx_y < 15"}),
             engine=planted.engine(blocked=True),

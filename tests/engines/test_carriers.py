@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from calibray.engines import fingerprint
 
 from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
-from calibray.engines import ReplayCarriers
+from calibray.engines import ReplayCarriers, fingerprint
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
 from calibray.materials import itu_law

@@ -14,7 +14,7 @@ import programs
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, aid, with_constants
+from calibray.fitting.cheap_replay import ProblemRows, ReplayedModel, make_cheap_replay, with_constants
 from calibray.fitting.methods import choose
 from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.problem import Problem
@@ -64,7 +64,7 @@ def asked(tmp_path_factory) -> Problem:
 @pytest.fixture(scope="module")
 def model(asked) -> ReplayedModel:
     """Its cheap model."""
-    found = aid(asked).model
+    found = make_cheap_replay(asked).model
     assert found is not None
     return found
 
@@ -154,8 +154,8 @@ def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, 
 def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch, method):
     asked = problem(tmp_path, method=method)
     monkeypatch.setattr(Setup, "trace", lambda *_, **__: pytest.fail("traced"))
-    assert aid(asked).model is None
-    assert aid(asked).remark is None
+    assert make_cheap_replay(asked).model is None
+    assert make_cheap_replay(asked).remark is None
 
 
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):

@@ -11,9 +11,9 @@ import pytest
 
 import planted
 from calibray.calibration.calibrate import calibrate
-from calibray.fitting.noise_floor import MARGIN, heard
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
+from calibray.fitting.preliminary_fits import MARGIN, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.measurements import (
     Averaging,
@@ -72,7 +72,7 @@ def slope(problem: Problem) -> float:
 
 def test_a_fit_to_what_was_heard_is_too_strong_and_one_to_what_is_expected_is_not():
     every = [measured(seed) for seed in range(40)]
-    chosen = [heard(problem) for problem in every]
+    chosen = [leave_out_near_floor(problem) for problem in every]
     all_heard, expected = (np.array([slope(each) for each in problems]) for problems in (every, chosen))
     errors = [slopes.std(ddof=1) / np.sqrt(len(every)) for slopes in (all_heard, expected)]
     assert all_heard.mean() < SLOPE - 4 * errors[0]
@@ -90,7 +90,7 @@ def test_without_a_floor_or_far_above_it_all_links_count():
     links = problem.setup.links
     for limit in (None, np.full(len(links), 300.0)):
         other = SimpleNamespace(links=Measurements(links.tx, links.rx, links.path_loss_db, limit_db=limit))
-        kept = heard(Problem(other, problem.engine, problem.objective, problem.before))  # type: ignore[arg-type]
+        kept = leave_out_near_floor(Problem(other, problem.engine, problem.objective, problem.before))  # type: ignore[arg-type]
         assert kept.faint is None
         assert kept.objective.num_counted == len(links)
 
@@ -100,7 +100,7 @@ def test_links_that_are_all_faint_stay():
     links = problem.setup.links
     limit = np.full(len(links), 60.0)
     other = SimpleNamespace(links=Measurements(links.tx, links.rx, links.path_loss_db, limit_db=limit))
-    kept = heard(Problem(other, problem.engine, problem.objective, problem.before))  # type: ignore[arg-type]
+    kept = leave_out_near_floor(Problem(other, problem.engine, problem.objective, problem.before))  # type: ignore[arg-type]
     assert kept.objective.num_counted == len(links)
 
 

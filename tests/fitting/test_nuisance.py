@@ -154,7 +154,7 @@ def test_a_small_design_and_a_large_one_take_the_same_way(monkeypatch):
         elimination = Elimination.of(nuisance, links.weight, np.zeros(9))
         found = elimination.coefficients(gap)
         left = slope.copy()
-        elimination.remove(left, elimination.taken_up(slope, found))
+        elimination.remove(left, elimination.projection(slope, found))
         answers.append((found, left))
     assert answers[0][0] == pytest.approx(answers[1][0], abs=1e-12)
     assert answers[0][1] == pytest.approx(answers[1][1], abs=1e-12)
@@ -194,7 +194,7 @@ def test_no_end_is_told_and_not_passed_off_as_an_answer(monkeypatch):
     links = campaign(40, 2)
     terms = make_term(links, "offset", bounds=(-0.1, 0.1)), make_term(links, "slope", "log_distance")
     elimination = Elimination.of(Nuisance(40, terms), links.weight, np.zeros(2))
-    monkeypatch.setattr(arrowhead, "ROUNDS", 1)
+    monkeypatch.setattr(arrowhead, "MAX_EXCHANGES", 1)
     with pytest.raises(EngineError, match="no minimum within the bounds"):
         elimination.coefficients(np.full((1, 40), 5.0))
 

@@ -331,7 +331,7 @@ def test_a_candidate_that_loses_links_is_not_fitted_to_them():
 def test_no_link_to_calibrate_on_is_refused():
     links, nothing = campaign(), np.zeros(LINKS, dtype=bool)
     with pytest.raises(
-        InputError, match=r"no path leads to any of 30 links to calibrate on; raise trace.max_depth"
+        InputError, match=r"no path reaches any of the 30 calibration links; raise trace.max_depth"
     ):
         make_objective(links, nothing, ~nothing)
     assert make_objective(links, nothing, ~nothing, ceiling_db=120.0).weight.tolist() == links.weight.tolist()
@@ -339,7 +339,7 @@ def test_no_link_to_calibrate_on_is_refused():
 
 def test_a_nuisance_that_does_not_fit_is_refused():
     links, everything = campaign(), np.ones(LINKS, dtype=bool)
-    with pytest.raises(InputError, match="the nuisance is of 7 links, must be of 30"):
+    with pytest.raises(InputError, match="the nuisance has 7 links, must have 30"):
         make_objective(links, everything, everything, nuisance=Nuisance(7))
     term = make_term(links, "offset", prior=3.0)
     with pytest.raises(InputError, match="a prior needs noise_db"):

@@ -1,7 +1,6 @@
 """The drawing of antennas over a scene."""
 
 from calibray.reporting.position_plot import draw_positions
-
 from calibray.scenes.authoring import make_scene
 from planted_maps import L_SHAPE, footprints
 

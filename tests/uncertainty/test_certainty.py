@@ -13,9 +13,8 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
-from calibray.fitting.minima import BASINS
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import BASINS, search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links

@@ -12,11 +12,10 @@ from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
-from calibray.fitting.cheap_replay import aid
-from calibray.fitting.fidelity_loop import settle
+from calibray.fitting.cheap_replay import make_cheap_replay
+from calibray.fitting.fidelity_loop import retrace
 from calibray.fitting.methods import check_fit, check_method, choose
-from calibray.fitting.noise_floor import heard
-from calibray.fitting.noise_level import weighed
+from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.result.files import FILES
@@ -95,12 +94,12 @@ def calibrate(
     # With an engine that is handed in, there may be no ray tracer on this machine to look for enclosed antennas.
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
-    problem = weighed(heard(problem, progress), progress)
+    problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
     paused = time.perf_counter()
-    cheap = aid(problem, progress, None if cheap_model is None else cheap_model.opened())
+    cheap = make_cheap_replay(problem, progress, None if cheap_model is None else cheap_model.opened())
     traced += time.perf_counter() - paused
     trail = search(problem, choose(problem, cheap.model), progress)
-    problem, trail, gap = settle(problem, trail, progress)
+    problem, trail, gap = retrace(problem, trail, progress)
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
     minima = {Model.CALIBRATED: trail.minima} if len(trail.minima) > FEW_MINIMA else NOTHING

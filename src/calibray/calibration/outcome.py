@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calibray.calibration.result import Result
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
-from calibray.fitting.cheap_replay import Aid
-from calibray.fitting.fidelity_loop import largest
+from calibray.fitting.cheap_replay import CheapReplay
+from calibray.fitting.fidelity_loop import largest_gap
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
@@ -80,7 +80,7 @@ def outcome(
     validation: Validation | None,
     enclosed: EnclosedAntennas | None,
     timing: Timing,
-    cheap: Aid,
+    cheap: CheapReplay,
 ) -> Result:
     """Assemble the result.
 
@@ -145,7 +145,7 @@ def outcome(
             initial_rmse_db=_rmse(problem, models.initial, counted),
             nuisance_only_rmse_db=_rmse(problem, nuisance_only, counted) if fitted else None,
             log_distance_rmse_db=_rmse(problem, models.log_distance, counted),
-            retrace_gap_db=largest(gap, counted),
+            retrace_gap_db=largest_gap(gap, counted),
             laws=parameters.law_coefficients(trail.best),
             power_shares=diagnostics.power_shares,
         ),

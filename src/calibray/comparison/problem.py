@@ -15,7 +15,7 @@ from calibray import engines
 from calibray.engines.problem_fingerprint import fingerprint
 from calibray.errors import InputError
 from calibray.fitting.methods import local_searches
-from calibray.fitting.noise_level import weighed
+from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Evaluate
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
@@ -74,7 +74,7 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     setup = Setup.open(study.replace(engine="replay"))
     # A replay gives derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
-    problem = weighed(Problem.of(setup, engine))
+    problem = estimate_noise(Problem.of(setup, engine))
     objective, parameters, links = problem.objective, problem.parameters, setup.links
     lower, upper = parameters.search_bounds
     digest = hashlib.sha256(fingerprint(setup).encode())

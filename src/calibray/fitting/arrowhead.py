@@ -1,15 +1,15 @@
-"""Minima of quadratics whose matrix is an arrowhead: blocks on the diagonal, bordered by a few columns.
+"""Box-constrained minima of quadratic forms with an arrowhead matrix: diagonal blocks bordered by a few columns.
 
-That is what the normal equations of a nuisance look like: the columns of one group meet those of no other group,
-while a column over all links meets them all. With the blocks eliminated first, a solution costs about as much as
-reading the matrix, however many groups there are.
+The normal equations of a nuisance have this form. Columns of different groups share no link, so they form separate
+blocks. Columns over all links overlap with every block and form the border. Block elimination solves the system at
+about the cost of reading the matrix, for any number of groups.
 
-Bounds are kept by block principal pivoting (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
+Block principal pivoting keeps the bounds (L. F. Portugal, J. J. Judice and L. N. Vicente, A comparison of block
 pivoting and interior-point algorithms for linear least squares problems with nonnegative variables, Mathematics of
-Computation 63, 1994), in all problems of a batch at once: components that leave their bounds are fixed there, fixed
-ones that are pulled inwards are let go, and the rest is solved again. Where exchanging all of them does not make
-them fewer, the last alone is exchanged (Murty's rule), which ends. The answer meets the conditions of the minimum
-exactly; no step length or tolerance of convergence enters.
+Computation 63, 1994), in all problems of a batch at once. Each iteration fixes the components that leave their bounds,
+frees the fixed components whose gradient points inwards, and solves again. If the number of infeasible components
+stops falling, only the last one is exchanged (Murty's rule), which guarantees termination. The result meets the
+optimality conditions exactly, without a step length or a convergence tolerance.
 """
 
 from __future__ import annotations
@@ -24,29 +24,31 @@ from scipy import sparse
 from calibray.errors import EngineError
 
 DEPENDENT: Final = 1e-10
-"""Share of a column's square that the columns before it must leave over; a column with less is held."""
+"""A column is linearly dependent if the columns before it leave at most this share of its squared norm. Rounding leaves
+some 1e-16 per column."""
 
 ROUNDING: Final = 1e-11
-"""Excess over a bound, and pull off a bound, that count as none; of the size of the problem."""
+"""Tolerance for a bound violation or a gradient, relative to the size of the right-hand side: rounding of double
+precision."""
 
 PATIENCE: Final = 3
-"""Exchanges of all wrong components that do not make them fewer, before one at a time is exchanged."""
+"""Full exchanges without progress before single exchanges start."""
 
-ROUNDS: Final = 1000
-"""Exchanges that no problem has come near to needing."""
+MAX_EXCHANGES: Final = 1000
+"""Limit on the exchanges; tested problems need far fewer."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arrowhead:
-    """The matrix N of x.N.x / 2 - side.x, scaled to ones on the diagonal, with q = g b + p rows.
+    """The matrix N of the quadratic form x.N.x / 2 - side.x, scaled to a unit diagonal, with q = g b + p rows.
 
     Attributes:
-        scale: Roots of the diagonal before scaling, 1 where it is 0 [q].
-        blocks: The blocks [g, b, b].
-        border: The columns beside them [g, b, p].
-        corner: Where the border's columns meet [p, p].
-        held: Components that the data cannot tell: nothing depends on them, or those before them serve as well [q].
-            The blocks' come before the border's.
+        scale: Square roots of the diagonal before scaling, 1 where it is 0 [q].
+        blocks: The g diagonal blocks [g, b, b].
+        border: Products of the block columns with the p border columns [g, b, p].
+        corner: Products of the border columns with each other [p, p].
+        held: Undetermined components: their column is zero or a combination of the columns before it, blocks before
+            border [q].
     """
 
     scale: NDArray[np.float64]
@@ -57,15 +59,12 @@ class Arrowhead:
 
     @classmethod
     def of(cls, matrix: sparse.coo_array, blocks: int, width: int) -> Arrowhead:
-        """Take a matrix apart.
+        """Split a matrix into blocks, border and corner.
 
         Args:
-            matrix: Positive semidefinite [q, q]; the blocks come first, and no two of them meet.
+            matrix: Positive semidefinite [q, q]; the blocks come first and do not overlap.
             blocks: Number of blocks g.
-            width: Their width b.
-
-        Returns:
-            The arrowhead.
+            width: Width b of a block.
         """
         diagonal, split = matrix.diagonal(), blocks * width
         scale = np.where(diagonal > 0, np.sqrt(diagonal), 1.0)
@@ -73,30 +72,31 @@ class Arrowhead:
         value = matrix.data / (scale[row] * scale[column])
         edge = len(diagonal) - split
         inner, border, corner = np.zeros((split, width)), np.zeros((split, edge)), np.zeros((edge, edge))
-        here = (row < split) & (column < split)
-        inner[row[here], column[here] % width] = value[here]
-        here = (row < split) & (column >= split)
-        border[row[here], column[here] - split] = value[here]
-        here = (row >= split) & (column >= split)
-        corner[row[here] - split, column[here] - split] = value[here]
-        square, beside = inner.reshape(blocks, width, width), border.reshape(blocks, width, edge)
-        held = np.concatenate([_dependent(square).ravel(), np.zeros(edge, dtype=bool)])
-        first = cls(scale, square, beside, corner, held)
-        held[split:] = _dependent(first._left_over(~held[None])[0])
-        return first
+        in_blocks = (row < split) & (column < split)
+        inner[row[in_blocks], column[in_blocks] % width] = value[in_blocks]
+        in_border = (row < split) & (column >= split)
+        border[row[in_border], column[in_border] - split] = value[in_border]
+        in_corner = (row >= split) & (column >= split)
+        corner[row[in_corner] - split, column[in_corner] - split] = value[in_corner]
+        inner, border = inner.reshape(blocks, width, width), border.reshape(blocks, width, edge)
+        held = np.concatenate([_dependent(inner).ravel(), np.zeros(edge, dtype=bool)])
+        arrowhead = cls(scale, inner, border, corner, held)
+        # Border columns count as dependent if the blocks leave nothing of them.
+        held[split:] = _dependent(arrowhead._schur_complement(~held[None])[0])
+        return arrowhead
 
     def solve(self, free: NDArray[np.bool_], side: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minimum over the free components, the others being zero.
+        """Unbounded minimum over the free components; the others are zero.
 
         Args:
-            free: Which components are free, none of them held [m, q].
+            free: Mask of the free components, none of them held [m, q].
             side: Right-hand sides [m, q, k].
 
         Returns:
             The minima [m, q, k].
         """
         problems, count, sides = side.shape
-        if problems > 1 and (free == free[0]).all():  # one matrix for all
+        if problems > 1 and (free == free[0]).all():  # all problems share one matrix
             merged = self.solve(free[:1], side.transpose(1, 0, 2).reshape(1, count, problems * sides))
             return merged.reshape(count, problems, sides).transpose(1, 0, 2)
         scaled = np.where(free[..., None], side / self.scale[:, None], 0.0)
@@ -105,7 +105,7 @@ class Arrowhead:
     def minimum(
         self, side: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum within bounds; held components take the value nearest to zero.
+        """Minimum within bounds; held components take the value within their bounds that is nearest to zero.
 
         Args:
             side: Right-hand sides [m, q].
@@ -116,40 +116,41 @@ class Arrowhead:
             The minima [m, q].
 
         Raises:
-            EngineError: No minimum was found.
+            EngineError: The exchanges did not terminate.
         """
-        ends, side = (lower, upper), side / self.scale
+        given_lower, given_upper, side = lower, upper, side / self.scale
         lower, upper = lower * self.scale, upper * self.scale
-        # Blocks without a border are problems of their own.
+        # Blocks without a border are independent problems.
         independent = 1 if self.border.shape[2] else len(self.blocks)
         free = np.tile(~self.held, (len(side), 1))
         value = np.tile(np.where(self.held, np.clip(0.0, lower, upper), 0.0), (len(side), 1))
         fewest = np.full((len(side), independent), len(lower) + 1)
         patience = np.full((len(side), independent), PATIENCE)
         pending = np.arange(len(side))
-        for _ in range(ROUNDS):
-            here, now = free[pending], value[pending]
-            now = np.where(here, self._trial(side[pending], here, now), now)
-            pull = side[pending] - self._times(now)
+        for _ in range(MAX_EXCHANGES):
+            active = free[pending]
+            trial = np.where(active, self._trial(side[pending], active, value[pending]), value[pending])
+            descent = side[pending] - self._times(trial)  # minus the gradient
             slack = ROUNDING * (1.0 + np.abs(side[pending]).max(axis=1, initial=0.0))[:, None]
-            outside = here & ((now < lower - slack) | (now > upper + slack))
-            inwards = ((now <= lower) & (pull > slack)) | ((now >= upper) & (pull < -slack))
-            wrong = outside | (~here & ~self.held & inwards)
-            value[pending] = np.clip(now, lower, upper)
-            pending, wrong = pending[(unfinished := wrong.any(axis=1))], wrong[unfinished]
+            outside = active & ((trial < lower - slack) | (trial > upper + slack))
+            inwards = ((trial <= lower) & (descent > slack)) | ((trial >= upper) & (descent < -slack))
+            infeasible = outside | (~active & ~self.held & inwards)
+            value[pending] = np.clip(trial, lower, upper)
+            unfinished = infeasible.any(axis=1)
+            pending, infeasible = pending[unfinished], infeasible[unfinished]
             if not len(pending):
-                inside = np.clip(value / self.scale, *ends)
-                return np.where(value == lower, ends[0], np.where(value == upper, ends[1], inside))
-            exchanged = _exchanged(wrong, fewest, patience, pending)
-            free[pending] ^= exchanged
+                # Values at a bound are the given bound itself, without the rounding of the scale.
+                inside = np.clip(value / self.scale, given_lower, given_upper)
+                return np.where(value == lower, given_lower, np.where(value == upper, given_upper, inside))
+            free[pending] ^= _to_exchange(infeasible, fewest, patience, pending)
         raise EngineError(
-            f"nuisance: no minimum within the bounds was found in {ROUNDS} exchanges; widen the bounds"
+            f"nuisance: no minimum within the bounds was found in {MAX_EXCHANGES} exchanges; widen the bounds"
         )
 
     def _trial(
         self, side: NDArray[np.float64], free: NDArray[np.bool_], value: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Minimum over the free components, the others being fixed [m, q]."""
+        """Minimum over the free components with the others fixed at their values [m, q]."""
         rest = np.where(free, side - self._times(np.where(free, 0.0, value)), 0.0)
         if (free == free[0]).all():
             return self._solve(free[:1], rest.T[None])[0].T
@@ -161,21 +162,22 @@ class Arrowhead:
         split = groups * width
         blocks, border, corner = self._restricted(free)
         inner = side[:, :split].reshape(len(side), groups, width, -1)
-        found = np.linalg.solve(blocks, np.concatenate([border, inner], axis=-1))
-        across, within = found[..., :edge], found[..., edge:]
-        left = corner - np.einsum("mgbp,mgbr->mpr", border, across, optimize=True)
-        outer = np.linalg.solve(left, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
+        solved = np.linalg.solve(blocks, np.concatenate([border, inner], axis=-1))
+        across, within = solved[..., :edge], solved[..., edge:]
+        schur = corner - np.einsum("mgbp,mgbr->mpr", border, across, optimize=True)
+        outer = np.linalg.solve(schur, side[:, split:] - np.einsum("mgbp,mgbk->mpk", border, within))
         within = within - across @ outer[:, None]
         return np.concatenate([within.reshape(len(side), split, -1), outer], axis=1)
 
-    def _left_over(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """What the blocks leave over of the corner (Schur complement) [m, p, p]."""
+    def _schur_complement(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Schur complement of the blocks: the corner with the blocks eliminated [m, p, p]."""
         blocks, border, corner = self._restricted(free)
         return corner - np.einsum("mgbp,mgbr->mpr", border, np.linalg.solve(blocks, border), optimize=True)
 
     def _restricted(
         self, free: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Blocks, border and corner with rows and columns of the identity for fixed components."""
         groups, width, edge = self.border.shape
         inner, outer = free[:, : groups * width].reshape(-1, groups, width), free[:, groups * width :]
         return (
@@ -194,39 +196,39 @@ class Arrowhead:
 
 
 def _dependent(matrix: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which columns of Gram matrices of unit columns [..., b, b] the columns before them make up [..., b]."""
-    work, found = matrix.copy(), np.zeros(matrix.shape[:-1], dtype=bool)
+    """Linearly dependent columns [..., b] of Gram matrices of unit columns [..., b, b], by Cholesky elimination."""
+    remainder, dependent = matrix.copy(), np.zeros(matrix.shape[:-1], dtype=bool)
     for k in range(matrix.shape[-1]):
-        pivot = work[..., k, k].copy()
-        found[..., k] = pivot <= DEPENDENT
-        root = np.where(found[..., k], np.inf, np.sqrt(np.maximum(pivot, DEPENDENT)))
-        column = work[..., :, k] / root[..., None]
-        work -= column[..., :, None] * column[..., None, :]
-    return found
+        pivot = remainder[..., k, k].copy()
+        dependent[..., k] = pivot <= DEPENDENT
+        root = np.where(dependent[..., k], np.inf, np.sqrt(np.maximum(pivot, DEPENDENT)))
+        column = remainder[..., :, k] / root[..., None]
+        remainder -= column[..., :, None] * column[..., None, :]
+    return dependent
 
 
-def _exchanged(
-    wrong: NDArray[np.bool_],
+def _to_exchange(
+    infeasible: NDArray[np.bool_],
     fewest: NDArray[np.int64],
     patience: NDArray[np.int64],
     pending: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """Which wrong components to exchange: all while they get fewer, else the last of each independent problem.
+    """Components to exchange: all infeasible ones while their number falls, else the last of each independent part.
 
     Args:
-        wrong: Wrong components of the problems that are not solved [r, q].
-        fewest: Fewest wrong ones so far, by independent part [m, i]; updated.
-        patience: Further exchanges of all that do not make them fewer [m, i]; updated.
-        pending: The problems that are not solved [r].
+        infeasible: Infeasible components of the r unsolved problems [r, q].
+        fewest: Smallest number of infeasible components so far, by independent part [m, i]; updated.
+        patience: Remaining full exchanges without progress [m, i]; updated.
+        pending: Indices of the unsolved problems [r].
 
     Returns:
-        What to exchange [r, q].
+        Mask of the components to exchange [r, q].
     """
-    parts = wrong.reshape(len(wrong), fewest.shape[1], -1)
+    parts = infeasible.reshape(len(infeasible), fewest.shape[1], -1)
     count = parts.sum(axis=2)
-    fewer, left = count < fewest[pending], patience[pending]
+    fewer, remaining = count < fewest[pending], patience[pending]
     last = parts.shape[2] - 1 - np.argmax(parts[..., ::-1], axis=2)
-    alone = parts & (np.arange(parts.shape[2]) == last[..., None])
+    last_only = parts & (np.arange(parts.shape[2]) == last[..., None])
     fewest[pending] = np.minimum(count, fewest[pending])
-    patience[pending] = np.where(fewer, PATIENCE, np.maximum(left - 1, 0))
-    return np.where((fewer | (left > 0))[..., None], parts, alone).reshape(wrong.shape)
+    patience[pending] = np.where(fewer, PATIENCE, np.maximum(remaining - 1, 0))
+    return np.where((fewer | (remaining > 0))[..., None], parts, last_only).reshape(infeasible.shape)

@@ -1,8 +1,8 @@
-"""The replay of a study's own scene, as the cheap model of an engine that can only be called.
+"""The replay of a study's scene as the cheap model of an engine without derivatives.
 
-The scene that the study names is traced once, and its paths answer for a candidate in microseconds. What its materials
-are taken to be and the study does not calibrate (thickness above all, conductivity, permittivity) are the model's
-constants, which space mapping adjusts.
+We trace the study's scene once; its paths then evaluate a candidate in microseconds. The material constants that the
+study does not calibrate (above all thickness, then conductivity and permittivity) are the constants of the cheap model,
+which space mapping adjusts.
 """
 
 from __future__ import annotations
@@ -28,70 +28,70 @@ from calibray.study import Setup
 from calibray.support.progress import Progress
 
 SPREAD: Final = {"thickness": 0.5, "conductivity": 0.7, "relative_permittivity": 0.2}
-"""Standard deviation of the logarithm of a constant around what the study says."""
+"""Standard deviation of the logarithm of a constant around its declared value."""
 
-FAR: Final = 3.0
-"""Standard deviations to the bounds of a constant."""
+BOUND: Final = 3.0
+"""Distance of a constant's bounds from its declared value, in standard deviations."""
 
 METAL: Final = 1e4
-"""Conductivity from which on a material reflects all, whatever its constants [S/m]."""
+"""Conductivity above which a material reflects everything, whatever its other constants [S/m]."""
 
 
 class StoredPaths(Protocol):
-    """Stored paths, with derivatives."""
+    """A replay of stored paths, with derivatives."""
 
     @property
     def parameters(self) -> Parameters:
-        """What a candidate's components stand for."""
+        """The parameters of a candidate."""
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss [n, L], [dB], of candidates [n, d]; +inf without a path."""
+        """Path loss [n, L], [dB], of candidates [n, d]; +inf for a link without a path."""
         ...
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The same, and its derivatives by the parameters [n, L, d]."""
+        """Path loss, and its derivatives by the parameters [n, L, d]."""
         ...
 
 
 class Rows(Protocol):
-    """How path loss becomes what is compared."""
+    """Converts path loss to the residuals of a cheap model."""
 
     def residuals(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Rows [n, m] of candidates [n, d] and their path loss [n, L], [dB]."""
+        """Residuals [n, m] of candidates [n, d] with path loss [n, L], [dB]."""
         ...
 
     def slopes(
         self, candidates: NDArray[np.float64], path_loss: NDArray[np.float64], slope: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of the rows [n, m, k] from those of the path loss [n, L, k]."""
+        """Derivatives of the residuals [n, m, k] from those of the path loss [n, L, k]."""
         ...
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """What stands for the path loss of a link that no path leads to [L], [dB]."""
+        """Path loss assigned to links without a path [L], [dB]."""
         ...
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which rows depend on links that are reached [m], of the links that are [L]."""
+        """Mask of the residuals that depend on the reached links [m]; `reached` marks the links with a path [L]."""
         ...
 
 
 @final
 @dataclass(eq=False)
 class ReplayedModel:
-    """Stored paths as a cheap model, of the constants that a study leaves as they are.
+    """A replay as a cheap model, with the constants that the study does not calibrate.
 
     Attributes:
-        engine: The paths, over the study's parameters and then the constants.
+        engine: The replay, over the study's parameters followed by the constants.
         count: Number of the study's parameters.
-        rows: How their path loss becomes what is compared.
+        rows: Converts path loss to residuals.
         calls: Candidates evaluated so far.
-        seconds: Time that these took [s].
+        seconds: Time spent on them [s].
     """
 
     engine: StoredPaths
@@ -107,35 +107,35 @@ class ReplayedModel:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Rows that the paths say something about [m]."""
+        """Mask of the residuals that the replay predicts [m]."""
         return self.rows.known(self._reached)
 
     @property
     def constants(self) -> Constants:
-        """The constants, as logarithms."""
+        """The constants on a logarithmic scale."""
         parameters = self.engine.parameters
         lower, upper = (bound[self.count :] for bound in parameters.search_bounds)
         centre = parameters.to_search(parameters.start)[self.count :]
-        return Constants(centre, (upper - lower) / (2.0 * FAR), lower, upper)
+        return Constants(centre, (upper - lower) / (2.0 * BOUND), lower, upper)
 
     def residuals(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `CheapModel.residuals`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
         loss = self._filled(self.engine.path_loss(candidates))
-        self._spent(started, len(points))
+        self._count(started, len(points))
         return self.rows.residuals(candidates[:, : self.count], loss)
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """See `CheapModel.answer`."""
         started, candidates = time.perf_counter(), self._candidates(points, constants)
         loss, slope = self.engine.path_loss_and_jacobian(candidates)
-        self._spent(started, len(points))
+        self._count(started, len(points))
         slope = np.where(np.isfinite(slope) & np.isfinite(loss)[:, :, None], slope, 0.0)
         slope = slope * self.engine.parameters.search_slope(candidates)[:, None, :]
-        loss, own = self._filled(loss), candidates[:, : self.count]
-        slopes = self.rows.slopes(own, loss, slope)
+        loss, studied = self._filled(loss), candidates[:, : self.count]
+        slopes = self.rows.slopes(studied, loss, slope)
         return CheapAnswer(
-            self.rows.residuals(own, loss), slopes[:, :, : self.count], slopes[:, :, self.count :]
+            self.rows.residuals(studied, loss), slopes[:, :, : self.count], slopes[:, :, self.count :]
         )
 
     def _candidates(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,13 +144,14 @@ class ReplayedModel:
     def _filled(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(self._reached, loss, self.rows.filling)
 
-    def _spent(self, started: float, calls: int) -> None:
-        self.calls, self.seconds = self.calls + calls, self.seconds + time.perf_counter() - started
+    def _count(self, started: float, calls: int) -> None:
+        self.calls += calls
+        self.seconds += time.perf_counter() - started
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemRows:
-    """The rows of a problem: its residuals, those of priors included.
+    """The residuals of a problem, including rows of priors.
 
     Attributes:
         problem: The problem.
@@ -160,14 +161,14 @@ class ProblemRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The measured path loss, or the ceiling where one stands for a link without a path [L], [dB]."""
+        """The ceiling, or without one the measured path loss [L], [dB]."""
         objective = self.problem.objective
         if objective.ceiling_db is not None:
             return np.full(len(objective.measured), objective.ceiling_db)
         return objective.measured
 
     def known(self, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """See `Rows.known`; a prior needs no model."""
+        """See `Rows.known`; False for rows of priors, which the model does not predict."""
         links = reached[self.problem.objective.weight > 0]
         priors = int((self.problem.objective.nuisance.prior < np.inf).sum()) + len(self.problem.priors)
         return np.append(links, np.zeros(priors, dtype=bool))
@@ -186,34 +187,36 @@ class ProblemRows:
 
 
 @dataclass(frozen=True, eq=False)
-class Aid:
-    """The cheap model of a calibration.
+class CheapReplay:
+    """The cheap model of a calibration, if any.
 
     Attributes:
-        model: The model; None where none is wanted, or there is nothing to make one of.
-        remark: Why there is none, where one was wanted.
+        model: The model; None if the study wants none or it cannot be made.
+        remark: The reason if it cannot be made.
     """
 
     model: ReplayedModel | None = None
     remark: Remark | None = None
 
 
-def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None = None) -> Aid:
-    """The replay of a problem's own scene, where its method has a use for it.
+def make_cheap_replay(
+    problem: Problem, progress: Progress | None = None, scene: Setup | None = None
+) -> CheapReplay:
+    """Trace a problem's scene for a cheap model, if its method uses one.
 
     Args:
         problem: The problem.
         progress: Called with the stage "tracing" after every launch.
-        scene: A study of the same links, whose trace is replayed in place of the problem's own.
+        scene: A study of the same links to trace instead of the problem's study.
 
     Returns:
-        The model, or why there is none.
+        The model, or the reason why there is none.
     """
     setup = problem.setup
     section = setup.study.method
     wanted = section.name in (AUTO, "space-mapping") and section.model == "replay"
     if not wanted or not setup.study.engine.expensive or problem.observable is not PATH_LOSS:
-        return Aid()
+        return CheapReplay()
     try:
         scene = setup if scene is None else scene
         paths = scene.trace(progress=progress)
@@ -222,10 +225,10 @@ def aid(problem: Problem, progress: Progress | None = None, scene: Setup | None 
         model = ReplayedModel(engine, len(problem.parameters), ProblemRows(problem))
     except (InputError, EngineError, ImportError) as error:
         reason = " ".join(str(error).split())
-        return Aid(None, _no_model(f"the scene cannot be traced here ({reason})"))
+        return CheapReplay(None, _no_model(f"the scene cannot be traced here ({reason})"))
     if not model.known.any():
-        return Aid(None, _no_model("the trace of the scene reaches none of the links"))
-    return Aid(model)
+        return CheapReplay(None, _no_model("the trace of the scene reaches none of the links"))
+    return CheapReplay(model)
 
 
 def _no_model(cause: str) -> Remark:
@@ -235,26 +238,27 @@ def _no_model(cause: str) -> Remark:
 def with_constants(
     parameters: Parameters, materials: dict[str, Material], one_carrier: bool = True
 ) -> Parameters:
-    """Parameters, and after them the constants that none of them acts on.
+    """Append the material constants that are not calibrated to the parameters.
 
     Args:
         parameters: The parameters.
-        materials: The materials, as they are believed to be.
-        one_carrier: Whether constants hold at all links; else those that follow the frequency are left as they are.
+        materials: The declared materials.
+        one_carrier: Whether all links have one carrier; otherwise constants that depend on frequency stay fixed.
 
     Returns:
-        Both, the constants on a logarithmic scale.
+        The parameters, then the constants on a logarithmic scale.
     """
-    free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
-    found = []
+    calibrated = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
+    constants = []
     for name, material in materials.items():
         for constant, spread in SPREAD.items():
             value, bound = getattr(material, constant), PARAMETER_BOUNDS[constant]
-            lower, upper = (value * float(np.exp(sign * FAR * spread)) for sign in (-1.0, 1.0))
-            fixed = f"{name}.{constant}" not in free and value > 0 and material.conductivity < METAL
-            if not fixed or upper not in bound or not (one_carrier or constant == "thickness"):
+            lower, upper = (value * float(np.exp(sign * BOUND * spread)) for sign in (-1.0, 1.0))
+            adjustable = (
+                f"{name}.{constant}" not in calibrated and value > 0 and material.conductivity < METAL
+            )
+            if not adjustable or not (one_carrier or constant == "thickness"):
                 continue
-            if lower not in bound:  # of permittivity, of which none is below 1
-                continue
-            found.append(Parameter(f"{name}.{constant}", lower, upper, value, "log"))
-    return replace(parameters, items=(*parameters.items, *found))
+            if lower in bound and upper in bound:  # a permittivity near 1 has no room below
+                constants.append(Parameter(f"{name}.{constant}", lower, upper, value, "log"))
+    return replace(parameters, items=(*parameters.items, *constants))

@@ -1,8 +1,8 @@
-"""Nuisances eliminated: their best coefficients, and what they take up of the derivatives, for all candidates at once.
+"""Elimination of the nuisance: best coefficients and projected derivatives, for all candidates at once.
 
-Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients
+Variable projection (G. H. Golub and V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973): the coefficients b
 minimise sum_i w_i (gap_i - z_i.b)^2 + sum_j (ridge_j b_j)^2 within their bounds. With one column per link, each
-coefficient is a weighted mean, clipped; else the normal equations are solved, which `arrowhead.py` does.
+coefficient is a clipped weighted mean. Otherwise `arrowhead.py` solves the normal equations.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from calibray.fitting.arrowhead import Arrowhead
 from calibray.fitting.nuisance import Nuisance
 
 DENSE = 2**18
-"""Entries of a design up to which dense products, all candidates in one, are the faster ones."""
+"""Entries of a design up to which one dense product over all candidates is faster than sparse products."""
 
 Matrix = NDArray[np.float64] | sparse.csr_array
 
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """A nuisance over links of given weights.
+    """Normal equations of a nuisance over weighted links.
 
     Attributes:
-        design: Its columns at the links that count [m, q].
-        weighted: The same transposed, times the weights [q, m].
-        data: Their product, the normal equations of the data alone [q, q].
-        normal: The normal equations, columns in the order of `order`.
-        order: Place in the design of the columns of `normal` [q].
+        design: Columns Z of the nuisance at the m links with weight [m, q].
+        weighted: Z' W, with the diagonal matrix W of the weights [q, m].
+        data: Z' W Z, the normal equations without priors [q, q].
+        normal: The normal equations with priors, columns in the order of `order`.
+        order: Index in the design of each column of `normal` [q].
         lower: Lower bounds [q].
         upper: Upper bounds [q].
         separable: Whether no link has more than one column.
-        determined: Which columns some link depends on, and no others make up [q]. Of columns that make up each other,
-            those of the finest grouping are kept.
+        determined: Mask of the columns that the links determine [q]. Of linearly dependent columns, those of the finest
+            grouping are kept.
     """
 
     design: Matrix
@@ -56,10 +56,7 @@ class Elimination:
         Args:
             nuisance: The nuisance.
             weight: Weights of all links; 0 leaves a link out [L].
-            ridge: Root of what the prior adds to the diagonal of the normal equations [q].
-
-        Returns:
-            The elimination.
+            ridge: Square root of the prior's term on the diagonal of the normal equations [q].
         """
         counted = weight > 0
         design = nuisance.design if counted.all() else nuisance.design[counted]
@@ -86,11 +83,11 @@ class Elimination:
         """The best coefficients.
 
         Args:
-            gap: Measured minus modelled path loss at the links that count [n, m], [dB].
+            gap: Measured minus modelled path loss at the links with weight [n, m], [dB].
 
         Returns:
-            Coefficients [n, q], [dB] per unit of the column; what the data cannot tell is as near to 0 as its bounds
-            let it be.
+            Coefficients [n, q], [dB] per unit of the column; an undetermined one takes the value within its bounds
+            that is nearest to 0.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -101,7 +98,7 @@ class Elimination:
         """The best coefficients from sums over the links.
 
         Args:
-            side: Columns of the design times weights and gap [n, q].
+            side: Right-hand side Z' W gap [n, q].
 
         Returns:
             Coefficients [n, q]; see `coefficients`.
@@ -110,56 +107,59 @@ class Elimination:
             EngineError: No minimum within the bounds was found.
         """
         side = side[:, self.order]
-        found = np.empty_like(side)
+        best = np.empty_like(side)
         if self.separable:
-            found[:, self.order] = side / np.where(self.normal.held, np.inf, self.normal.scale**2)
-            return np.clip(found, self.lower, self.upper)
-        found[:, self.order] = self.normal.minimum(side, self.lower[self.order], self.upper[self.order])
-        return found
+            best[:, self.order] = side / np.where(self.normal.held, np.inf, self.normal.scale**2)
+            return np.clip(best, self.lower, self.upper)
+        best[:, self.order] = self.normal.minimum(side, self.lower[self.order], self.upper[self.order])
+        return best
 
-    def taken_up(self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How the best coefficients follow the modelled path loss; one at its bound does not.
+    def projection(
+        self, slope: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Least-squares coefficients of the derivatives on the design; 0 for a coefficient at its bound.
+
+        These are minus the derivatives of the best coefficients by the parameters.
 
         Args:
-            slope: Derivatives of the modelled path loss at the links that count [n, m, d].
+            slope: Derivatives of the modelled path loss at the links with weight [n, m, d].
             coefficients: The best coefficients [n, q].
 
         Returns:
-            Derivatives of the coefficients with their sign changed [n, q, d].
+            Coefficients of the derivatives [n, q, d].
         """
-        return self.followed(_products(self.weighted, slope), coefficients)
+        if isinstance(self.weighted, np.ndarray):
+            side = self.weighted @ slope
+        else:
+            side = np.stack([self.weighted @ candidate for candidate in slope])
+        return self.projection_from_sums(side, coefficients)
 
-    def followed(self, side: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same from sums over the links.
+    def projection_from_sums(
+        self, side: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """`projection` from sums over the links.
 
         Args:
-            side: Columns of the design times weights and derivatives [n, q, d].
+            side: Z' W times the derivatives [n, q, d].
             coefficients: The best coefficients [n, q].
 
         Returns:
-            What `taken_up` gives [n, q, d].
+            Coefficients of the derivatives [n, q, d].
         """
         free = ((coefficients > self.lower) & (coefficients < self.upper))[:, self.order]
-        taken = np.empty_like(side)
-        taken[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
-        return taken
+        projection = np.empty_like(side)
+        projection[:, self.order] = self.normal.solve(free & ~self.normal.held, side[:, self.order])
+        return projection
 
-    def remove(self, slope: NDArray[np.float64], taken: NDArray[np.float64]) -> None:
-        """Take off, in place, what the coefficients take up of derivatives.
+    def remove(self, slope: NDArray[np.float64], projection: NDArray[np.float64]) -> None:
+        """Subtract the projection from derivatives, in place.
 
         Args:
-            slope: Derivatives of the modelled path loss at the links that count [n, m, d]; changed.
-            taken: What `taken_up` gave [n, q, d].
+            slope: Derivatives of the modelled path loss at the links with weight [n, m, d]; changed.
+            projection: Their coefficients from `projection` [n, q, d].
         """
         if isinstance(self.design, np.ndarray):
-            slope -= self.design @ taken
+            slope -= self.design @ projection
             return
-        for one, share in zip(slope, taken, strict=True):
-            one -= self.design @ share
-
-
-def _products(matrix: Matrix, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A matrix [q, m] times each of some [n, m, d]."""
-    if isinstance(matrix, np.ndarray):
-        return matrix @ values
-    return np.stack([matrix @ each for each in values])
+        for candidate, coefficients in zip(slope, projection, strict=True):
+            candidate -= self.design @ coefficients

@@ -1,4 +1,4 @@
-"""The fidelity loop: trace again with the materials found, and calibrate again while that changes too much."""
+"""The fidelity loop: trace again with the calibrated materials, and calibrate again while the path loss changes."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from calibray.fitting.search import Trail, search
 from calibray.support.progress import Progress, with_stage
 
 
-def settle(
+def retrace(
     problem: Problem, trail: Trail, progress: Progress | None = None
 ) -> tuple[Problem, Trail, NDArray[np.float64] | None]:
-    """Trace again with the materials found, and calibrate again while that changes the path loss too much.
+    """Trace with the calibrated materials, and calibrate again while the path loss changes by more than the tolerance.
 
-    Refraction and diffuse reflection are sampled by the materials of the trace, so the set of paths can change with
-    them. Where a trace follows neither, there is nothing to check. Only `auto` calibrates again: the other methods
-    have a budget of RT calls to keep to.
+    The tracer samples refraction and diffuse reflection by the materials, so the set of paths can depend on them. A
+    trace without both needs no check. Only the method `auto` calibrates again; other methods have a fixed budget of RT
+    calls.
 
     Args:
         problem: The problem.
         trail: Its first search.
-        progress: Called as the work goes on, with the stage "checking" while tracing.
+        progress: Called with the stage "checking" while tracing.
 
     Returns:
-        The problem on the last trace calibrated on, its search, and the gap of every link, path loss on paths traced
-        with the materials found minus path loss on those calibrated on [L], [dB]; None where nothing was checked.
+        The problem on the last trace that was calibrated on, its search, and the gap of every link: path loss on paths
+        traced with the calibrated materials minus path loss on the paths of the calibration [L], [dB]; None if not
+        checked.
     """
     setup, section = problem.setup, problem.setup.study.engine
     study, parameters = setup.study, problem.parameters
@@ -41,32 +42,32 @@ def settle(
     gap = None
     for turn in range(study.fidelity.rounds):
         materials = parameters.materials(trail.best, problem.engine.materials)
-        told = with_stage(progress, "checking")
+        stage = with_stage(progress, "checking")
         if isinstance(problem.engine, Chunked):
-            again = problem.engine.traced_with(materials, told)
+            engine = problem.engine.traced_with(materials, stage)
         else:
-            again = replay(setup, setup.trace(materials, told), section.compress_db)
-        gap = difference(again.path_loss(trail.best[None])[0], trail.best_modelled)
+            engine = replay(setup, setup.trace(materials, stage), section.compress_db)
+        gap = path_loss_change(engine.path_loss(trail.best[None])[0], trail.best_modelled)
         objective = problem.objective
         settled = np.abs(gap[objective.weight > 0]).max() <= study.fidelity.tolerance_db
         if settled or study.method.name != AUTO or turn == study.fidelity.rounds - 1:
             break
-        # A link that the new trace does not reach is left out from here on.
+        # Links without a path in the new trace are left out of the next calibration.
         if objective.ceiling_db is None:
             objective = replace(objective, weight=np.where(np.isfinite(gap), objective.weight, 0.0))
-        problem = replace(problem, engine=again, objective=objective)
+        problem = replace(problem, engine=engine, objective=objective)
         trail = search(problem, choose(problem), progress)
     return problem, trail, gap
 
 
-def difference(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Difference of path losses [L], [dB]; 0 where neither has a path, infinite where one has none."""
+def path_loss_change(after: NDArray[np.float64], before: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change of path loss [L], [dB]; 0 for a link without a path in both, infinite for one without a path in one."""
     lost = np.isinf(after) & np.isinf(before)
     return np.where(lost, 0.0, after - np.where(lost, 0.0, before))
 
 
-def largest(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
-    """Largest gap [dB] of the links that count and have a path on both traces; None where nothing was checked."""
+def largest_gap(gap: NDArray[np.float64] | None, counted: NDArray[np.bool_]) -> float | None:
+    """Largest gap of the links with weight and a path on both traces [dB]; None if not checked."""
     if gap is None:
         return None
     return float(np.abs(gap[counted & np.isfinite(gap)]).max(initial=0.0))

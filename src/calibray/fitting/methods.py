@@ -1,4 +1,4 @@
-"""Which method solves a problem, and with what settings."""
+"""Choice of the calibration method and its settings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from calibray.support.messages import did_you_mean
 AUTO: Final = "auto"
 
 STARTS: Final = (16, 512)
-"""Local searches on the largest and on small programs."""
+"""Fewest and most local searches of a multi-start method."""
 
 START_INTERACTIONS: Final = 4_000_000
-"""Local searches times interactions between the two."""
+"""Target for local searches times interactions of the path program, which keeps the cost of a search constant."""
 
 
 def check_method(name: str) -> None:
-    """Refuse a method that does not exist.
+    """Check that a method exists.
 
     Args:
         name: The method.
@@ -34,17 +34,17 @@ def check_method(name: str) -> None:
     Raises:
         InputError: There is no such method.
     """
-    known = (AUTO, *METHODS)
-    if name not in known:
-        raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, known)}")
+    names = (AUTO, *METHODS)
+    if name not in names:
+        raise InputError(f"method {name!r}: there is no such method; {did_you_mean(name, names)}")
 
 
 def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
-    """The optimizer of a study's problem: the one it names, or for "auto" the one that serves it best.
+    """Make the optimizer that a study names; "auto" takes the best one for its engine.
 
     Args:
         problem: The problem.
-        model: A cheap model of it, if there is one.
+        model: A cheap model of it, if available.
 
     Returns:
         The optimizer.
@@ -58,10 +58,10 @@ def choose(problem: Problem, model: CheapModel | None = None) -> Optimizer:
 
 
 def check_fit(setup: Setup) -> None:
-    """Refuse a method that cannot run on a study's engine, or its options, before anything is paid or written.
+    """Check that a study's method and options work on its engine, before any expensive call or output.
 
     Args:
-        setup: The study, opened.
+        setup: The opened study.
 
     Raises:
         InputError: The method does not exist, needs derivatives that the engine does not give, or its options cannot
@@ -83,7 +83,9 @@ def _make(
     if name == AUTO:
         name = "least-squares" if differentiable else "space-mapping"
     if METHODS[name].needs_derivatives() and not differentiable:
-        raise InputError(f"method {name!r} needs derivatives, which only the replay engine gives")
+        raise InputError(
+            f"method {name!r} needs derivatives, which only the engine 'replay' gives; use method 'auto'"
+        )
     try:
         return optimizers.make(
             name,
@@ -99,12 +101,9 @@ def _make(
 
 
 def local_searches(interactions: int) -> int:
-    """Starting points of a method that takes them, on paths where they cost what they may.
+    """Number of starting points of a multi-start method: fewer on larger path programs.
 
     Args:
-        interactions: Interactions that a candidate is evaluated at.
-
-    Returns:
-        Their number.
+        interactions: Interactions of the path program.
     """
     return int(np.clip(START_INTERACTIONS // max(interactions, 1), *STARTS))

@@ -1,11 +1,11 @@
-"""What shifts path loss beside the materials: columns of a linear design, each times an unknown coefficient.
+"""Nuisances: columns of a linear design times unknown coefficients, added to the modelled path loss.
 
-An offset for all links or for each group, a slope per decade of distance, any numeric column of the links. A term
-is one such column, split up by groups if asked for; several terms make one design [links, q]. It is kept sparse: a
-link has one entry for each term, however many groups there are.
+A term is one column of the links: a constant (an offset), the logarithm of the distance (a slope per decade), or any
+numeric column of the table. It has one coefficient for all links or one per group. Several terms form one design
+[links, q]. The design is sparse: a link has one entry per term, however many groups there are.
 
-Being linear, the best coefficients are known in closed form for every candidate (variable projection), within their
-bounds and with Gaussian priors; `elimination.py` has that.
+The model is linear in the coefficients. For every candidate the best ones follow in closed form (variable projection),
+within their bounds and with Gaussian priors; see `elimination.py`.
 """
 
 from __future__ import annotations
@@ -28,24 +28,27 @@ OFFSET: Final = "offset"
 """Name of the term that `[offset]` makes."""
 
 UNKNOWN_DB: Final = 10.0
-"""Spread of groups of which only one is known [dB per unit of the column]."""
+"""Assumed standard deviation between groups if only one is measured [dB per unit of the column]; wide, because one
+group says nothing about the spread."""
 
 UNBOUNDED: Final = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One column of the links times an unknown coefficient, or one coefficient for each group of links.
+    """A column of the links with one unknown coefficient, or one coefficient per group of links.
 
     Attributes:
         name: Its name.
-        by: What the column is: "constant", "log_distance", or a column of the links' table.
-        value: The column [L]: 1 for a constant; decades of distance from `centre`; else the column's own unit.
-        group: Group of every link [L]; -1 where a link belongs to none of `labels`.
-        labels: Labels of the groups; one nameless group for all links.
+        by: The column: "constant", "log_distance", or a column of the links' table.
+        value: The values of the column [L]: 1 for a constant; decades of distance relative to `centre` for
+            "log_distance"; else in the unit of the table.
+        group: Index of each link's group in `labels` [L]; -1 for a link of another group.
+        labels: Labels of the groups; one empty label if all links share one coefficient.
         bounds: Lower and upper bound of every coefficient, [dB] per unit of the column.
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the same unit; +inf for none.
-        centre: What was taken off the column: the mean of log10(distance / 1 m) of the links first seen, else 0.
+        centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links that the term was
+            made for, else 0.
     """
 
     name: str
@@ -59,7 +62,7 @@ class Term:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of its columns: the term's own, with the group in brackets if there are groups."""
+        """Names of its columns: the term's name, with the group in brackets if there are groups."""
         return tuple(f"{self.name}[{label}]" if label else self.name for label in self.labels)
 
     def at(self, links: Measurements, labels: ArrayLike | None = None) -> Term:
@@ -67,13 +70,14 @@ class Term:
 
         Args:
             links: The links.
-            labels: Their groups' labels [n]; one never seen belongs to no group. None for a term without groups.
+            labels: Labels of their groups [n]; a link with an unknown label belongs to no group. None for a term
+                without groups.
 
         Returns:
-            The term, its columns those of this one.
+            The term with the same columns at these links.
 
         Raises:
-            InputError: The links' table lacks the column, or the labels do not fit.
+            InputError: The links' table lacks the column, or the labels do not match the term.
         """
         if (labels is None) != (self.labels == ("",)):
             need = "takes no labels" if labels is not None else "needs the labels of the links' groups"
@@ -81,9 +85,10 @@ class Term:
         value = _column(links, self.by) - self.centre
         if labels is None:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
-        given = _labels(self.name, links, labels)
-        place = np.minimum(np.searchsorted(self.labels, given), len(self.labels) - 1)
-        return replace(self, value=value, group=np.where(np.array(self.labels)[place] == given, place, -1))
+        link_labels = _labels(self.name, links, labels)
+        index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
+        known = np.array(self.labels)[index] == link_labels
+        return replace(self, value=value, group=np.where(known, index, -1))
 
 
 def make_term(
@@ -95,14 +100,14 @@ def make_term(
     bounds: tuple[float, float] | None = None,
     prior: float | None = None,
 ) -> Term:
-    """A term of a nuisance.
+    """Make a term of a nuisance.
 
     Args:
         links: The links.
         name: Name of the term.
-        by: "constant" for an offset [dB]; "log_distance" for a slope [dB per decade], which turns about the links'
-            geometric mean distance; or a numeric column of the links' table.
-        labels: Labels of the links' groups [L], for one coefficient each; one coefficient for all links if None.
+        by: "constant" for an offset [dB]; "log_distance" for a slope [dB per decade] about the links' geometric mean
+            distance; or a numeric column of the links' table.
+        labels: Labels of the links' groups [L], for one coefficient per group; one coefficient for all links if None.
         bounds: Lower and upper bound of the coefficients; unbounded if None.
         prior: Standard deviation of the coefficients' Gaussian prior around zero; flat if None.
 
@@ -110,8 +115,8 @@ def make_term(
         The term.
 
     Raises:
-        InputError: The bounds are not ordered, the prior is not positive, the labels do not fit, or the column does
-            not exist or is not numeric.
+        InputError: The bounds are not ordered, the prior is not positive, the number of labels is wrong, or the column
+            does not exist or is not numeric.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 10]] * 2, rx=[[30, 40, 10], [300, 400, 10]], path_loss_db=[85, 110])
@@ -120,25 +125,26 @@ def make_term(
         >>> make_term(links, "clutter", "log_distance").value.tolist()
         [-0.5, 0.5]
     """
-    place = f"nuisance {name!r}"
     lower, upper = UNBOUNDED if bounds is None else bounds
     if not lower < upper:
-        raise InputError(f"{place}: bounds = [{lower:g}, {upper:g}]; the lower must be less than the upper")
+        raise InputError(
+            f"nuisance {name!r}: bounds = [{lower:g}, {upper:g}]; the lower must be less than the upper"
+        )
     if prior is not None and not prior > 0:
-        raise InputError(f"{place}: prior = {prior:g}; a standard deviation must be greater than 0")
+        raise InputError(f"nuisance {name!r}: prior = {prior:g}; a standard deviation must be greater than 0")
     value = _column(links, by)
     centre = float(value.mean()) if by == LOG_DISTANCE else 0.0
     if labels is None:
-        known, group = ("",), np.zeros(len(links), dtype=np.int64)
+        groups, group = ("",), np.zeros(len(links), dtype=np.int64)
     else:
-        names, group = np.unique(_labels(name, links, labels), return_inverse=True)
-        known = tuple(map(str, names))
+        distinct, group = np.unique(_labels(name, links, labels), return_inverse=True)
+        groups = tuple(map(str, distinct))
     prior = np.inf if prior is None else float(prior)
-    return Term(name, by, value - centre, group, known, (float(lower), float(upper)), prior, centre)
+    return Term(name, by, value - centre, group, groups, (float(lower), float(upper)), prior, centre)
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
-    """Labels of the links' transmitters, by where they stand to the centimetre.
+    """Label each link's transmitter by its position to the centimetre.
 
     Args:
         links: The links.
@@ -146,7 +152,7 @@ def transmitters(links: Measurements) -> NDArray[np.str_]:
     Returns:
         A label for each link [L].
     """
-    return np.array([",".join(f"{each:.2f}" for each in place) for place in links.tx], dtype=np.str_)
+    return np.array([",".join(f"{value:.2f}" for value in tx) for tx in links.tx], dtype=np.str_)
 
 
 def _column(links: Measurements, by: str) -> NDArray[np.float64]:
@@ -156,24 +162,24 @@ def _column(links: Measurements, by: str) -> NDArray[np.float64]:
 
 
 def _labels(name: str, links: Measurements, labels: ArrayLike) -> NDArray[np.str_]:
-    given = np.asarray(labels, dtype=np.str_)
-    if given.shape != (len(links),):
+    array = np.asarray(labels, dtype=np.str_)
+    if array.shape != (len(links),):
         raise InputError(
-            f"nuisance {name!r}: labels of shape {given.shape}, must be ({len(links)},), one per link"
+            f"nuisance {name!r}: labels of shape {array.shape}, must be ({len(links)},), one per link"
         )
-    return given
+    return array
 
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
-    """A linear design [links, q].
+    """A linear design [L, q]: the columns of several terms.
 
     Attributes:
         num_links: Number of links L.
-        terms: Its terms; none for a design without columns.
+        terms: Its terms; may be empty.
 
     Raises:
-        InputError: A term is of other links, or two have the same name.
+        InputError: A term has another number of links, or two terms have the same name.
     """
 
     num_links: int
@@ -184,7 +190,7 @@ class Nuisance:
         for term in self.terms:
             if len(term.value) != self.num_links:
                 raise InputError(
-                    f"nuisance {term.name!r}: {len(term.value)} links, must be {self.num_links} as for the others"
+                    f"nuisance {term.name!r}: {len(term.value)} links, must be {self.num_links} as in other terms"
                 )
             if names.count(term.name) > 1:
                 raise InputError(f"nuisance {term.name!r}: two terms have this name; rename one")
@@ -197,21 +203,21 @@ class Nuisance:
     @cached_property
     def lower(self) -> NDArray[np.float64]:
         """Lower bounds [q], [dB] per unit of the column."""
-        return self._each([term.bounds[0] for term in self.terms])
+        return self._per_column([term.bounds[0] for term in self.terms])
 
     @cached_property
     def upper(self) -> NDArray[np.float64]:
         """Upper bounds [q], [dB] per unit of the column."""
-        return self._each([term.bounds[1] for term in self.terms])
+        return self._per_column([term.bounds[1] for term in self.terms])
 
     @cached_property
     def prior(self) -> NDArray[np.float64]:
         """Standard deviations of the priors [q], [dB] per unit of the column; +inf where flat."""
-        return self._each([term.prior for term in self.terms])
+        return self._per_column([term.prior for term in self.terms])
 
     @cached_property
     def design(self) -> sparse.csr_array:
-        """The design [L, q]: one entry in a row for each term that the link belongs to a group of."""
+        """The design [L, q]: a row has one entry for each term with a group of the link."""
         parts = [sparse.csr_array((self.num_links, 0))]
         for term in self.terms:
             row = np.flatnonzero(term.group >= 0)
@@ -221,57 +227,60 @@ class Nuisance:
 
     @cached_property
     def layout(self) -> tuple[NDArray[np.int64], int, int]:
-        """How the normal equations come apart.
+        """Order of the columns that gives the normal equations an arrowhead form.
+
+        Columns of different groups share no link, so the groups of one grouping form diagonal blocks.
 
         Returns:
-            Order of the columns [q] in which those of the finest grouping come first, group after group; the number
-            of its groups; and the number of its terms. Columns of different groups share no link.
+            Order of the columns [q] with those of the finest grouping first, group by group; the number of its groups;
+            and the number of its terms.
         """
         first = np.cumsum([0, *(len(term.labels) for term in self.terms)])
-        alike: dict[bytes, list[int]] = {}
+        by_grouping: dict[bytes, list[int]] = {}
         for index, term in enumerate(self.terms):
-            alike.setdefault(term.group.tobytes(), []).append(index)
-        finest = max(alike.values(), key=lambda terms: (len(self.terms[terms[0]].labels), len(terms)))
+            by_grouping.setdefault(term.group.tobytes(), []).append(index)
+        finest = max(by_grouping.values(), key=lambda terms: (len(self.terms[terms[0]].labels), len(terms)))
         groups = len(self.terms[finest[0]].labels)
         inner = (first[finest][None] + np.arange(groups)[:, None]).ravel()
         order = np.concatenate([inner, np.setdiff1d(np.arange(first[-1]), inner)])
         return order.astype(np.int64), groups, len(finest)
 
     def contribution(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the nuisance adds to path loss.
+        """Contribution of the nuisance to path loss: design times coefficients.
 
         Args:
             coefficients: Coefficients [n, q].
 
         Returns:
-            The sum of its columns times the coefficients [n, L], [dB].
+            The contribution [n, L], [dB].
         """
         return (self.design @ coefficients.T).T
 
     def filled(
         self, coefficients: NDArray[np.float64], counted: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficients with those of groups never seen filled in: the mean of the others of their term.
+        """Fill in the coefficients of unmeasured groups: the mean over the measured groups of the term.
 
         Args:
             coefficients: Coefficients fitted to some links [n, q].
-            counted: Which links these are [L].
+            counted: Mask of these links [L].
 
         Returns:
-            All coefficients [n, q], and the standard deviation of each: the spread of the groups where none of a
-            group's links was seen, else 0 [q].
+            All coefficients [n, q], and their standard deviations [q]: the spread between groups for a filled-in
+            coefficient, else 0.
         """
-        seen = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
-        found, spread, first = coefficients.copy(), np.zeros(len(seen)), 0
+        measured = np.asarray(abs(self.design[counted]).sum(axis=0)).ravel() > 0
+        filled, deviation, first = coefficients.copy(), np.zeros(len(measured)), 0
         for term in self.terms:
-            here = np.arange(first, first := first + len(term.labels))
-            known, unknown = here[seen[here]], here[~seen[here]]
+            columns = np.arange(first, first + len(term.labels))
+            first += len(term.labels)
+            known, unknown = columns[measured[columns]], columns[~measured[columns]]
             if len(known) and len(unknown):
-                found[:, unknown] = coefficients[:, known].mean(axis=1, keepdims=True)
-                # A further one lies around a mean that is uncertain itself.
-                size = np.std(coefficients[0, known], ddof=1) if len(known) > 1 else UNKNOWN_DB
-                spread[unknown] = size * np.sqrt(1 + 1 / len(known))
-        return found, spread
+                filled[:, unknown] = coefficients[:, known].mean(axis=1, keepdims=True)
+                # Variance between groups, plus that of their mean.
+                spread = np.std(coefficients[0, known], ddof=1) if len(known) > 1 else UNKNOWN_DB
+                deviation[unknown] = spread * np.sqrt(1 + 1 / len(known))
+        return filled, deviation
 
-    def _each(self, values: list[float]) -> NDArray[np.float64]:
+    def _per_column(self, values: list[float]) -> NDArray[np.float64]:
         return np.repeat(np.array(values, dtype=np.float64), [len(term.labels) for term in self.terms])

@@ -1,12 +1,12 @@
-"""What a calibration minimizes.
+"""The objective that a calibration minimises.
 
-The objective is the paper's RMSE (eq. 1) over the links that count, weighted if the links are. Nuisances, an offset
-or other columns of a linear design, enter the model as path loss + design x coefficients; the best coefficients are
-known in closed form for every candidate (variable projection), so that no optimizer ever sees them.
+It is the paper's RMSE (eq. 1) over the links with weight, weighted by these. Nuisances, an offset or other columns of a
+linear design, enter the model as path loss + design x coefficients. For every candidate the best coefficients follow in
+closed form (variable projection), so optimizers search only the parameters.
 
-A Gaussian prior of a coefficient adds a row to the residuals, (noise / prior) x coefficient: their sum of squares is
-then, but for constants, minus twice the logarithm of the posterior in units of the noise variance. `value` is that
-of all rows; `rmse` remains the paper's, of the links alone. Without priors the two are the same number.
+A Gaussian prior of a coefficient adds the row (noise / prior) x coefficient to the residuals. Up to constants, the sum
+of squares is then minus twice the log posterior, in units of the noise variance. `value` includes these rows, `rmse` is
+the paper's RMSE of the links only. Without priors both are the same number.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from calibray.measurements import Measurements
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The weighted RMSE between modelled and measured path loss, the nuisance eliminated.
+    """The weighted RMSE between modelled and measured path loss, with the nuisance eliminated.
 
     Attributes:
         measured: Measured path loss [L], [dB].
         weight: Weights of the links; 0 leaves a link out [L].
-        nuisance: The nuisance; one without terms for none.
-        ceiling_db: Path loss that a link without a path counts as, [dB]; None where such links are left out.
-        noise_db: Standard deviation of a link's error, at the mean weight, that priors are weighed against [dB].
+        nuisance: The nuisance; may have no terms.
+        ceiling_db: Path loss assigned to a link without a path [dB]; None leaves such links out.
+        noise_db: Standard deviation of a link's error at the mean weight, which scales the priors [dB].
     """
 
     measured: NDArray[np.float64]
@@ -44,14 +44,14 @@ class Objective:
     noise_db: float = 1.0
 
     def coefficients(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The nuisance's coefficients that fit best.
+        """The best coefficients of the nuisance.
 
         Args:
-            path_loss: Modelled path loss [n, L], [dB].
+            path_loss: Modelled path loss [n, L], [dB]. A candidate's links without a path are left out of its fit.
 
         Returns:
-            Coefficients [n, q], [dB] per unit of their columns; where `determined` is false, the value within the
-            bounds that is nearest to 0. Links that a candidate has no path for leave its coefficients alone.
+            Coefficients [n, q], [dB] per unit of their columns; if not `determined`, the value within the bounds that
+            is nearest to 0.
 
         Raises:
             EngineError: No minimum within the bounds was found.
@@ -62,19 +62,20 @@ class Objective:
         reached = np.isfinite(gap)
         if reached.all():
             return self._elimination.coefficients(gap)
-        found = np.empty((len(gap), len(self.nuisance.columns)))
-        patterns, which = np.unique(reached, axis=0, return_inverse=True)
+        # Candidates that lose the same links share one elimination.
+        coefficients = np.empty((len(gap), len(self.nuisance.columns)))
+        patterns, pattern_of = np.unique(reached, axis=0, return_inverse=True)
         for number, pattern in enumerate(patterns):
-            weight, mine = np.zeros(len(self.weight)), which.ravel() == number
+            weight, members = np.zeros(len(self.weight)), pattern_of.ravel() == number
             weight[self._counted] = np.where(pattern, self._scale**2, 0.0)
-            fewer = Elimination.of(self.nuisance, weight, self._ridge)
-            found[mine] = fewer.coefficients(gap[mine][:, pattern])
-        return found
+            elimination = Elimination.of(self.nuisance, weight, self._ridge)
+            coefficients[members] = elimination.coefficients(gap[members][:, pattern])
+        return coefficients
 
-    def following(
+    def coefficient_slopes(
         self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """How the best coefficients of the nuisance follow the parameters.
+        """Derivatives of the best coefficients by the parameters.
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
@@ -85,13 +86,15 @@ class Objective:
         """
         if not self.nuisance.terms:
             return np.zeros((len(path_loss), 0, derivative.shape[2]))
-        return -self._elimination.taken_up(self._sloped(path_loss, derivative), self.coefficients(path_loss))
+        slope = self._slopes(path_loss, derivative)
+        return -self._elimination.projection(slope, self.coefficients(path_loss))
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """Which columns the links that count determine [q].
+        """Mask of the columns that the links with weight determine [q].
 
-        Not so a group none of whose links counts, or a slope where a group's links all stand at one distance.
+        Undetermined are, for example, the offset of a group without such links, or the slope of a group whose links all
+        have the same distance.
         """
         if not self.nuisance.terms:
             return np.zeros(0, dtype=bool)
@@ -99,29 +102,29 @@ class Objective:
 
     @property
     def supported(self) -> NDArray[np.bool_]:
-        """Which links have no column that is not determined: the others' model lacks part of the nuisance [L]."""
+        """Mask of the links whose columns are all determined; the model of other links is incomplete [L]."""
         return ~((self.nuisance.design != 0) @ ~self.determined)
 
     def model(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is compared with the measurements.
+        """The full model: path loss, limited to the ceiling, plus the best nuisance.
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
 
         Returns:
-            The path loss, at most the ceiling, plus the best nuisance [n, L], [dB].
+            The model that is compared with the measurements [n, L], [dB].
         """
         return self._model(path_loss, self.coefficients(path_loss))
 
     def residuals(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals whose root mean square is `value`.
+        """Residuals, whose root mean square is `value`.
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
 
         Returns:
-            Model minus measurement, scaled by the square root of the weights, and a row for each column of the
-            nuisance that has a prior [n, counted links + priors], [dB].
+            Model minus measurement times the square root of the weights, followed by one row per coefficient with a
+            prior [n, links with weight + priors], [dB].
         """
         coefficients = self.coefficients(path_loss)
         links = (self._model(path_loss, coefficients) - self.measured)[:, self._counted] * self._scale
@@ -137,70 +140,77 @@ class Objective:
             derivative: Its derivatives [n, L, d], [dB] per unit.
 
         Returns:
-            Derivatives of the residuals [n, counted links + priors, d].
+            Derivatives of the residuals [n, links with weight + priors, d].
         """
-        slope, rows = self._sloped(path_loss, derivative), []
+        slope, prior_rows = self._slopes(path_loss, derivative), None
         if self.nuisance.terms:
-            taken = self._elimination.taken_up(slope, self.coefficients(path_loss))
-            self._elimination.remove(slope, taken)
-            if (held := self._ridge > 0).any():
-                rows = [-(taken * self._ridge[:, None])[:, held]]
+            projection = self._elimination.projection(slope, self.coefficients(path_loss))
+            self._elimination.remove(slope, projection)
+            has_prior = self._ridge > 0
+            if has_prior.any():
+                prior_rows = -(projection * self._ridge[:, None])[:, has_prior]
         slope *= self._scale[:, None]
-        return np.concatenate([slope, *rows], axis=1) if rows else slope
+        return slope if prior_rows is None else np.concatenate([slope, prior_rows], axis=1)
 
     def value(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is minimized: the root mean square of the residuals, those of priors included.
+        """The minimised value: the root mean square of all residuals, including the rows of priors.
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
 
         Returns:
-            Its value [n], [dB]; the RMSE where no coefficient has a prior; +inf where a link that counts has no path.
+            The value [n], [dB]; the RMSE if no coefficient has a prior; +inf if a link with weight has no path.
         """
         return np.sqrt(np.mean(self.residuals(path_loss) ** 2, axis=1))
 
     def rmse(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """RMSE of candidates (paper eq. 1), over links alone.
+        """RMSE of candidates over the links only (paper eq. 1).
 
         Args:
             path_loss: Modelled path loss [n, L], [dB].
 
         Returns:
-            RMSE [n], [dB]; +inf where a link that counts has no path.
+            RMSE [n], [dB]; +inf if a link with weight has no path.
         """
         links = self.residuals(path_loss)[:, : len(self._scale)]
         return np.sqrt(np.mean(links**2, axis=1))
 
-    def shares(self, blocks: Sequence[NDArray[np.int64]]) -> list[Share]:
-        """What blocks of links need for their sums.
+    def shares(self, chunks: Sequence[NDArray[np.int64]]) -> list[Share]:
+        """Split the objective by chunks of links, each of which can be summed by itself.
 
         Args:
-            blocks: Links of every block.
+            chunks: Links of every chunk.
 
         Returns:
-            The share of every block.
+            The share of every chunk.
         """
-        weight, found = np.zeros(len(self.weight)), []
+        weight, shares = np.zeros(len(self.weight)), []
         weight[self._counted] = self._scale**2
-        for block in blocks:
-            here = np.flatnonzero(weight[block] > 0)
-            links = block[here]
+        for chunk in chunks:
+            inside = np.flatnonzero(weight[chunk] > 0)
+            links = chunk[inside]
             design = self.nuisance.design[links]
             columns = np.unique(design.indices).astype(np.int64)
-            found.append(
-                Share(here, self.measured[links], weight[links], design[:, columns], columns, self.ceiling_db)
+            share = Share(
+                links=inside,
+                measured=self.measured[links],
+                weight=weight[links],
+                design=design[:, columns],
+                columns=columns,
+                ceiling_db=self.ceiling_db,
             )
-        return found
+            shares.append(share)
+        return shares
 
     def products(self, sums: Sums) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Squares and products of residuals and their derivatives, from sums over the links that count.
+        """Squares and products of residuals and their derivatives, from sums over the links.
 
         Args:
-            sums: Sums over all links, by their `shares`.
+            sums: Sums over all links, from their `shares`.
 
         Returns:
-            What the columns [derivatives, -residuals], rows of priors included, have as squares and products
-            [n, k, k], and the sum of squares of the links alone [n], [dB^2].
+            Products of the k columns [derivatives, -residuals], rows of priors included [n, k, k], and the sum of
+            squares of the links only [n], [dB^2].
 
         Raises:
             EngineError: No minimum of the nuisance within its bounds was found.
@@ -209,26 +219,27 @@ class Objective:
             return sums.square, sums.square[:, -1, -1]
         side = sums.side
         best = self._elimination.minimum(side[..., -1])
-        taken = self._elimination.followed(side[..., :-1], best)
-        best = np.concatenate([taken, best[..., None]], axis=2)
+        projection = self._elimination.projection_from_sums(side[..., :-1], best)
+        # (A - Z X)' w (A - Z X), with the best coefficients X of all columns; see `sums_of_squares`.
+        best = np.concatenate([projection, best[..., None]], axis=2)
         crossed = best.transpose(0, 2, 1) @ side
-        inner = np.stack([each.T @ (self._elimination.data @ each) for each in best])
+        inner = np.stack([candidate.T @ (self._elimination.data @ candidate) for candidate in best])
         links = sums.square - crossed - crossed.transpose(0, 2, 1) + inner
-        held = best * self._ridge[:, None]
-        return links + held.transpose(0, 2, 1) @ held, links[:, -1, -1]
+        prior_rows = best * self._ridge[:, None]
+        return links + prior_rows.transpose(0, 2, 1) @ prior_rows, links[:, -1, -1]
 
     @property
     def num_rows(self) -> int:
-        """Number of residuals: of the links that count, and of coefficients with a prior."""
+        """Number of residuals: links with weight, and coefficients with a prior."""
         return self.num_counted + int(np.count_nonzero(self._ridge > 0))
 
     @property
     def num_counted(self) -> int:
-        """Number of links that count; the rows of the residuals after them belong to priors."""
+        """Number of links with weight; later rows of the residuals belong to priors."""
         return len(self._scale)
 
     def capped(self, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss as it could have been measured: at most the ceiling, if there is one [dB]."""
+        """Path loss limited to the ceiling, if there is one [dB]."""
         return path_loss if self.ceiling_db is None else np.minimum(path_loss, self.ceiling_db)
 
     def _model(
@@ -237,28 +248,28 @@ class Objective:
         model = self.capped(path_loss)
         return model + self.nuisance.contribution(coefficients) if self.nuisance.terms else model
 
-    def _sloped(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives at the links that count; none where the path loss stands at the ceiling."""
-        flat = (path_loss >= (np.inf if self.ceiling_db is None else self.ceiling_db))[:, self._counted]
+    def _slopes(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Copy of the derivatives at the links with weight; 0 if the path loss is at the ceiling."""
+        at_ceiling = (path_loss >= (np.inf if self.ceiling_db is None else self.ceiling_db))[:, self._counted]
         slope = np.array(derivative[:, self._counted])
-        slope[flat] = 0.0
+        slope[at_ceiling] = 0.0
         return slope
 
     @cached_property
     def _counted(self) -> NDArray[np.int64] | slice:
-        """The links that count; a slice where all do, which copies nothing."""
+        """The links with weight; a slice if all have weight, which avoids copies."""
         counted = self.weight > 0
         return slice(None) if counted.all() else np.flatnonzero(counted)
 
     @cached_property
     def _scale(self) -> NDArray[np.float64]:
-        """Roots of the weights of the links that count, their mean square one."""
+        """Square roots of the links' weights, normalised to a mean square of one."""
         weight = self.weight[self._counted]
         return np.sqrt(weight * len(weight) / weight.sum())
 
     @cached_property
     def _ridge(self) -> NDArray[np.float64]:
-        """Standard deviation of the noise by that of the priors [q]; 0 where flat."""
+        """Ratio of the standard deviations of noise and priors [q]; 0 for a flat prior."""
         return self.noise_db / self.nuisance.prior
 
     @cached_property
@@ -277,32 +288,32 @@ def make_objective(
     ceiling_db: float | None = None,
     noise_db: float | None = None,
 ) -> Objective:
-    """The objective over some links.
+    """Make the objective over the calibration links.
 
     Args:
         links: All links.
-        reached: Which of them a path leads to [L].
-        calibrated: Which of them to calibrate on [L].
-        nuisance: The nuisance, over all links; none if None.
-        ceiling_db: Path loss that a link without a path counts as, [dB]; None leaves such links out.
-        noise_db: Standard deviation of a link's error [dB]; needed where a coefficient has a prior.
+        reached: Mask of the links with a path [L].
+        calibrated: Mask of the calibration links [L].
+        nuisance: The nuisance over all links; none if None.
+        ceiling_db: Path loss assigned to a link without a path [dB]; None leaves such links out.
+        noise_db: Standard deviation of a link's error [dB]; required if a coefficient has a prior.
 
     Returns:
         The objective.
 
     Raises:
-        InputError: No link is left, the nuisance is of other links, or a prior has no noise to be weighed against.
+        InputError: No link is left, the nuisance has another number of links, or a prior is given without noise_db.
     """
     counted = calibrated & (reached if ceiling_db is None else True)
     if not counted.any():
         raise InputError(
-            f"{links.source}: no path leads to any of {int(calibrated.sum())} links to calibrate on; raise "
+            f"{links.source}: no path reaches any of the {int(calibrated.sum())} calibration links; raise "
             "trace.max_depth, allow refraction or diffraction, or check that positions and scene share a frame"
         )
     nuisance = Nuisance(len(links)) if nuisance is None else nuisance
     if nuisance.num_links != len(links):
         raise InputError(
-            f"{links.source}: the nuisance is of {nuisance.num_links} links, must be of {len(links)}"
+            f"{links.source}: the nuisance has {nuisance.num_links} links, must have {len(links)}"
         )
     if noise_db is None and np.isfinite(nuisance.prior).any():
         raise InputError("nuisance: a prior needs noise_db, the standard deviation of a link's error [dB]")

@@ -1,4 +1,4 @@
-"""A study ready to be solved: what is minimized, over which search space."""
+"""A calibration problem: an opened study, its engine, its objective and its search space."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from calibray.study import Setup, Study
 
 
 class Evaluation(NamedTuple):
-    """What a problem answers to points of the search space.
+    """A problem evaluated at n points of the search space.
 
     Attributes:
-        value: What is minimized [n].
-        residuals: Weighted residuals, and a row for every prior [n, m].
-        jacobian: Their derivatives by the search coordinates [n, m, d], where asked for.
-        modelled: What the engine answered [n, L]; [n, 0] where it gave sums alone.
-        rmse_db: The RMSE of the links alone (paper eq. 1) [n].
-        stands_for: Number of residuals that those given stand for, with the same mean squares and products; None
-            where they are all.
+        value: The objective, including priors [n].
+        residuals: Weighted residuals, then one row per prior [n, m].
+        jacobian: Their derivatives by the search coordinates [n, m, d]; None if not requested.
+        modelled: The engine's values [n, L]; [n, 0] if it returned only sums.
+        rmse_db: The RMSE of the links only (paper eq. 1) [n].
+        represents: Number of full residuals that the m compressed ones represent, with the same mean squares and
+            products; None if the residuals are the full ones.
     """
 
     value: NDArray[np.float64]
@@ -38,44 +38,44 @@ class Evaluation(NamedTuple):
     jacobian: NDArray[np.float64] | None
     modelled: NDArray[np.float64]
     rmse_db: NDArray[np.float64]
-    stands_for: int | None = None
+    represents: int | None = None
 
     @property
     def num_rows(self) -> int:
-        """Number of residuals, or of those that the ones given stand for."""
-        return self.residuals.shape[1] if self.stands_for is None else self.stands_for
+        """Number of full residuals."""
+        return self.residuals.shape[1] if self.represents is None else self.represents
 
     @property
     def curvature(self) -> NDArray[np.float64]:
-        """Products of the derivatives, summed over all residuals [n, d, d]."""
+        """Products of the derivatives J'J, summed over all full residuals [n, d, d]."""
         slopes = self.slopes
         return np.einsum("nmi,nmj->nij", slopes, slopes) * (self.num_rows / slopes.shape[1])
 
     @property
     def slopes(self) -> NDArray[np.float64]:
-        """The Jacobian, where it was asked for.
+        """The Jacobian [n, m, d].
 
         Raises:
-            ValueError: It was not.
+            ValueError: The Jacobian was not requested.
         """
         if self.jacobian is None:
-            raise ValueError("the Jacobian was not asked for")
+            raise ValueError("the Jacobian was not requested; evaluate with derivatives=True")
         return self.jacobian
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A study ready to be solved.
+    """A calibration problem.
 
     Attributes:
         setup: The opened study.
         engine: The engine over all its links.
-        objective: What is minimized.
-        before: What the engine answers to the values before calibration [L].
-        observable: What is measured and modelled.
-        priors: What is known of the parameters beforehand.
-        faint: Links left out because they were not heard, or because the model expects them near the noise floor [L];
-            None where none is.
+        objective: The objective over the calibration links.
+        before: The engine's values for the initial parameters [L].
+        observable: The quantity that is measured and modelled.
+        priors: Priors of the parameters.
+        faint: Mask of the links left out because they are censored or predicted near the noise floor [L]; None if no
+            link is.
     """
 
     setup: Setup
@@ -88,58 +88,55 @@ class Problem:
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
-        """Set up a study's problem; runs the engine once, on the values before calibration.
+        """Set up a study's problem. This runs the engine once, for the initial parameters.
 
         Args:
             setup: The opened study.
             engine: The engine over all its links.
-            observable: What is measured and modelled.
-
-        Returns:
-            The problem.
+            observable: The quantity that is measured and modelled.
 
         Raises:
-            InputError: No link is left to calibrate on, or none of a group of which links are held out.
+            InputError: No calibration link is left, or a group has held-out links only.
         """
         study, links, held_out = setup.study, setup.links, setup.held_out
         before = observable.modelled(engine, engine.parameters.start[None])[0]
-        unheard = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
+        censored = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
         objective = make_objective(
             links,
             np.isfinite(before),
-            ~(held_out | unheard),
+            ~(held_out | censored),
             nuisance=study_nuisance(study, links),
             ceiling_db=study.objective.ceiling_db,
             noise_db=_noise(study, links),
         )
         objective = replace(objective, measured=observable.measured(links))
-        _check_groups(links, objective, held_out & ~unheard & np.isfinite(before))
-        priors = study.priors
-        return cls(setup, engine, objective, before, observable, priors, unheard if unheard.any() else None)
+        _check_groups(links, objective, held_out & ~censored & np.isfinite(before))
+        faint = censored if censored.any() else None
+        return cls(setup, engine, objective, before, observable, study.priors, faint)
 
     @property
-    def weighs_priors(self) -> bool:
-        """Whether the size of the noise matters to the optimum, as it does where anything has a prior."""
+    def has_priors(self) -> bool:
+        """Whether a parameter or a coefficient has a prior, so that the optimum depends on the noise level."""
         return bool(len(self.priors)) or bool(np.isfinite(self.objective.nuisance.prior).any())
 
     @property
     def parameters(self) -> Parameters:
-        """What a candidate's components stand for; they own the search space."""
+        """The parameters, which define the search space."""
         return self.engine.parameters
 
     @property
     def unknowns(self) -> int:
-        """Number of values that the links have to determine: parameters, and coefficients of the nuisance."""
+        """Number of unknowns that are fitted to the links: parameters and determined coefficients of the nuisance."""
         return len(self.parameters) + int(self.objective.determined.sum())
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom: links calibrated on, less the unknowns; below 1 they tell nothing of the errors' size."""
+        """Degrees of freedom: calibration links minus unknowns; below 1 the noise cannot be estimated."""
         return self.objective.num_counted - self.unknowns
 
     @property
     def differentiable(self) -> bool:
-        """Whether derivatives can be had."""
+        """Whether the engine gives derivatives of the observable."""
         return isinstance(self.engine, Differentiable) and self.observable.derivatives is not None
 
     def evaluate(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
@@ -147,10 +144,10 @@ class Problem:
 
         Args:
             points: The points [n, d].
-            derivatives: Whether the Jacobian is wanted.
+            derivatives: Whether to compute the Jacobian.
 
         Returns:
-            What an optimizer is told, and what the engine answered.
+            Objective, residuals and the engine's values.
         """
         parameters, objective, jacobian = self.parameters, self.objective, None
         candidates = parameters.from_search(points)
@@ -167,53 +164,59 @@ class Problem:
         return Evaluation(value, residuals, jacobian, modelled, rmse_db)
 
     def squares(self, points: NDArray[np.float64], derivatives: bool = False) -> Evaluation:
-        """The same for who asks nothing of residuals but their squares and products.
+        """Like `evaluate`, for methods that use only squares and products of the residuals.
 
-        Where links are parted into blocks, sums come from these, and as many residuals as there are parameters, and one
-        more, stand for those of all links.
+        If the engine holds the links in chunks, each chunk returns sums, and d + 1 compressed residuals represent those
+        of all links. Otherwise the residuals are the full ones.
 
         Args:
             points: The points [n, d].
-            derivatives: Whether the Jacobian is wanted.
+            derivatives: Whether to compute the Jacobian.
 
         Returns:
-            What an optimizer is told, if it is told no link's own residual.
+            The objective and residuals, compressed or full.
         """
-        if self._blocks is None:
+        if self._chunks is None:
             return self.evaluate(points, derivatives)
-        reduced, shares = self._blocks
+        reduced, shares = self._chunks
         parameters, objective = self.parameters, self.objective
         candidates = parameters.from_search(points)
-        found = total(reduced(candidates, derivatives), shares, len(objective.nuisance.columns))
-        products, links = objective.products(found)
+        sums = total(reduced(candidates, derivatives), shares, len(objective.nuisance.columns))
+        products, links = objective.products(sums)
         count, width = objective.num_rows, products.shape[1]
         unit = np.ones((len(points), width))
         if derivatives:
             unit[:, :-1] = parameters.search_slope(candidates)
         products = products * unit[:, :, None] * unit[:, None, :]
         if len(self.priors):
-            known = -objective.noise_db * self.priors.residuals(candidates)[..., None]
+            # Columns as in the sums: derivatives, then the gap, which is minus the residual.
+            prior_rows = -objective.noise_db * self.priors.residuals(candidates)[..., None]
             if derivatives:
                 slopes = objective.noise_db * self.priors.jacobian(candidates) * unit[:, None, :-1]
-                known = np.concatenate([slopes, known], axis=2)
-            products = products + known.transpose(0, 2, 1) @ known
-            count += known.shape[1]
+                prior_rows = np.concatenate([slopes, prior_rows], axis=2)
+            products = products + prior_rows.transpose(0, 2, 1) @ prior_rows
+            count += prior_rows.shape[1]
         lost = ~np.isfinite(products[:, -1, -1])
-        made = rows(np.where(lost[:, None, None], 0.0, products)) * np.sqrt(width / count)
-        value, rmse_db = (
-            np.where(lost, np.inf, np.sqrt(np.maximum(square, 0.0) / number))
-            for square, number in ((products[:, -1, -1], count), (links, objective.num_counted))
+        # The mean square over `width` compressed rows equals the mean square over all `count` rows.
+        compressed = rows(np.where(lost[:, None, None], 0.0, products)) * np.sqrt(width / count)
+        value = np.sqrt(np.maximum(products[:, -1, -1], 0.0) / count)
+        rmse_db = np.sqrt(np.maximum(links, 0.0) / objective.num_counted)
+        return Evaluation(
+            value=np.where(lost, np.inf, value),
+            residuals=-compressed[:, :, -1],
+            jacobian=compressed[:, :, :-1] if derivatives else None,
+            modelled=np.empty((len(points), 0)),
+            rmse_db=np.where(lost, np.inf, rmse_db),
+            represents=count,
         )
-        jacobian = made[:, :, :-1] if derivatives else None
-        return Evaluation(value, -made[:, :, -1], jacobian, np.empty((len(points), 0)), rmse_db, count)
 
     def modelled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the engine answers to points of the search space [n, d]: that of every link [n, L]."""
+        """The engine's values of all links [n, L] at points of the search space [n, d]."""
         return self.observable.modelled(self.engine, self.parameters.from_search(points))
 
     @cached_property
-    def _blocks(self) -> tuple[Reduced, list[Share]] | None:
-        """What reduces path loss to sums where it arises, where links are parted into blocks."""
+    def _chunks(self) -> tuple[Reduced, list[Share]] | None:
+        """The engine's chunks reduced to sums, with their shares; None if the engine has no chunks."""
         if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
             return None
         shares = self.objective.shares(self.engine.chunks)
@@ -222,14 +225,14 @@ class Problem:
     def residuals(
         self, candidates: NDArray[np.float64], modelled: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Weighted residuals of what is modelled, and a row for every prior.
+        """Weighted residuals of modelled values, then one row per prior of a parameter.
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
-            modelled: What is modelled for them [n, L].
+            modelled: The engine's values for them [n, L].
 
         Returns:
-            The rows [n, m].
+            The residuals [n, m].
         """
         residuals = self.objective.residuals(modelled)
         if not len(self.priors):
@@ -247,11 +250,11 @@ class Problem:
 
         Args:
             candidates: Parameter values [n, d], in the fields' units.
-            modelled: What is modelled for them [n, L].
-            slope: Its derivatives by the search coordinates [n, L, k], and after these d by any others.
+            modelled: The engine's values for them [n, L].
+            slope: Their derivatives by k variables [n, L, k]: the d search coordinates, then any others.
 
         Returns:
-            Derivatives of the rows by the same [n, m, k].
+            Derivatives of the residuals by the same variables [n, m, k].
         """
         jacobian = self.objective.jacobian(modelled, slope)
         if not len(self.priors):
@@ -263,7 +266,7 @@ class Problem:
 
 
 def study_nuisance(study: Study, links: Measurements) -> Nuisance:
-    """What a study lets shift the path loss: its offset, for all links or each group, and its further terms.
+    """Make the nuisance that a study declares: its offset, for all links or per group, and its further terms.
 
     Args:
         study: The study.
@@ -275,8 +278,8 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
     Raises:
         InputError: A term's column or groups cannot be used.
     """
-    terms = []
-    if (offset := study.offset) is not None:
+    terms, offset = [], study.offset
+    if offset is not None:
         terms.append(
             make_term(links, OFFSET, labels=links.group, bounds=offset.bounds, prior=offset.prior_db)
         )
@@ -287,17 +290,17 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
 
 
 def _noise(study: Study, links: Measurements) -> float:
-    """Standard deviation of a link's error at the mean weight [dB]: as stated, else 1 until it is estimated."""
+    """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated."""
     if study.noise.std_db is not None:
         return study.noise.std_db
     return 1.0 if study.links.std is None else float(1.0 / np.sqrt(links.weight.mean()))
 
 
 def _check_groups(links: Measurements, objective: Objective, judged: NDArray[np.bool_]) -> None:
-    """Refuse links held out whose offset no link to calibrate on could tell."""
+    """Refuse held-out links with a group offset that no calibration link determines."""
     unknown = links.group_index[judged & ~objective.supported]
     if len(unknown):
         raise InputError(
-            f"{links.source}: group {links.group_names[unknown.min()]!r} is held out but has no link to "
-            "calibrate its offset on; change [holdout] or [offset]"
+            f"{links.source}: group {links.group_names[unknown.min()]!r} has held-out links but no calibration "
+            "link to fit its offset to; change [holdout] or [offset]"
         )

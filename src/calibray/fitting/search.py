@@ -1,10 +1,11 @@
-"""The one loop (paper Fig. 1): ask for candidates, run the engine, compare with the measurements, tell."""
+"""The calibration loop (paper Fig. 1): propose candidates, run the engine, compare with the measurements, repeat."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -14,12 +15,21 @@ from calibray.engines.ledger.recorded import Recorded
 from calibray.engines.protocol import Engine
 from calibray.errors import InputError
 from calibray.fitting.problem import Evaluation, Problem
-from calibray.optimizers import Optimizer
+from calibray.optimizers import LeastSquares, Optimizer
 from calibray.support.blas_threads import single_blas_thread
 from calibray.support.progress import Progress
 
 Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]
-"""Points of the search space [n, d], and whether derivatives are wanted, to what an optimizer is told."""
+"""Evaluates points of the search space [n, d]; the flag requests derivatives."""
+
+SEARCHES: Final = 64
+"""Local searches for further minima if the method kept only its best."""
+
+BASINS: Final = 24
+"""Minimum number of minima that posterior sampling starts from."""
+
+RELEVANT: Final = 20.0
+"""Largest excess sum of squares of a relevant minimum, in noise variances; a likelihood ratio of exp(-10)."""
 
 
 def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[np.float64], Evaluation]]:
@@ -27,39 +37,58 @@ def rounds(optimizer: Optimizer, evaluate: Evaluate) -> Iterator[tuple[NDArray[n
 
     Args:
         optimizer: The optimizer.
-        evaluate: What it searches.
+        evaluate: Evaluates its candidates.
 
     Yields:
-        The candidates of every round [n, d], as points of the search space, and what was told of them.
+        The candidates of every round, as points of the search space [n, d], and their evaluation.
     """
     derivatives = optimizer.needs_derivatives()
-    # Matrices of surrogates are small: threads of the linear algebra cost more there than they give.
+    # The matrices of surrogates are small; BLAS threads cost more than they save.
     with single_blas_thread():
         while not optimizer.done:
             points = optimizer.ask()
-            told = evaluate(points, derivatives)
-            optimizer.tell(points, told.value, residuals=told.residuals, jacobian=told.jacobian)
-            yield points, told
+            evaluation = evaluate(points, derivatives)
+            optimizer.tell(
+                points, evaluation.value, residuals=evaluation.residuals, jacobian=evaluation.jacobian
+            )
+            yield points, evaluation
+
+
+def least_squares(problem: Problem, starts: int, x0: NDArray[np.float64]) -> LeastSquares:
+    """Run local least-squares searches on a problem.
+
+    Args:
+        problem: The problem.
+        starts: Number of random starting points.
+        x0: Further starting points [k, d].
+
+    Returns:
+        The finished optimizer.
+    """
+    optimizer = LeastSquares(*problem.parameters.search_bounds, starts=starts, x0=x0)
+    for _ in rounds(optimizer, problem.squares):
+        pass
+    return optimizer
 
 
 @dataclass
 class Trail:
-    """What a search has seen: every RT call in order, what the engine answered to the best, and its count.
+    """The record of a search: every RT call in order, the best candidate, and the cost.
 
     Attributes:
         candidates: The candidates in the fields' units, each [d].
-        rmse_db: Their RMSE [dB].
-        best_db: The RMSE of the best until then [dB].
-        iteration: The round that each belongs to.
-        seconds: When each was known, since the start [s].
+        rmse_db: RMSE of each candidate [dB].
+        best_db: RMSE of the best candidate up to each call [dB].
+        iteration: Round of each call.
+        seconds: Time of each call since the start [s].
         best: The best candidate [d].
-        best_modelled: What the engine answered to it [L].
+        best_modelled: The engine's values for it [L].
         best_rmse_db: Its RMSE [dB].
-        best_value: Its objective, which priors are part of [dB].
-        minima: Where the optimizer's searches ended, the best first, as points of the search space [k, d].
-        rt_calls: RT calls that the search spent, now or in an earlier run that left them in the ledger.
-        ledger_hits: How many of them the ledger answered.
-        modelled: What the engine answered to each [L], where it gives no derivatives: nothing else tells of it then.
+        best_value: Its objective, including priors [dB].
+        minima: Minima of the optimizer's searches, the best first, as points of the search space [k, d].
+        rt_calls: RT calls of the search, including calls of an earlier run that the ledger answered.
+        ledger_hits: Number of calls that the ledger answered.
+        modelled: The engine's values for each candidate [L], for an engine without derivatives only.
     """
 
     candidates: list[NDArray[np.float64]] = field(default_factory=list)
@@ -76,27 +105,29 @@ class Trail:
     ledger_hits: int = 0
     modelled: list[NDArray[np.float64]] = field(default_factory=list)
 
-    def add(self, candidates: NDArray[np.float64], told: Evaluation, iteration: int, now: float) -> None:
+    def add(
+        self, candidates: NDArray[np.float64], evaluation: Evaluation, iteration: int, seconds: float
+    ) -> None:
         """Record one round.
 
         Args:
             candidates: Its candidates in the fields' units [n, d].
-            told: What was told of them.
+            evaluation: Their evaluation.
             iteration: Its number, from 1.
-            now: Time since the start [s].
+            seconds: Time since the start [s].
         """
         self.candidates += list(candidates)
-        self.rmse_db += told.rmse_db.tolist()
-        self.iteration += [iteration] * len(told.value)
-        self.seconds += [now] * len(told.value)
-        for row, value in enumerate(told.value.tolist()):
+        self.rmse_db += evaluation.rmse_db.tolist()
+        self.iteration += [iteration] * len(evaluation.value)
+        self.seconds += [seconds] * len(evaluation.value)
+        for row, value in enumerate(evaluation.value.tolist()):
             if value < self.best_value:
-                self.best, self.best_modelled = candidates[row], told.modelled[row]
-                self.best_value, self.best_rmse_db = value, float(told.rmse_db[row])
+                self.best, self.best_modelled = candidates[row], evaluation.modelled[row]
+                self.best_value, self.best_rmse_db = value, float(evaluation.rmse_db[row])
             self.best_db.append(self.best_rmse_db)
 
     def history(self) -> pd.DataFrame:
-        """One row per RT call: number, iteration, RMSE, best so far, seconds since the start."""
+        """One row per RT call: number, iteration, RMSE, best RMSE so far, seconds since the start."""
         return pd.DataFrame(
             {
                 "call": np.arange(1, len(self.rmse_db) + 1),
@@ -117,24 +148,25 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         progress: Called with the stage "calibrating" after every round.
 
     Returns:
-        What it saw.
+        The record of the search.
 
     Raises:
         InputError: No candidate could be evaluated.
     """
     engine, trail = problem.engine, Trail()
     started, calls, hits = time.perf_counter(), engine.calls, _hits(engine)
-    # A method that takes residuals without derivatives makes a model of each.
-    each = "residuals" in optimizer.uses and not optimizer.needs_derivatives()
-    evaluate = problem.evaluate if each else problem.squares
-    for iteration, (points, told) in enumerate(rounds(optimizer, evaluate), start=1):
-        trail.add(problem.parameters.from_search(points), told, iteration, time.perf_counter() - started)
+    # A method that uses residuals but no derivatives models each residual, so it needs the full ones.
+    needs_all_residuals = "residuals" in optimizer.uses and not optimizer.needs_derivatives()
+    evaluate = problem.evaluate if needs_all_residuals else problem.squares
+    for iteration, (points, evaluation) in enumerate(rounds(optimizer, evaluate), start=1):
+        candidates = problem.parameters.from_search(points)
+        trail.add(candidates, evaluation, iteration, time.perf_counter() - started)
         if not problem.differentiable:
-            trail.modelled += list(told.modelled)
+            trail.modelled += list(evaluation.modelled)
         if progress is not None:
             progress("calibrating", len(trail.rmse_db), optimizer.budget)
     trail.ledger_hits = _hits(engine) - hits
-    # What the ledger answered was paid for before, so that a run ends alike however often it was started again.
+    # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits
     if not np.isfinite(trail.best_rmse_db):
         raise InputError(
@@ -148,3 +180,37 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
 
 def _hits(engine: Engine) -> int:
     return engine.hits if isinstance(engine, Recorded) else 0
+
+
+def find_minima(problem: Problem, trail: Trail) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Collect the known minima of a problem; search for more if the method kept only its best.
+
+    Args:
+        problem: The problem.
+        trail: Its finished search.
+
+    Returns:
+        Points of the search space, the calibrated one first [k, d], and their mean squares [k].
+    """
+    points = np.concatenate([problem.parameters.to_search(trail.best)[None], trail.minima])
+    if len(points) <= 2:
+        points = np.concatenate([points, least_squares(problem, SEARCHES, points).minima])
+    return points, problem.squares(points).value ** 2
+
+
+def relevant_minima(
+    minima: NDArray[np.float64], square: NDArray[np.float64], freedom: int
+) -> NDArray[np.float64]:
+    """Select the minima that can contribute to an interval.
+
+    Args:
+        minima: Minima [k, d].
+        square: Their mean squares [k].
+        freedom: Number of residuals minus unknowns.
+
+    Returns:
+        The relevant minima, the lowest first [j, d].
+    """
+    order = np.argsort(square, kind="stable")
+    order = order[square[order] <= square.min() * (1.0 + RELEVANT / freedom)]
+    return minima[order]

@@ -1,11 +1,13 @@
-"""Sums of squares and products over blocks of links: all that least squares asks of them, however many they are.
+"""Sums of squares and products over chunks of links: all that least squares needs, at a cost independent of the links.
 
-For gaps g (measured minus modelled path loss), derivatives J, weights w and a nuisance's design Z, a block gives
-[J g]' w [J g] and Z' w [J g]. Their sums over all blocks hold the normal equations with the nuisance eliminated: with
-best coefficients X of every column, (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
+For gaps g (measured minus modelled path loss), derivatives J, weights w and a nuisance's design Z, a chunk gives
+[J g]' w [J g] and Z' w [J g]. Their sums over all chunks give the normal equations with the nuisance eliminated. With
+A = [J g] and the best coefficients X of every column,
 
-From these a few rows are made that have the same squares and products as the residuals of all links, for methods that
-take residuals and use nothing else of them.
+    (A - Z X)' w (A - Z X) = A'wA - X'Z'wA - A'wZ X + X'Z'wZ X.
+
+From these products we build a few rows with the same squares and products as the residuals of all links, for methods
+that use residuals in no other way.
 """
 
 from __future__ import annotations
@@ -21,11 +23,11 @@ from scipy import sparse
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over links for candidates, k columns: the derivatives, if asked for, then the gap.
+    """Sums over links for n candidates and k columns: the derivatives, if requested, then the gap.
 
     Attributes:
-        square: Columns times weights times columns [n, k, k]; infinite where a candidate loses a link's path.
-        side: Design times weights times columns [n, q, k].
+        square: Columns' products A'wA [n, k, k]; infinite for the gap if a candidate loses the path of a link.
+        side: Products with the design Z'wA [n, q, k].
     """
 
     square: NDArray[np.float64]
@@ -35,15 +37,15 @@ class Sums:
 @final
 @dataclass(frozen=True, eq=False)
 class Share:
-    """What a block needs of the objective; called with its path loss, it gives its sums.
+    """The objective's data of one chunk of links; called with the path loss of the chunk, it returns its sums.
 
     Attributes:
-        links: Links of the block that count, by place in the block [m].
+        links: Indices within the chunk of its m links with weight [m].
         measured: Their measured path loss [m], [dB].
-        weight: Their weights, as in the objective [m].
-        design: The nuisance's columns that any of them has [m, c].
-        columns: Places of these columns among all [c].
-        ceiling_db: Path loss that a link without a path counts as [dB], if any.
+        weight: Their weights, normalised as in the objective [m].
+        design: The c columns of the nuisance with entries at these links [m, c].
+        columns: Indices of these columns in the nuisance [c].
+        ceiling_db: Path loss of a link without a path [dB]; None if there is no ceiling.
     """
 
     links: NDArray[np.int64]
@@ -54,37 +56,37 @@ class Share:
     ceiling_db: float | None
 
     def __call__(self, path_loss: NDArray[np.float64], derivative: NDArray[np.float64] | None = None) -> Sums:
-        """The sums of a block.
+        """Sum over the links of the chunk.
 
         Args:
-            path_loss: Modelled path loss of the block's links [n, l], [dB].
+            path_loss: Modelled path loss of the chunk's links [n, l], [dB].
             derivative: Its derivatives [n, l, d], [dB] per unit.
 
         Returns:
-            The sums; `side` of the block's own columns alone [n, c, k].
+            The sums; `side` for the columns of the chunk only [n, c, k].
         """
         loss = path_loss[:, self.links]
-        flat = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
+        at_ceiling = loss >= (np.inf if self.ceiling_db is None else self.ceiling_db)
         gap = self.measured - (loss if self.ceiling_db is None else np.minimum(loss, self.ceiling_db))
         lost = np.asarray(~np.isfinite(gap).all(axis=1))
-        column = np.where(lost[:, None], 0.0, gap)[..., None]
+        columns = np.where(lost[:, None], 0.0, gap)[..., None]
         if derivative is not None:
-            slope = np.where((flat | lost[:, None])[..., None], 0.0, derivative[:, self.links])
-            column = np.concatenate([slope, column], axis=2)
-        weighted = column * self.weight[:, None]
-        square = weighted.transpose(0, 2, 1) @ column
+            slope = np.where((at_ceiling | lost[:, None])[..., None], 0.0, derivative[:, self.links])
+            columns = np.concatenate([slope, columns], axis=2)
+        weighted = columns * self.weight[:, None]
+        square = weighted.transpose(0, 2, 1) @ columns
         square[lost, -1, -1] = np.inf
-        side = [self.design.T @ each for each in weighted] if len(self.columns) else []
-        shape = len(column), len(self.columns), column.shape[2]
-        return Sums(square, np.stack(side) if side else np.zeros(shape))
+        if not len(self.columns):
+            return Sums(square, np.zeros((len(columns), 0, columns.shape[2])))
+        return Sums(square, np.stack([self.design.T @ candidate for candidate in weighted]))
 
 
 def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
-    """The sums over all blocks, added in their order.
+    """Add the sums of all chunks, in their order.
 
     Args:
-        parts: The sums of every block.
-        shares: What they are sums of.
+        parts: The sums of every chunk.
+        shares: The shares that they were made by.
         columns: Number of columns of the nuisance q.
 
     Returns:
@@ -99,7 +101,7 @@ def total(parts: Sequence[Sums], shares: Sequence[Share], columns: int) -> Sums:
 
 
 def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows that have given squares and products.
+    """Rows with given squares and products.
 
     Args:
         products: Positive semidefinite matrices [n, k, k].
@@ -108,13 +110,13 @@ def rows(products: NDArray[np.float64]) -> NDArray[np.float64]:
         Matrices R with R'R = products [n, k, k].
 
     Example:
-        >>> found = rows(np.array([[[4.0, 2.0], [2.0, 1.0]]]))
-        >>> np.allclose(found[0].T @ found[0], [[4.0, 2.0], [2.0, 1.0]])
+        >>> root = rows(np.array([[[4.0, 2.0], [2.0, 1.0]]]))
+        >>> np.allclose(root[0].T @ root[0], [[4.0, 2.0], [2.0, 1.0]])
         True
     """
     size = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
-    # Columns of one size, or the small ones would drown in the rounding of the large.
+    # Scale to a unit diagonal first: otherwise small columns drown in the rounding of large ones.
     values, vectors = np.linalg.eigh(products / (size[:, :, None] * size[:, None, :]))
     root = np.sqrt(np.maximum(values, 0.0))
     return root[:, :, None] * vectors.transpose(0, 2, 1) * size[:, None, :]

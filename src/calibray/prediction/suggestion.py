@@ -179,7 +179,7 @@ class _Model:
         errors = Errors(self.noise_db, common, place)
         if shared is not None:
             errors = Errors(shared.own_db, common, place, shared.shared_db, shared.range_m)
-        following = objective.following(*self._replayed(self.engine))
+        following = objective.coefficient_slopes(*self._replayed(self.engine))
         return loss + coefficients @ design.T, (slope + design @ following)[: self.draws], errors
 
     def _engine(self, setup: Setup) -> Differentiable:

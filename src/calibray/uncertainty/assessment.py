@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from calibray.engines.observable import PATH_LOSS
 from calibray.fitting.cheap_replay import ReplayedModel
-from calibray.fitting.minima import BASINS, likely, minima
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import Trail
+from calibray.fitting.search import BASINS, Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
@@ -206,8 +205,8 @@ def _from_draws(
     spent: int,
     progress: Progress | None,
 ) -> Certainty:
-    known, square = minima(problem, trail)
-    lowest, least = likely(known, square, freedom), float(square.min())
+    known, square = find_minima(problem, trail)
+    lowest, least = relevant_minima(known, square, freedom), float(square.min())
     offset = forgotten_offset(problem, lowest, least, freedom)
     found = Certainty(
         free_offset_db=offset.offset_db, free_offset_error_db=offset.error_db, remarks=offset.remarks

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
-from calibray.fitting.minima import BASINS, likely
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import rounds
+from calibray.fitting.search import BASINS, relevant_minima, rounds
 from calibray.optimizers import LeastSquares
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE
@@ -66,7 +65,7 @@ def forgotten_offset(
     for _ in rounds(search, trial.squares):
         pass
     told = trial.squares(search.minima)
-    shifted = likely(search.minima, told.value**2, freedom - 1)
+    shifted = relevant_minima(search.minima, told.value**2, freedom - 1)
     best = int(np.argmin(told.value))
     offset = float(trial.objective.coefficients(trial.modelled(search.minima[best : best + 1]))[0, -1])
     left = float(told.value[best] ** 2)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from calibray import engines
 from calibray.engines.cluster.workers import Workers
 from calibray.errors import EngineError, InputError
-from calibray.fitting.noise_floor import heard
-from calibray.fitting.noise_level import weighed
+from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
@@ -69,7 +68,9 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = weighed(heard(Problem.of(setup, engines.make(setup, progress=progress, workers=workers))))
+    problem = estimate_noise(
+        leave_out_near_floor(Problem.of(setup, engines.make(setup, progress=progress, workers=workers)))
+    )
     return validated(problem, blocks, by, progress)
 
 
