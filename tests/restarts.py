@@ -215,14 +215,15 @@ def _remount(folder: Path, mode: str) -> None:
 
 
 def result(folder: Path) -> tuple:
-    """What a run found, without what is measured by the clock."""
+    """Result and history of a run, without times."""
     content = json.loads((folder / "out" / "result.json").read_text())
-    clocked = {"seconds", "trace_seconds", "profile_seconds", "cheap_seconds", "ledger_hits", "study_file"}
-    kept = {name: value for name, value in content.items() if name not in clocked}
+    del content["study_file"]
+    clock = {"seconds", "trace_seconds", "uncertainty_seconds", "cheap_seconds", "ledger_hits"}
+    content["cost"] = {name: value for name, value in content["cost"].items() if name not in clock}
     history = np.genfromtxt(folder / "out" / "result-history.csv", delimiter=",", skip_header=1)[
         :, :4
     ].tolist()
-    return kept, history
+    return content, history
 
 
 @contextmanager

@@ -198,12 +198,12 @@ def test_calls_are_shared_by_methods_seeds_bounds_and_measured_values(tmp_path):
     links = pd.read_csv(tmp_path / "links.csv")
     links.assign(path_loss_db=links.path_loss_db + 1).to_csv(tmp_path / "links.csv", index=False)
     measured_anew = calibrate(first, out=tmp_path / "out")
-    assert measured_anew.ledger_hits == 6
+    assert measured_anew.cost.ledger_hits == 6
     assert measured_anew.rmse_db != result.rmse_db
-    assert calibrate(first, seed=9, out=tmp_path / "out").ledger_hits == 0
+    assert calibrate(first, seed=9, out=tmp_path / "out").cost.ledger_hits == 0
     assert len(programs.calls(tmp_path)) == 1 + 6 + 6
     links.assign(rx_z=links.rx_z + 1).to_csv(tmp_path / "links.csv", index=False)
-    assert calibrate(first, out=tmp_path / "out").ledger_hits == 0
+    assert calibrate(first, out=tmp_path / "out").cost.ledger_hits == 0
 
 
 def problem(study: Study) -> str:

@@ -23,7 +23,7 @@ from calibray.reporting.link_map import footprints
 from calibray.scenes import Triangles, ground_heights
 from changed import changed
 
-LEGACY = Path(__file__).parents[1] / "legacy"
+GOLDEN = Path(__file__).parents[1] / "golden"
 TX = (0.0, 0.0, 12.0)
 AREA = (-57.0, -57.0, 63.0, 33.0)
 ORIGIN = (11.5755, 48.1374)
@@ -33,13 +33,14 @@ WEST = {"half": "west"}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """A stored calibration of two blocks and a tower, with an offset on either side."""
-    copy = tmp_path_factory.mktemp("map") / "legacy"
-    shutil.copytree(LEGACY, copy)
-    file = copy / "replay" / "result.json"
-    stored = json.loads(file.read_text().replace("/srv/calibray-legacy", str(copy)))
+    study = tmp_path_factory.mktemp("map") / "study"
+    shutil.copytree(GOLDEN / "study", study)
+    shutil.copytree(GOLDEN / "result", study / "out")
+    file = study / "out" / "result.json"
+    stored = json.loads(file.read_text()) | {"study_file": str(study / "study.toml")}
     stored["study"]["trace"] |= {"max_depth": 1, "diffraction": False, "samples": 4000}
     file.write_text(json.dumps(stored))
-    return copy / "replay"
+    return study / "out"
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from calibray.cli.app import app
 from calibray.study import Study
 
-LEGACY = Path(__file__).parents[1] / "legacy"
+STUDY = Path(__file__).parents[1] / "golden" / "study"
 WATCHED: Counter[str] = Counter()
 _inside: list[Path] = []
 
@@ -33,10 +33,8 @@ sys.addaudithook(_watch)
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A small study with every section, its folder watched, and nothing in the cache."""
-    shutil.copytree(LEGACY / "scene", tmp_path / "scene")
-    for name in ("links.csv", "replay.toml"):
-        shutil.copy(LEGACY / name, tmp_path)
-    study = tmp_path / "replay.toml"
+    shutil.copytree(STUDY, tmp_path, dirs_exist_ok=True)
+    study = tmp_path / "study.toml"
     study.write_text(study.read_text().replace("starts = 16, iterations = 50", "starts = 1, iterations = 2"))
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     WATCHED.clear()
@@ -59,10 +57,10 @@ def test_one_run_reads_each_file_and_makes_each_thing_once(folder, monkeypatch):
 
     counted(sionna.rt.Scene, "__init__", "Sionna scenes")
     counted(Study, "parameter_set", "parameters")
-    done = CliRunner().invoke(app, ["run", str(folder / "replay.toml"), "--out", str(folder / "out")])
+    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), "--out", str(folder / "out")])
     assert done.exit_code == 0, done.output
-    assert {name: WATCHED[name] for name in ("replay.toml", "links.csv", "scene.xml")} == {
-        "replay.toml": 1,
+    assert {name: WATCHED[name] for name in ("study.toml", "links.csv", "scene.xml")} == {
+        "study.toml": 1,
         "links.csv": 1,
         "scene.xml": 1,
     }
