@@ -50,7 +50,7 @@ class Reason:
     """
 
     kind: ReasonKind
-    values: dict[str, float | str] = field(default_factory=dict)
+    values: dict[str, float | int | str] = field(default_factory=dict)
     ranges: tuple[tuple[float, ...], ...] = ()
 
 
