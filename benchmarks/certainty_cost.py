@@ -25,7 +25,7 @@ from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
 from calibray.validation.choice import choose_model
-from calibray.validation.validate import validated
+from calibray.validation.validate import validate_problem
 
 LIMIT = 10.0
 
@@ -44,7 +44,7 @@ def costs(problem: Problem) -> dict[str, tuple[float, int]]:
         trail = timed("calibration", search, problem, choose(problem))
         timed("draws and verdicts", certainty, problem, trail)
         validation = timed(
-            "validation", validated, problem, None, None, None, {Model.CALIBRATED: trail.minima}
+            "validation", validate_problem, problem, None, None, None, {Model.CALIBRATED: trail.minima}
         )
         best = problem.parameters.to_search(trail.best)
         timed("choice", choose_model, problem, validation, best)

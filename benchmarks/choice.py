@@ -47,9 +47,8 @@ from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
-from calibray.validation.blocks import blocks as parted
-from calibray.validation.conformal import reach
-from calibray.validation.validate import models, validated
+from calibray.validation.held_out_statistics import interval_half_width, spatial_blocks
+from calibray.validation.validate import fit_models, validate_problem
 
 LEVEL = 0.9
 NOISE_DB = 4.0
@@ -86,13 +85,17 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     """
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
-    inner = validated(part)
-    found = models(part)
+    inner = validate_problem(part)
+    found = fit_models(part)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
     least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, Model.LOG_DISTANCE]).idxmin()
     errors[LEAST] = errors[str(least)]
     judged = errors[inner.chosen][np.isfinite(errors[inner.chosen])]
-    return inner.chosen, errors, (np.abs(judged) <= reach(inner.sizes(inner.chosen), LEVEL)).tolist()
+    return (
+        inner.chosen,
+        errors,
+        (np.abs(judged) <= interval_half_width(inner.sizes(inner.chosen), LEVEL)).tolist(),
+    )
 
 
 def nested(problem: Problem, count: int, uneven: int | None) -> tuple[Table, str]:
@@ -126,7 +129,7 @@ def blocks_of(problem: Problem, count: int, uneven: int | None = None) -> np.nda
     links, counted = problem.setup.links, np.flatnonzero(problem.objective.weight > 0)
     block, place = np.full(len(links), -1), links.rx[counted, :2]
     block[counted] = (
-        parted(place, count) if uneven is None else kmeans2(place, count, rng=uneven, minit="++")[1]
+        spatial_blocks(place, count) if uneven is None else kmeans2(place, count, rng=uneven, minit="++")[1]
     )
     return block
 
@@ -191,7 +194,9 @@ def without_a_chance(seed: int) -> tuple[int, str]:
     links, random = problem.setup.links, np.random.default_rng([seed, 5])
     law = INTERCEPT_DB + SLOPE_DB * np.log10(links.distance)
     measured = law + NOISE_DB * random.standard_normal(len(links))
-    return seed, validated(replace(problem, objective=replace(problem.objective, measured=measured))).sentence
+    return seed, validate_problem(
+        replace(problem, objective=replace(problem.objective, measured=measured))
+    ).sentence
 
 
 def said_without_a_chance(count: int, workers: int, out: Path | None) -> list[str]:

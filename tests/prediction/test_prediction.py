@@ -19,7 +19,7 @@ from calibray.prediction.suggestion import suggest
 from calibray.result.prediction_model import ResidualField
 from calibray.scenes import Triangles
 from calibray.uncertainty.residuals import shared_errors
-from calibray.validation.conformal import FEW, reach
+from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width
 from changed import changed
 
 FIELD = ResidualField(range_m=20.0, shared_db=3.0, own_db=1.0)
@@ -178,8 +178,8 @@ def test_of_many_errors_the_share_within_reach_is_what_was_asked_for():
     held = []
     for _ in range(300):
         errors = np.abs(random.standard_t(3, 61))
-        held.append(errors[-1] <= reach(np.sort(errors[:-1]), 0.9))
+        held.append(errors[-1] <= interval_half_width(np.sort(errors[:-1]), 0.9))
     assert np.mean(held) == pytest.approx(0.9, abs=0.05)
-    few = np.abs(random.standard_normal(FEW - 1))
-    assert reach(np.sort(few), 0.9) == pytest.approx(1.685 * np.sqrt(np.mean(few**2)), rel=1e-2)
-    assert reach(np.ones(50), 0.999) > 3.0
+    few = np.abs(random.standard_normal(FEWEST_FOR_RANKS - 1))
+    assert interval_half_width(np.sort(few), 0.9) == pytest.approx(1.685 * np.sqrt(np.mean(few**2)), rel=1e-2)
+    assert interval_half_width(np.ones(50), 0.999) > 3.0

@@ -26,8 +26,8 @@ from calibray.tables.text import render
 from calibray.uncertainty.assessment import PLACE, certainty
 from calibray.uncertainty.importance_sampling import sample
 from calibray.uncertainty.likelihood import Explaining
-from calibray.validation import variants as twins
-from calibray.validation.validate import validated
+from calibray.validation import variants
+from calibray.validation.validate import validate_problem
 
 CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
@@ -182,7 +182,7 @@ def test_the_noise_must_be_stated_where_it_cannot_be_estimated(tmp_path, noisy):
 def validation(folder, table, **sections):
     """Blocks held out in turn, on the paths traced once."""
     setup = Setup.open(planted.study(folder, table, **sections))
-    return validated(Problem.of(setup, planted.engine()), **({} if sections else {"blocks": 3}))
+    return validate_problem(Problem.of(setup, planted.engine()), **({} if sections else {"blocks": 3}))
 
 
 def test_calibration_helps_where_its_truth_was_planted(tmp_path, noisy):
@@ -204,14 +204,14 @@ def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
 def test_beside_known_minima_other_searches_are_soon_given_up(tmp_path, noisy, monkeypatch):
     """The same models, for fewer replays."""
     problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
-    known = {Model.CALIBRATED: twins.minima(problem, np.zeros((0, 3)), 64)}
+    known = {Model.CALIBRATED: variants.find_minima(problem, np.zeros((0, 3)), 64)}
 
     def judged():
         before = problem.engine.calls
-        return validated(problem, 3, known=known), problem.engine.calls - before
+        return validate_problem(problem, 3, known_minima=known), problem.engine.calls - before
 
     quick, spent = judged()
-    monkeypatch.setattr(twins, "NEARER", 1e6)
+    monkeypatch.setattr(variants, "NEARER", 1e6)
     patient, more = judged()
     assert spent < 0.95 * more
     for name, errors in patient.errors.items():

@@ -1,4 +1,4 @@
-"""A validation beside a result: read back whole, refused where damaged, shown by the report."""
+"""The validation of a result: stored and read back, refused if damaged, shown in the report."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def validation() -> Validation:
     return Validation(("west", "<b>", "east"), block, errors, random.uniform(0, 300, (LINKS, 3)))
 
 
-def test_what_is_written_is_read(validation, tmp_path):
+def test_a_validation_is_read_back(validation, tmp_path):
     write_validation(validation, tmp_path, validation.content())
     errors = read_validation(tmp_path, LINKS)
     assert errors is not None
-    found = Validation.of(errors)
-    assert found.table.to_numpy() == pytest.approx(validation.table.to_numpy(), abs=1e-3)
-    assert found.sentence == validation.sentence
-    assert found.labels == validation.labels
+    stored = Validation.of(errors)
+    assert stored.table.to_numpy() == pytest.approx(validation.table.to_numpy(), abs=1e-3)
+    assert stored.sentence == validation.sentence
+    assert stored.labels == validation.labels
     assert read_validation(tmp_path / "none", LINKS) is None
 
 
@@ -56,7 +56,7 @@ def test_what_is_written_is_read(validation, tmp_path):
         (lambda content: content.update(links=[]), "is no validation"),
     ],
 )
-def test_a_damaged_one_is_refused(validation, tmp_path, change, words):
+def test_a_damaged_validation_is_refused(validation, tmp_path, change, words):
     write_validation(validation, tmp_path, validation.content())
     content = json.loads((tmp_path / VALIDATION_FILE).read_text())
     change(content)
@@ -65,7 +65,7 @@ def test_a_damaged_one_is_refused(validation, tmp_path, change, words):
         read_validation(tmp_path, LINKS)
 
 
-def test_the_report_shows_it(validation):
+def test_the_report_shows_the_validation(validation):
     result, shown = made_up(LINKS, 12)
     result = replace(result, held_out=validation)
     figures = examined(result)
@@ -82,7 +82,7 @@ def test_the_report_shows_it(validation):
     assert "calibray validate STUDY" in page(replace(result, held_out=None), shown, {})
 
 
-def test_saving_a_result_leaves_none_of_an_earlier_one(validation, tmp_path: Path):
+def test_saving_a_result_removes_an_earlier_validation(validation, tmp_path: Path):
     write_validation(validation, tmp_path, validation.content())
     result, _ = made_up(LINKS, 12)
     replace(result, held_out=None).save(tmp_path)

@@ -1,4 +1,4 @@
-"""Blocks, the sentence, and the table of held-out errors, on made-up errors whose size is known."""
+"""Blocks, the judgement, and the table of held-out errors, on synthetic errors of known size."""
 
 from __future__ import annotations
 
@@ -7,109 +7,110 @@ import pytest
 
 from calibray.result.held_out import Model
 from calibray.result.wording import judgement_text
-from calibray.validation.blocks import blocks
-from calibray.validation.judgement import MOST_CLUSTERS, compare
+from calibray.validation.held_out_statistics import MOST_CLUSTERS, compare, spatial_blocks
 from calibray.validation.validation import Validation
 
 
-def places(count, seed=0):
+def positions(count, seed=0):
     return np.random.default_rng(seed).uniform(0, 500, (count, 3))
 
 
 def test_blocks_are_even_and_compact():
-    position = places(103)
-    found = blocks(position, 8)
-    assert np.ptp(np.bincount(found, minlength=8)) <= 7
-    middle = [position[found == k].mean(axis=0) for k in range(8)]
-    spread = np.mean([np.linalg.norm(position[found == k] - middle[k], axis=1).mean() for k in range(8)])
+    position = positions(103)
+    block = spatial_blocks(position, 8)
+    assert np.ptp(np.bincount(block, minlength=8)) <= 7
+    middle = [position[block == k].mean(axis=0) for k in range(8)]
+    spread = np.mean([np.linalg.norm(position[block == k] - middle[k], axis=1).mean() for k in range(8)])
     assert spread < 0.7 * np.linalg.norm(position - position.mean(axis=0), axis=1).mean()
-    assert np.unique(blocks(np.zeros((5, 3)), 9)).tolist() == [0, 1, 2, 3, 4]
+    assert np.unique(spatial_blocks(np.zeros((5, 3)), 9)).tolist() == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(
-    ("mine", "other", "words"),
+    ("model_db", "law_db", "words"),
     [(2.0, 5.0, "Calibration helped"), (5.0, 2.0, "Calibration did not help")],
 )
-def test_the_sentence_names_the_best_rival_and_the_difference(mine, other, words):
+def test_the_judgement_names_the_best_baseline_and_the_difference(model_db, law_db, words):
     random = np.random.default_rng(1)
-    errors = {"worst": 9.0 * random.normal(size=80), "law": other * random.normal(size=80)}
-    found = compare(mine * random.normal(size=80), errors, places(80))
-    sentence = judgement_text(found)
+    errors = {"worst": 9.0 * random.normal(size=80), "law": law_db * random.normal(size=80)}
+    judgement = compare(model_db * random.normal(size=80), errors, positions(80))
+    sentence = judgement_text(judgement)
     assert sentence.startswith(words)
     assert "than law, the best baseline" in sentence
-    assert f"{abs(found.gain_db):.2f} dB" in sentence
-    assert found.gain_db == pytest.approx(other - mine, abs=1.0)
+    assert f"{abs(judgement.gain_db):.2f} dB" in sentence
+    assert judgement.gain_db == pytest.approx(law_db - model_db, abs=1.0)
 
 
-def test_chance_is_seldom_called_help():
+def test_a_difference_by_chance_is_rarely_called_help():
     random = np.random.default_rng(2)
-    found = [
-        compare(random.normal(size=40), {"law": random.normal(size=40)}, places(40)).helped
+    helped = [
+        compare(random.normal(size=40), {"law": random.normal(size=40)}, positions(40)).helped
         for _ in range(400)
     ]
-    assert np.mean(found) < 0.05  # 0.025 by design, and 0.023 is three standard errors
+    assert np.mean(helped) < 0.05  # 0.025 by design, and 0.023 is three standard errors
 
 
-def test_errors_that_neighbours_share_make_the_difference_less_sure():
-    random, position = np.random.default_rng(3), places(160)
-    shared = random.normal(size=40)[blocks(position, 40)]
-    own, law = random.normal(size=(2, 160))
-    alone = compare(own, {"law": law}, position).error_db
-    together = compare(own, {"law": shared}, position).error_db
-    assert together > 1.2 * alone
+def test_errors_that_neighbours_share_make_the_difference_less_certain():
+    random, position = np.random.default_rng(3), positions(160)
+    shared = random.normal(size=40)[spatial_blocks(position, 40)]
+    model, law = random.normal(size=(2, 160))
+    independent_db = compare(model, {"law": law}, position).error_db
+    shared_db = compare(model, {"law": shared}, position).error_db
+    assert shared_db > 1.2 * independent_db
 
 
-def test_many_links_are_resampled_in_no_more_clusters_than_memory_holds():
-    own, law = np.random.default_rng(6).normal(size=(2, 6000))
-    found = compare(own, {"law": 1.1 * law}, places(6000))
-    assert found.clusters == MOST_CLUSTERS
-    assert found.error_db == pytest.approx(np.sqrt(1 + 1.1**2) / np.sqrt(2 * 6000), rel=0.15)
+def test_many_links_are_resampled_in_a_limited_number_of_clusters():
+    model, law = np.random.default_rng(6).normal(size=(2, 6000))
+    judgement = compare(model, {"law": 1.1 * law}, positions(6000))
+    assert judgement.clusters == MOST_CLUSTERS
+    assert judgement.error_db == pytest.approx(np.sqrt(1 + 1.1**2) / np.sqrt(2 * 6000), rel=0.15)
 
 
-def made(scales, count=400, seed=4):
-    """Errors of models of known size."""
+def synthetic_validation(scales, count=400, seed=4):
+    """A validation of models whose errors have known standard deviations [dB]."""
     random = np.random.default_rng(seed)
-    position = places(count)
+    position = positions(count)
     errors = {name: size * random.normal(size=count) for name, size in scales.items()}
-    return Validation(tuple("abcd"), blocks(position[:, :2], 4), errors, position)
+    return Validation(tuple("abcd"), spatial_blocks(position[:, :2], 4), errors, position)
 
 
-def test_the_table_tells_size_density_and_coverage():
-    found = made({Model.INITIAL: 6.0, Model.CALIBRATED: 3.0, Model.LOG_DISTANCE: 8.0})
-    row = found.table.loc[Model.CALIBRATED]
+def test_the_table_has_rmse_log_density_and_coverage():
+    validation = synthetic_validation({Model.INITIAL: 6.0, Model.CALIBRATED: 3.0, Model.LOG_DISTANCE: 8.0})
+    row = validation.table.loc[Model.CALIBRATED]
     assert row.rmse_db == pytest.approx(3.0, rel=0.1)
     assert row.coverage == pytest.approx(0.9, abs=0.04)
     assert row.log_density == pytest.approx(-0.5 - np.log(3 * np.sqrt(2 * np.pi)), abs=0.1)
-    assert found.best == Model.CALIBRATED
-    assert found.nested_rmse_db == pytest.approx(row.rmse_db)
-    assert found.sentence.startswith("Calibration helped")
-    assert found.content()["models"][Model.LOG_DISTANCE]["rmse_db"] == pytest.approx(8.0, rel=0.1)
-    assert "4 blocks held out in turn, 400 links" in repr(found)
+    assert validation.best == Model.CALIBRATED
+    assert validation.nested_rmse_db == pytest.approx(row.rmse_db)
+    assert validation.sentence.startswith("Calibration helped")
+    assert validation.content()["models"][Model.LOG_DISTANCE]["rmse_db"] == pytest.approx(8.0, rel=0.1)
+    assert "4 blocks held out in turn, 400 links" in repr(validation)
 
 
-def test_intervals_taken_from_other_blocks_do_not_cover_one_that_differs():
-    """Negative control: coverage is earned."""
-    found = made({Model.INITIAL: 6.0, Model.CALIBRATED: 3.0})
-    wide = np.where(found.block == 0, 4.0, 1.0) * found.errors[Model.CALIBRATED]
-    odd = Validation(found.labels, found.block, {**found.errors, Model.CALIBRATED: wide}, found.position)
-    inside = odd.table.loc[Model.CALIBRATED, "coverage"]
-    assert inside < 0.85
+def test_intervals_from_other_blocks_do_not_cover_a_block_that_differs():
+    """Negative control: coverage can fail."""
+    validation = synthetic_validation({Model.INITIAL: 6.0, Model.CALIBRATED: 3.0})
+    wide = np.where(validation.block == 0, 4.0, 1.0) * validation.errors[Model.CALIBRATED]
+    uneven = Validation(
+        validation.labels,
+        validation.block,
+        {**validation.errors, Model.CALIBRATED: wide},
+        validation.position,
+    )
+    assert uneven.table.loc[Model.CALIBRATED, "coverage"] < 0.85
 
 
-def test_choosing_by_the_other_blocks_costs_where_models_take_turns():
-    found = made({Model.INITIAL: 3.0, Model.CALIBRATED: 3.0})
-    turns = found.block % 2 == 0
-    errors = {Model.INITIAL: np.where(turns, 1.0, 9.0), Model.CALIBRATED: np.where(turns, 9.0, 1.0)}
-    taken = Validation(found.labels, found.block, errors, found.position)
-    assert taken.nested_rmse_db >= taken.table["rmse_db"].min() - 1e-9
-    assert taken.nested_rmse_db == pytest.approx(
-        9.0
-    )  # each block speaks for the model that fails on the others
+def test_choosing_by_the_other_blocks_costs_accuracy_where_blocks_disagree():
+    validation = synthetic_validation({Model.INITIAL: 3.0, Model.CALIBRATED: 3.0})
+    even = validation.block % 2 == 0
+    errors = {Model.INITIAL: np.where(even, 1.0, 9.0), Model.CALIBRATED: np.where(even, 9.0, 1.0)}
+    opposed = Validation(validation.labels, validation.block, errors, validation.position)
+    assert opposed.nested_rmse_db >= opposed.table["rmse_db"].min() - 1e-9
+    # The other blocks always choose the model that fails on the block that is held out.
+    assert opposed.nested_rmse_db == pytest.approx(9.0)
 
 
-def test_calibration_has_to_earn_its_place():
-    """A little better than the materials as they were says nothing; much better does."""
-    near = made(
+def test_a_calibrated_model_is_chosen_only_if_it_is_clearly_better():
+    near = synthetic_validation(
         {
             Model.INITIAL: 3.0,
             Model.PRIOR: 2.98,
@@ -129,7 +130,7 @@ def test_calibration_has_to_earn_its_place():
     )
     assert near.choice in near.summary()[2]
     assert near.content()["chosen"] == Model.INITIAL
-    clear = made(
+    clear = synthetic_validation(
         {
             Model.INITIAL: 6.0,
             Model.PRIOR: 5.0,
@@ -142,21 +143,22 @@ def test_calibration_has_to_earn_its_place():
     assert clear.choice == "Predictions use the model 'calibrated', the best on held-out blocks."
 
 
-def test_the_law_is_chosen_where_no_twin_comes_near():
-    far = made({Model.INITIAL: 9.0, Model.CALIBRATED: 8.0, Model.LOG_DISTANCE: 2.0})
+def test_the_log_distance_model_is_chosen_where_it_is_clearly_better():
+    far = synthetic_validation({Model.INITIAL: 9.0, Model.CALIBRATED: 8.0, Model.LOG_DISTANCE: 2.0})
     assert far.chosen == Model.LOG_DISTANCE
     assert far.choice == "Predictions use the model 'log-distance', the best on held-out blocks."
-    near = made({Model.INITIAL: 9.0, Model.CALIBRATED: 2.1, Model.LOG_DISTANCE: 2.0}, count=40, seed=3)
+    near = synthetic_validation(
+        {Model.INITIAL: 9.0, Model.CALIBRATED: 2.1, Model.LOG_DISTANCE: 2.0}, count=40, seed=3
+    )
     assert near.table.loc[Model.LOG_DISTANCE, "rmse_db"] < near.table.loc[Model.CALIBRATED, "rmse_db"]
     assert near.chosen == Model.CALIBRATED
     assert "it uses the scene and is worse than 'log-distance'" in near.choice
 
 
-def test_choosing_by_the_best_alone_is_worse_where_calibration_is():
-    """A few links seldom tell models that are nearly as good: what the rule is for."""
-    size, ruled, leading = {Model.INITIAL: 3.0, Model.CALIBRATED: 3.3, Model.SLOPE: 3.6}, [], []
+def test_the_one_standard_error_rule_beats_the_lowest_rmse_on_few_links():
+    rmse_db, by_rule, by_rmse = {Model.INITIAL: 3.0, Model.CALIBRATED: 3.3, Model.SLOPE: 3.6}, [], []
     for seed in range(60):
-        found = made(size, count=24, seed=seed)
-        ruled.append(size[found.chosen])
-        leading.append(size[found.best])
-    assert np.mean(ruled) < np.mean(leading) - 0.05
+        validation = synthetic_validation(rmse_db, count=24, seed=seed)
+        by_rule.append(rmse_db[validation.chosen])
+        by_rmse.append(rmse_db[validation.best])
+    assert np.mean(by_rule) < np.mean(by_rmse) - 0.05

@@ -27,8 +27,8 @@ from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.uncertainty.assessment import certainty
-from calibray.validation.validate import check_engine, validated
-from calibray.validation.variants import NOTHING
+from calibray.validation.validate import check_engine, validate_problem
+from calibray.validation.variants import NO_MINIMA
 
 FEW_MINIMA: Final = 2
 """Minima that a method without multi-start keeps: not enough to start a validation from."""
@@ -102,8 +102,8 @@ def calibrate(
     problem, trail, gap = retrace(problem, trail, progress)
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
-    minima = {Model.CALIBRATED: trail.minima} if len(trail.minima) > FEW_MINIMA else NOTHING
-    validation = validated(problem, progress=progress, known=minima) if by_blocks else None
+    minima = {Model.CALIBRATED: trail.minima} if len(trail.minima) > FEW_MINIMA else NO_MINIMA
+    validation = validate_problem(problem, progress=progress, known_minima=minima) if by_blocks else None
     result = outcome(problem, trail, gap, assessment, validation, enclosed, timing, cheap)
     if out is not None:
         # The folder was checked before the work: a file that appeared since must not cost the result.

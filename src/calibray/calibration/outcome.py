@@ -32,7 +32,7 @@ from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residuals import shared_errors
 from calibray.validation.baselines import log_distance
 from calibray.validation.choice import choose_model
-from calibray.validation.judgement import compare
+from calibray.validation.held_out_statistics import compare
 from calibray.validation.validation import Validation
 
 FEWEST_HELD_OUT: Final = 8

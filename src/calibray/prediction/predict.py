@@ -23,7 +23,7 @@ from calibray.result.prediction_model import PredictionModel
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
-from calibray.validation.conformal import FEW, reach
+from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width
 
 TRANSMITTER: Final = "transmitter"
 """What a term of the model that was chosen has an offset for each of, without a column that says so."""
@@ -184,8 +184,8 @@ def interval(
     deviation = np.sqrt((1.0 - share) * size**2 + share * own**2 + variance)
     factor = (
         float(stdtrit(freedom, (1 + level) / 2))
-        if len(sizes) < FEW
-        else reach(sizes, level) / max(size, 1e-9)
+        if len(sizes) < FEWEST_FOR_RANKS
+        else interval_half_width(sizes, level) / max(size, 1e-9)
     )
     said = np.where(shift.spread > 0, f"{basis}, group never measured", basis)
     said = np.where(share > BESIDE, np.char.add(said, ", beside measured links"), said)

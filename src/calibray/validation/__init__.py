@@ -1,1 +1,1 @@
-"""Validation: models judged on links that they were not fitted to."""
+"""Validation: accuracy of models on links that they were not fitted to."""

@@ -1,4 +1,4 @@
-"""Calibrate again without each block of links in turn, by several models, and judge them by the block left out."""
+"""Refit several models without each block of links in turn, and compare them on the block that was held out."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import kriging, log_distance
-from calibray.validation.blocks import blocks as parted
+from calibray.validation.held_out_statistics import spatial_blocks
 from calibray.validation.validation import Validation
-from calibray.validation.variants import NOTHING, fitted, predicted
+from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
 
-BLOCKS: Final = 4
-"""Spatial blocks where the study names none."""
+DEFAULT_BLOCKS: Final = 4
+"""Number of spatial blocks where the study gives none."""
 
 MOST_BLOCKS: Final = 100
-"""The largest number of spatial blocks, here as in a study."""
+"""Largest number of spatial blocks, as in a study."""
 
 TX: Final = "tx"
-"""Label of a link's transmitter where the table has no such column: its position."""
+"""Name of the transmitter's position as a label, where the table has no such column."""
 
 
 def validate(
@@ -43,39 +43,39 @@ def validate(
     progress: Progress | None = None,
     tracer: TracerFactory = SIONNA,
 ) -> Validation:
-    """Judge models by links that they were not fitted to: leave one block out.
+    """Compare models on held-out links: each block of links is left out in turn and predicted.
 
     Args:
         study: The study, opened or not; on the engine "replay".
-        blocks: Number of spatial blocks, each held out in turn; the study's, or 4, if None and `by` is None.
-        by: Column whose labels are held out in turn; "tx" for the place of the transmitter.
-        workers: Where blocks of links live that are traced and replayed together (`engines.open_workers`).
+        blocks: Number of spatial blocks, each held out in turn; if None and `by` is None, the study's, or 4.
+        by: Column whose labels are held out in turn; "tx" for the position of the transmitter.
+        workers: Workers that trace and replay chunks of links (`engines.open_workers`); this process if None.
         progress: Called with the stages "tracing" and "validating".
-        tracer: What opens the scene in a ray tracer; a study that is open brings its own.
+        tracer: Opens the scene in a ray tracer; an opened study brings its own.
 
     Returns:
-        Held-out errors of every model, with their table and one sentence.
+        Held-out errors of every model, with a table and a conclusion.
 
     Raises:
-        InputError: The study is on another engine, or cannot be parted so.
+        InputError: The study runs on another engine, or its links cannot be divided into these blocks.
         EngineError: The engine failed.
     """
     setup = study if isinstance(study, Setup) else Setup.open(study, tracer)
     if blocks is not None and by is not None:
         raise InputError("validate: give blocks or by, not both")
     if blocks is not None and not 2 <= blocks <= MOST_BLOCKS:
-        raise InputError(f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}: each takes a calibration")
+        raise InputError(
+            f"validate: blocks = {blocks}; must be 2 to {MOST_BLOCKS}, since each takes a calibration"
+        )
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = estimate_noise(
-        leave_out_near_floor(Problem.of(setup, engines.make(setup, progress=progress, workers=workers)))
-    )
-    return validated(problem, blocks, by, progress)
+    problem = Problem.of(setup, engines.make(setup, progress=progress, workers=workers))
+    return validate_problem(estimate_noise(leave_out_near_floor(problem)), blocks, by, progress)
 
 
 def check_engine(study: Study) -> None:
-    """Refuse an engine on which calibrating a dozen times over would be too dear.
+    """Refuse an engine on which a dozen calibrations would be too expensive.
 
     Args:
         study: The study.
@@ -85,99 +85,100 @@ def check_engine(study: Study) -> None:
     """
     if study.engine.name != "replay":
         raise InputError(
-            f"{study.path}: blocks held out in turn take a calibration each, and the engine {study.engine.name!r} is "
-            "too dear; set engine.name to 'replay', or hold links out by where"
+            f"{study.path}: each block that is held out takes a calibration, which is too expensive on the engine "
+            f"{study.engine.name!r}; set engine.name to 'replay', or hold links out by [holdout] where"
         )
 
 
-def validated(
+def validate_problem(
     problem: Problem,
     blocks: int | None = None,
     by: str | None = None,
     progress: Progress | None = None,
-    known: Mapping[Model, NDArray[np.float64]] = NOTHING,
+    known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA,
 ) -> Validation:
-    """Judge models on a problem that is set up, over all its links.
+    """Compare models on all links of a problem, each block held out in turn.
 
     Args:
         problem: The problem.
         blocks: Number of spatial blocks; the study's if None and `by` is None.
         by: Column whose labels are held out in turn.
         progress: Called with the stage "validating".
-        known: Minima of the study's own model over all links, under its name [k, d]; looked for if absent.
+        known_minima: Minima of the study's own model over all links, under its name [k, d]; searched for if absent.
 
     Returns:
         Held-out errors of every model.
 
     Raises:
-        InputError: The links cannot be parted so.
+        InputError: The links cannot be divided into these blocks.
     """
     links, objective = problem.setup.links, problem.objective
-    block, labels = _parted(problem, blocks, by)
-    known = {name: points for name, (_, points) in fitted(problem, known).items()}
+    block, labels = _divide(problem, blocks, by)
+    all_link_minima = {name: minima for name, (_, minima) in fit_variants(problem, known_minima).items()}
     errors: dict[str, NDArray[np.float64]] = {}
     for number in range(len(labels)):
-        here = block == number
-        part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
-        for name, model in models(part, known).items():
-            errors.setdefault(name, np.full(len(links), np.nan))[here] = (model - objective.measured)[here]
+        held_out = block == number
+        weight = np.where(held_out, 0.0, objective.weight)
+        part = replace(problem, objective=replace(objective, weight=weight))
+        for name, modelled in fit_models(part, all_link_minima).items():
+            residual = errors.setdefault(name, np.full(len(links), np.nan))
+            residual[held_out] = (modelled - objective.measured)[held_out]
         if progress is not None:
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
-    whole = {name: each for name, each in errors.items() if np.isfinite(each[judged]).all()}
-    position = np.where(judged, block, -1)
-    return Validation(labels, position, whole, links.rx)
+    complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
+    return Validation(labels, np.where(judged, block, -1), complete, links.rx)
 
 
-def _parted(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Block of every link, -1 where it does not count, and the blocks' labels."""
+def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Block of every link, -1 where it has no weight, and the blocks' labels."""
     links, holdout = problem.setup.links, problem.setup.study.holdout
     if count is None and by is None and holdout is not None:
         count, by = holdout.blocks, holdout.by
     counted = problem.objective.weight > 0
     block = np.full(len(links), -1, dtype=np.int64)
     if by is None:
-        count = BLOCKS if count is None else count
-        block[counted] = parted(links.rx[counted, :2], count)
+        count = DEFAULT_BLOCKS if count is None else count
+        block[counted] = spatial_blocks(links.rx[counted, :2], count)
         labels = tuple(str(number + 1) for number in range(count))
     else:
         if by == TX and by not in links.frame:
-            given = np.unique(links.tx, axis=0, return_inverse=True)[1].reshape(-1).astype(str)
+            link_labels = np.unique(links.tx, axis=0, return_inverse=True)[1].reshape(-1).astype(str)
         else:
-            given = links.table.labels(by)
-        names, place = np.unique(given[counted], return_inverse=True)
-        block[counted], labels = place, tuple(map(str, names))
+            link_labels = links.table.labels(by)
+        names, block[counted] = np.unique(link_labels[counted], return_inverse=True)
+        labels = tuple(map(str, names))
     fewest = int(counted.sum()) - int(np.bincount(block[counted]).max())
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= problem.unknowns:
         raise InputError(
-            f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} to calibrate "
-            f"{problem.unknowns} unknowns on; name two blocks or more, of fewer links each"
+            f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} links to calibrate "
+            f"{problem.unknowns} unknowns; use at least two blocks with fewer links each"
         )
     return block, labels
 
 
-def models(
-    part: Problem, known: Mapping[Model, NDArray[np.float64]] = NOTHING
+def fit_models(
+    part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
 ) -> dict[str, NDArray[np.float64]]:
-    """Every model, fitted to the links that count.
+    """Fit every model to the links that have a weight, and predict all links.
 
     Args:
-        part: The problem, other links without weight.
-        known: Points that searches start from beside their own, by name of the model [k, d].
+        part: The problem; held-out links have weight 0.
+        known_minima: Additional starting points of the searches, by name of the model [k, d].
 
     Returns:
-        Path loss at all links by name of the model [L], [dB]; NaN where nothing could be kriged.
+        Path loss at all links by name of the model [links], [dB]; NaN where kriging is impossible.
     """
     setup, objective = part.setup, part.objective
-    found = {
-        name: predicted(variant.objective, variant.modelled(points[:1])[0])
-        for name, (variant, points) in fitted(part, known).items()
+    path_loss_db = {
+        name: add_nuisance(variant.objective, variant.modelled(minima[:1])[0])
+        for name, (variant, minima) in fit_variants(part, known_minima).items()
     }
-    found[Model.LOG_DISTANCE] = log_distance(setup.links, objective, setup.study.scene.frequency)
-    for name, law in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
+    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, setup.study.scene.frequency)
+    for name, trend in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
         try:
-            found[name] = kriging(setup.links, objective, found[law])
+            path_loss_db[name] = kriging(setup.links, objective, path_loss_db[trend])
         except (InputError, EngineError):
-            # Too few or too many links, or all at one place: nothing to krige.
-            found[name] = np.full(len(setup.links), np.nan)
-    return found
+            # There are too few or too many links, or all have the same position.
+            path_loss_db[name] = np.full(len(setup.links), np.nan)
+    return path_loss_db

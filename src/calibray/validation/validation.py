@@ -1,9 +1,9 @@
 """Validation: accuracy of several models on blocks of links, each held out in turn, and the choice between them.
 
 Predictions use the initial materials with fitted offsets until another model is better by more than the bootstrap error
-of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984): first the
-best of the calibrated models, then the log-distance model, which knows nothing of the scene. A few blocks hardly
-distinguish models of similar accuracy, and a fitted model loses more where its fit does not transfer.
+of the difference (the one-standard-error rule, L. Breiman et al., Classification and Regression Trees, 1984). The best
+calibrated model is tried first, then the log-distance model, which uses no scene. A few blocks hardly distinguish
+models of similar accuracy, and a fitted model loses more where its fit does not transfer.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from calibray.result.held_out import BASELINES, FITTED, HeldOutErrors, Judgement, Model
 from calibray.result.wording import choice_text, judgement_text
 from calibray.tables import Column, Table, display, numbers
-from calibray.validation.conformal import reach
-from calibray.validation.judgement import compare
+from calibray.validation.held_out_statistics import compare, interval_half_width
 
 
 @final
@@ -29,7 +28,7 @@ from calibray.validation.judgement import compare
 class Validation(HeldOutErrors):
     """Held-out errors of several models on the same links, and what follows from them.
 
-    The error expected in a block is that on the other blocks, so that no block judges itself.
+    The error expected in a block is estimated on the other blocks, so that no block judges itself.
     """
 
     @classmethod
@@ -116,15 +115,15 @@ class Validation(HeldOutErrors):
             name: The model.
 
         Returns:
-            They, ascending [dB].
+            Absolute residuals, ascending [dB].
         """
         return np.sort(np.abs(self.errors[name][self.judged]))
 
     def summary(self) -> tuple[Table | str, ...]:
-        """The models side by side.
+        """A comparison of the models.
 
         Returns:
-            A table and two sentences.
+            A table, the judgement, and the choice of the prediction model.
         """
         columns = (
             Column(), numbers("RMSE", "dB"), numbers("standard deviation", "dB"), numbers("log density"),
@@ -158,7 +157,7 @@ class Validation(HeldOutErrors):
         return min(present, key=lambda name: float(np.mean(self.errors[name][mask] ** 2)))
 
     def _choose(self, mask: NDArray[np.bool_]) -> str:
-        """The prediction model by some links."""
+        """The prediction model that some links choose."""
         chosen: str = Model.INITIAL
         for name in (self._least(FITTED, mask), Model.LOG_DISTANCE):
             if name in self.errors:
@@ -171,16 +170,16 @@ class Validation(HeldOutErrors):
         return [self.block == number for number in np.unique(self.block[self.judged])]
 
     def _figures(self, name: str) -> dict[str, float]:
-        errors, density, inside = self.errors[name], [], []
+        errors, log_density, inside = self.errors[name], [], []
         for block in self._blocks():
             others = errors[self.judged & ~block]
-            size = float(np.sqrt(np.mean(others**2)))
-            density.append(-0.5 * (errors[block] / size) ** 2 - np.log(size * np.sqrt(2 * np.pi)))
-            inside.append(np.abs(errors[block]) <= reach(np.sort(np.abs(others)), self.level))
+            rms = float(np.sqrt(np.mean(others**2)))
+            log_density.append(-0.5 * (errors[block] / rms) ** 2 - np.log(rms * np.sqrt(2 * np.pi)))
+            inside.append(np.abs(errors[block]) <= interval_half_width(np.sort(np.abs(others)), self.level))
         judged = errors[self.judged]
         return {
             "rmse_db": float(np.sqrt(np.mean(judged**2))),
             "standard_deviation_db": float(np.std(judged)),
-            "log_density": float(np.mean(np.concatenate(density))),
+            "log_density": float(np.mean(np.concatenate(log_density))),
             "coverage": float(np.mean(np.concatenate(inside))),
         }

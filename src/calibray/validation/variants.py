@@ -1,8 +1,8 @@
-"""Models that know the scene, each a variant of a study's problem, and their fits to the links that count.
+"""Variants of a study's model that use the scene, each fitted to the calibration links.
 
-Beside the study's own model stand its materials left as they are, priors around them, a slope over distance, and an
-offset for every transmitter: what an engineer would try by hand. Which of them predicts best differs from campaign to
-campaign, and only links held out tell (`validate.py`).
+The variants are the study's own model, its initial materials, priors around the initial values, a slope over distance,
+and an offset per transmitter: what an engineer would try by hand. Which one predicts best differs between campaigns, so
+that held-out links decide (`validate.py`).
 """
 
 from __future__ import annotations
@@ -26,134 +26,147 @@ from calibray.parameters import LogNormal
 from calibray.result.held_out import Model
 from calibray.study import Setup
 
-SPREAD: Final = 0.3
-"""Standard deviation of the logarithm of a parameter around its start, where the model has priors."""
+PRIOR_SPREAD: Final = 0.3
+"""Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
 
-KNOWN: Final = 4
-"""Minima known beforehand that a search starts from, beside points of its own."""
+MOST_STARTS: Final = 4
+"""Known minima that a search starts from."""
 
-SEARCHES: Final = 4
-"""Points of its own, where minima are known beforehand."""
+NEW_STARTS: Final = 4
+"""Additional starting points, where minima are known."""
 
-MOST: Final = 128
-"""Points of its own at most, where none are known."""
+MOST_NEW_STARTS: Final = 128
+"""Most starting points where no minimum is known."""
 
 TOLERANCE: Final = 1e-6
-"""Relative decrease of the mean square below which a search has converged: predictions change by less."""
+"""Relative decrease of the mean square below which a search has converged; predictions change by less."""
 
-NOTHING: Final[Mapping[Model, NDArray[np.float64]]] = {}
+NO_MINIMA: Final[Mapping[Model, NDArray[np.float64]]] = {}
 
 TX_OFFSET: Final = "offset of the transmitter"
-"""Name of the term that gives each transmitter its offset."""
+"""Name of the term that gives each transmitter an offset."""
 
 
-def fitted(
-    part: Problem, known: Mapping[Model, NDArray[np.float64]] = NOTHING
+def fit_variants(
+    part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
 ) -> dict[str, tuple[Problem, NDArray[np.float64]]]:
-    """Every model that knows the scene, fitted to the links that count.
+    """Fit every variant to the links that have a weight.
 
     Args:
-        part: The problem, other links without weight.
-        known: Minima over more links, by name of the model, that searches start from beside few points of their own
-            [k, d]; without any, the study's own model is searched for all over its ranges.
+        part: The problem; held-out links have weight 0.
+        known_minima: Minima over more links by variant [k, d], to start from. Without those of the study's own model,
+            its whole ranges are searched.
 
     Returns:
-        The problem that each solves, and its minima, the best first [k, d], by name.
+        Each variant's problem and its minima, the best first [k, d], by name.
     """
-    if Model.CALIBRATED in known:
-        calibrated = minima(part, known[Model.CALIBRATED])
+    if Model.CALIBRATED in known_minima:
+        calibrated = find_minima(part, known_minima[Model.CALIBRATED])
     else:
-        calibrated = minima(part, np.zeros((0, len(part.parameters))), _all_over(part))
-    found = {}
-    for name, variant in twins(part, calibrated[0]).items():
+        calibrated = find_minima(part, np.zeros((0, len(part.parameters))), _global_starts(part))
+    fits = {}
+    for name, variant in variants(part, calibrated[0]).items():
         if name == Model.INITIAL:
-            points = part.parameters.to_search(part.parameters.start)[None]
+            minima = part.parameters.to_search(part.parameters.start)[None]
         elif name == Model.CALIBRATED:
-            points = calibrated
+            minima = calibrated
         else:
-            points = minima(variant, known.get(name, calibrated))
-        found[name] = variant, points
-    return found
+            minima = find_minima(variant, known_minima.get(name, calibrated))
+        fits[name] = variant, minima
+    return fits
 
 
-def twins(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
-    """Every model that knows the scene.
+def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
+    """The problems of all variants.
 
     Args:
-        part: The problem, links that are held out without weight.
-        best: Its optimum, by which the noise is told that priors are weighed against [d].
+        part: The problem; held-out links have weight 0.
+        best: Its optimum [d]; the residuals there give the noise that priors are weighed against.
 
     Returns:
-        The problem that each solves, by its name; of `Model.INITIAL` only the nuisance is to be fitted.
+        The problems by name. For `Model.INITIAL` only the nuisance is fitted.
     """
     setup, objective = part.setup, part.objective
-    rows = objective.num_counted
-    noise = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(rows / max(part.freedom, 1))
-    prior = replace(part, priors=_start_priors(part), objective=replace(objective, noise_db=noise))
-    found = {
+    noise_db = float(part.squares(best[None]).rmse_db[0]) * np.sqrt(
+        objective.num_counted / max(part.freedom, 1)
+    )
+    with_prior = replace(
+        part, priors=_priors_around_start(part), objective=replace(objective, noise_db=noise_db)
+    )
+    problems = {
         Model.INITIAL: replace(part, objective=_with_term(objective, CONSTANT, setup)),
         Model.CALIBRATED: part,
-        Model.PRIOR: prior,
+        Model.PRIOR: with_prior,
         Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
     }
-    if (per_tx := _per_transmitter(objective, setup)) is not None:
-        found[Model.PER_TRANSMITTER] = replace(part, objective=per_tx)
-        found[Model.PRIOR_PER_TRANSMITTER] = replace(prior, objective=replace(per_tx, noise_db=noise))
-    return found
+    per_transmitter = _with_offset_per_transmitter(objective, setup)
+    if per_transmitter is not None:
+        problems[Model.PER_TRANSMITTER] = replace(part, objective=per_transmitter)
+        problems[Model.PRIOR_PER_TRANSMITTER] = replace(
+            with_prior, objective=replace(per_transmitter, noise_db=noise_db)
+        )
+    return problems
 
 
-def minima(problem: Problem, known: NDArray[np.float64], searches: int = SEARCHES) -> NDArray[np.float64]:
-    """Minima of a problem by local searches.
+def find_minima(
+    problem: Problem, starts: NDArray[np.float64], new_starts: int = NEW_STARTS
+) -> NDArray[np.float64]:
+    """Find minima of a problem by local searches.
 
     Args:
         problem: The problem.
-        known: Points that they start from, the most promising first [k, d].
-        searches: Points of their own beside them.
+        starts: Starting points, the most promising first [k, d].
+        new_starts: Number of additional starting points.
 
     Returns:
         The minima, the best first [k, d].
     """
-    bounds = problem.parameters.search_bounds
-    behind = NEARER if len(known) else CATCH_UP
-    search = LeastSquares(*bounds, starts=searches, x0=known[:KNOWN], tolerance=TOLERANCE, catch_up=behind)
+    search = LeastSquares(
+        *problem.parameters.search_bounds,
+        starts=new_starts,
+        x0=starts[:MOST_STARTS],
+        tolerance=TOLERANCE,
+        catch_up=NEARER if len(starts) else CATCH_UP,
+    )
     for _ in rounds(search, problem.squares):
         pass
     return search.minima
 
 
-def _all_over(problem: Problem) -> int:
-    """Local searches that find the minima of a problem of which nothing is known."""
+def _global_starts(problem: Problem) -> int:
+    """Number of local searches that find the minima of a problem without any known minimum."""
     interactions = problem.engine.interactions if isinstance(problem.engine, Differentiable) else 1
-    return min(local_searches(interactions), MOST)
+    return min(local_searches(interactions), MOST_NEW_STARTS)
 
 
-def predicted(objective: Objective, path_loss: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Path loss with the nuisance fitted to the links that count; a group that has none gets the mean.
+def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Add the nuisance fitted to the links that have a weight; a group without such links gets the mean.
 
     Args:
-        objective: What the model is fitted by.
-        path_loss: Path loss without it [L], [dB].
+        objective: The objective.
+        path_loss_db: Path loss without nuisance [links], [dB].
 
     Returns:
-        Path loss with it [L], [dB].
+        Path loss with nuisance [links], [dB].
     """
-    coefficients = objective.coefficients(path_loss[None])
+    coefficients = objective.coefficients(path_loss_db[None])
     filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
-    return objective.capped(path_loss) + objective.nuisance.contribution(filled)[0]
+    return objective.capped(path_loss_db) + objective.nuisance.contribution(filled)[0]
 
 
-def _per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
-    """The objective with an offset for every transmitter, if there are several and it has none such."""
+def _with_offset_per_transmitter(objective: Objective, setup: Setup) -> Objective | None:
+    """The objective with an offset per transmitter; None with one transmitter, or where a term has groups already."""
     labels = transmitters(setup.links)
     if len(np.unique(labels)) < 2 or any(len(term.labels) > 1 for term in objective.nuisance.terms):
         return None
     offset = make_term(setup.links, TX_OFFSET, labels=labels)
+    # The offsets per transmitter replace the offset of all links.
     kept = [term for term in objective.nuisance.terms if term.by != CONSTANT]
     return replace(objective, nuisance=Nuisance(len(setup.links), (*kept, offset)))
 
 
 def _with_term(objective: Objective, by: str, setup: Setup) -> Objective:
-    """The objective with one coefficient of a kind for all links, if it has none of that kind."""
+    """The objective with one coefficient of a kind for all links, unless it has a term of that kind."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
     term = make_term(setup.links, f"{by} of all links", by)
@@ -161,14 +174,16 @@ def _with_term(objective: Objective, by: str, setup: Setup) -> Objective:
     return replace(objective, nuisance=Nuisance(len(setup.links), terms))
 
 
-def _start_priors(problem: Problem) -> LogNormal:
-    """The study's priors, and one around the start of every other parameter that is positive."""
-    parameters, given = problem.parameters, problem.priors
-    place = [
-        k for k, each in enumerate(parameters) if k not in given.index and each.lower > 0 and each.start > 0
+def _priors_around_start(problem: Problem) -> LogNormal:
+    """The study's priors, and one around the initial value of every other positive parameter."""
+    parameters, priors = problem.parameters, problem.priors
+    added = [
+        index
+        for index, parameter in enumerate(parameters)
+        if index not in priors.index and parameter.lower > 0 and parameter.start > 0
     ]
     return LogNormal(
-        (*given.index, *place),
-        (*given.centre, *(float(parameters.start[k]) for k in place)),
-        (*given.spread, *(SPREAD for _ in place)),
+        (*priors.index, *added),
+        (*priors.centre, *(float(parameters.start[index]) for index in added)),
+        (*priors.spread, *(PRIOR_SPREAD for _ in added)),
     )

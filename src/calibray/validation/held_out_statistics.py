@@ -1,0 +1,122 @@
+"""Statistics of held-out errors: spatial blocks, comparison of two models, and width of a prediction interval.
+
+The interval is conformal: among n + 1 exchangeable errors, a new one has any rank with the same probability. It
+therefore lies within the ((n + 1) p)-th smallest of the n observed absolute errors with probability p, whatever their
+distribution (V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a Random World, 2005; R. J. Barber et al., Ann.
+Statist. 49, 2021, for held-out links). Errors of links have heavier tails than a Gaussian, so that an interval from
+their root mean square would be too wide at 90 %. With few errors the largest ones are too uncertain, and Student's t
+is used instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from calibray.result.held_out import Judgement, Model
+
+CLUSTER_LINKS: Final = 4
+"""Neighbouring links that are resampled together, since they share part of their noise."""
+
+MOST_CLUSTERS: Final = 1000
+"""Most clusters; with more links, clusters are larger."""
+
+RESAMPLES: Final = 2000
+
+FEWEST_FOR_RANKS: Final = 40
+"""Errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
+
+
+def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Divide positions into compact blocks of about equal size.
+
+    The largest block is halved across its longer side until there are enough.
+
+    Args:
+        position: Positions [n, 2 or 3], [m].
+        count: Number of blocks; at most n are made.
+
+    Returns:
+        Block of every position, from 0 [n].
+
+    Example:
+        >>> spatial_blocks(np.array([[0.0, 0.0], [9.0, 0.0], [1.0, 0.0], [8.0, 0.0]]), 2).tolist()
+        [0, 1, 0, 1]
+    """
+    block = np.zeros(len(position), dtype=np.int64)
+    for new_block in range(1, min(count, len(position))):
+        largest = int(np.argmax(np.bincount(block)))
+        members = np.flatnonzero(block == largest)
+        axis = int(np.argmax(np.ptp(position[members], axis=0)))
+        order = members[np.argsort(position[members, axis], kind="stable")]
+        block[order[(len(order) + 1) // 2 :]] = new_block
+    return block
+
+
+def compare(
+    errors: NDArray[np.float64],
+    baselines: Mapping[Model, NDArray[np.float64]],
+    position: NDArray[np.float64],
+    seed: int = 0,
+) -> Judgement:
+    """Compare a model with its best baseline.
+
+    The error of the difference comes from resampling clusters of neighbouring links, the same ones for both models.
+
+    Args:
+        errors: Residuals of the model on held-out links [n], [dB]; links with a non-finite residual are left out.
+        baselines: Residuals of each baseline on the same links [n], [dB].
+        position: Positions of the receivers [n, 3], [m].
+        seed: Seed of the resampling.
+
+    Returns:
+        The comparison.
+    """
+    table = np.stack([errors, *baselines.values()])
+    finite = np.isfinite(table).all(axis=0)
+    square, count = table[:, finite] ** 2, int(finite.sum())
+    if not count:
+        return Judgement(0, np.nan, next(iter(baselines)), np.nan, np.nan, 0)
+    rmse = np.sqrt(square.mean(axis=1))
+    best = 1 + int(np.argmin(rmse[1:]))
+    # Two links or more make at least two clusters: one cluster gives no standard error.
+    clusters = min(max(count // CLUSTER_LINKS, min(count, 2)), MOST_CLUSTERS)
+    cluster = spatial_blocks(position[finite], clusters)
+    size = np.bincount(cluster)
+    total = np.stack([np.bincount(cluster, weights=square[row]) for row in (0, best)])
+    resampled = np.random.default_rng(seed).integers(len(size), size=(RESAMPLES, len(size)))
+    model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
+    # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
+    correction = np.sqrt(len(size) / (len(size) - 1)) if len(size) > 1 else np.inf
+    error = float(np.std(baseline_rmse - model_rmse) * correction) if len(size) > 1 else np.inf
+    name = list(baselines)[best - 1]
+    return Judgement(count, float(rmse[0]), str(name), float(rmse[best]), error, len(size))
+
+
+def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
+    """Half the width of the interval that contains a new error with a given probability.
+
+    Args:
+        absolute_errors: Absolute errors, ascending [n], [dB].
+        level: The probability.
+
+    Returns:
+        Half the width [dB].
+
+    Example:
+        >>> errors = np.sort(np.abs(np.random.default_rng(0).standard_normal(999)))
+        >>> round(interval_half_width(errors, 0.9), 2), round(interval_half_width(errors[::100], 0.9), 2)
+        (1.56, 1.48)
+    """
+    count, rank = len(absolute_errors), (len(absolute_errors) + 1) * level
+    rms = float(np.sqrt(np.mean(np.square(absolute_errors))))
+    student_t = float(stdtrit(count, (1 + level) / 2)) * rms
+    if count < FEWEST_FOR_RANKS:
+        return student_t
+    if rank > count:
+        return max(student_t, float(absolute_errors[-1]))
+    return float(np.interp(rank, np.arange(1, count + 1), absolute_errors))
