@@ -347,7 +347,7 @@ def test_result_keeps_the_law_and_writes_the_constants_at_the_scenes_carrier(
     folder: Path, result: Result
 ) -> None:
     content = json.loads((folder / "out" / "result.json").read_text())
-    assert content["laws"]["walls"]["itu_b"] == result.parameters["walls.itu_b"]
+    assert content["fit"]["laws"]["walls"]["itu_b"] == result.parameters["walls.itu_b"]
     again = Result.load(folder / "out")
     assert again.fit.laws == result.fit.laws
     wall = read_scene(folder / "out" / "result-scene.xml", 10e9).materials["walls"]

@@ -90,7 +90,7 @@ def test_maps_of_workers_are_those_of_one_process(tmp_path, cluster):
     where = {"tx": (0.0, 0.0, 10.0), "bounds": (20.0, -10.0, 80.0, 10.0), "cell": 5.0}
     alone = coverage_map(result, **where)
     with engines.open_workers(scheduler=cluster.scheduler_address) as workers:
-        together = coverage_map(result, **where, crew=workers)
+        together = coverage_map(result, **where, workers=workers)
     assert alone.path_loss_db.shape == (4, 12)
     assert np.isfinite(alone.path_loss_db).all()
     for name, values in alone.layers.items():

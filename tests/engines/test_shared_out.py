@@ -111,7 +111,7 @@ def test_a_validation_in_blocks_is_that_of_one_piece(tmp_path, monkeypatch):
     whole = validate(Setup.open(study, two_ray.TwoRay), blocks=2)
     (tmp_path / two_ray.TRACED).unlink()
     parted = two_ray.study(tmp_path, noise_db=1.0, **PARTED)
-    found = validate(Setup.open(parted, two_ray.TwoRay), blocks=2, crew=InProcess())
+    found = validate(Setup.open(parted, two_ray.TwoRay), blocks=2, workers=InProcess())
     assert len((tmp_path / two_ray.TRACED).read_text().split()) == 5
     assert set(found.errors) == set(whole.errors)
     for name, errors in whole.errors.items():
@@ -162,7 +162,7 @@ def test_what_is_written_in_pieces_is_what_is_written_at_once(found, tmp_path, m
         plain = pyarrow.Table.from_pandas(mixed(40), preserve_index=False).replace_schema_metadata(None)
         parquet.write_table(plain, source)
     found.save(tmp_path / "out")
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
     written = []
     for size in (40, 9):
         monkeypatch.setattr(shared_out, "PIECE", size)
@@ -181,7 +181,7 @@ def test_a_row_that_cannot_be_used_is_refused_before_any_is_traced(found, tmp_pa
     table = new_links()
     table.loc[37, "rx_x"] = np.nan
     table.to_parquet(tmp_path / "links.parquet")
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
     monkeypatch.setattr(shared_out, "PIECE", 9)
     monkeypatch.setattr(Setup, "trace", None)
     rows = predicted_in_pieces(found, PiecedTable.open(tmp_path / "links.parquet"), None)
@@ -207,7 +207,7 @@ def test_memory_does_not_grow_with_the_rows(found, tmp_path, monkeypatch, kind):
     def cheap(result, setup, *_, **__):
         return pd.DataFrame({"path_loss_db": setup.links.distance, "remark": ""})
 
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, anyway: opened(result, links))
+    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
     monkeypatch.setattr(shared_out, "predicted", cheap)
     monkeypatch.setattr(shared_out, "PIECE", 500)
     peaks = []

@@ -84,7 +84,7 @@ def map(
         inputs = result.study.files()
         # Before anything is traced.
         check_outputs(target, FILES, inputs, overwrite)
-        with open_workers(workers, scheduler) as crew:
+        with open_workers(workers, scheduler) as pool:
             coverage = coverage_map(
                 result,
                 tx,
@@ -96,7 +96,7 @@ def map(
                 samples=None if samples is None else _samples(samples),
                 columns=_columns(column or []),
                 progress=progress,
-                workers=crew,
+                workers=pool,
                 allow_changed_inputs=allow_changed_inputs,
             )
         progress("writing", 0, None)

@@ -86,11 +86,11 @@ def predict(
             check_table(out, [links_file, *study.files()], overwrite)
         odd: dict[str, array[int]] = {}
         with (
-            open_workers(workers, scheduler) as crew,
+            open_workers(workers, scheduler) as pool,
             _printed() if out is None else growing_table(out) as append,
         ):
             for links, told in predicted_in_pieces(
-                result, table, level, progress, crew, allow_changed_inputs=allow_changed_inputs
+                result, table, level, progress, pool, allow_changed_inputs=allow_changed_inputs
             ):
                 own = as_measured(study, links, told)
                 columns = {

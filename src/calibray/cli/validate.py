@@ -56,8 +56,8 @@ def validate(
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
-        with open_workers(workers, scheduler) as crew:
-            found = judge(study, blocks=blocks, by=by, workers=crew, progress=progress)
+        with open_workers(workers, scheduler) as pool:
+            found = judge(study, blocks=blocks, by=by, workers=pool, progress=progress)
     typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
