@@ -1,4 +1,4 @@
-"""Every method on five problems at equal budgets of RT calls: the tables and figures of docs/methods.
+"""Every method on five problems at equal budgets of RT calls: the tables and figures of docs/measurements/methods.
 
     python benchmarks/methods.py --seeds 25 --workers 2
 
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=ROOT / "out/methods", help="folder that keeps the runs")
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "docs/methods", help="folder of tables and figures"
+        "--out", type=Path, default=ROOT / "docs/measurements/methods", help="folder of tables and figures"
     )
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)

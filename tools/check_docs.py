@@ -1,6 +1,6 @@
-"""Check that what the documentation points to is there: linked files, headings, make targets, commands.
+"""Check the documentation: linked files and headings, make targets, commands and their options, length of pages.
 
-Usage: `python tools/check_docs.py`, which lists what is missing and then exits with 1.
+Usage: `python tools/check_docs.py`. It lists the faults, and exits with 1 if there are any.
 """
 
 from __future__ import annotations
@@ -17,10 +17,16 @@ from calibray.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 
+KINDS = ("tutorial", "guides", "reference", "explanation")
+"""Folders of documentation by kind, whose pages are short."""
+
+LONGEST = 1500
+"""Largest number of words of such a page."""
+
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
-# At the start of a line of code; settings such as PYTHON=python3.12 may stand between.
+# At the start of a line of code; settings such as PYTHON=python3.12 may come before the target.
 _OPTIONS = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?calibray ([a-z][\w-]*)((?: (?!#).*)?)$", re.MULTILINE)
 _COMMAND = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(make|calibray)(?: \w+=\S+)* ([a-z][\w-]*)", re.MULTILINE)
 
@@ -33,7 +39,7 @@ def missing_links(document: Path, text: str) -> Iterator[str]:
         text: Its content.
 
     Yields:
-        The target of each such link. Addresses on the web are not looked up.
+        The target of each such link. Web addresses are not checked.
     """
     for target in _LINK.findall(_FENCE.sub("", text)):
         if re.match(r"[a-z]+:", target):
@@ -45,24 +51,24 @@ def missing_links(document: Path, text: str) -> Iterator[str]:
 
 
 def anchors(text: str) -> set[str]:
-    """The names under which the headings of a Markdown text can be linked to.
+    """The anchors of the headings of a Markdown text.
 
     Args:
         text: The Markdown text.
 
     Returns:
-        The headings in lower case without punctuation, with hyphens for spaces.
+        The headings in lower case without punctuation, with hyphens instead of spaces.
     """
     headings = _HEADING.findall(_FENCE.sub("", text))
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def missing_commands(text: str, known: dict[str, set[str]]) -> Iterator[str]:
+def missing_commands(text: str, commands: dict[str, set[str]]) -> Iterator[str]:
     """Find commands that do not exist, in blocks of code and in inline code.
 
     Args:
         text: The Markdown text.
-        known: The targets of `make` and the commands of `calibray`.
+        commands: The targets of `make` and the commands of `calibray`.
 
     Yields:
         Each such command.
@@ -70,16 +76,16 @@ def missing_commands(text: str, known: dict[str, set[str]]) -> Iterator[str]:
     code = _FENCE.findall(text) + re.findall(r"`([^`\n]+)`", _FENCE.sub("", text))
     for snippet in code:
         for program, command in _COMMAND.findall(snippet):
-            if command not in known[program]:
+            if command not in commands[program]:
                 yield f"{program} {command}"
 
 
-def missing_options(text: str, known: dict[str, dict[str, set[str]]]) -> Iterator[str]:
-    """Find options that commands do not have, in blocks of code.
+def missing_options(text: str, options: dict[str, dict[str, set[str]]]) -> Iterator[str]:
+    """Find options that do not exist, in blocks of code.
 
     Args:
         text: The Markdown text.
-        known: Options by command and, where it has such, by command of its own; "" for the command itself.
+        options: Options by command and subcommand; "" for the command itself.
 
     Yields:
         Each command with such an option.
@@ -87,24 +93,36 @@ def missing_options(text: str, known: dict[str, dict[str, set[str]]]) -> Iterato
     for block in _FENCE.findall(text):
         for command, rest in _OPTIONS.findall(re.sub(r"\\\n\s*", "", block)):
             words = rest.partition(" #")[0].split()
-            options = known.get(command, {})
-            own = options.get(words[0] if words else "", options.get("", set()))
-            for option in words:
-                name = option.partition("=")[0]
-                if re.fullmatch(r"--[a-z][\w-]*|-[a-z]", name) and name not in own:
+            allowed = options.get(command, {})
+            allowed_here = allowed.get(words[0] if words else "", allowed.get("", set()))
+            for word in words:
+                name = word.partition("=")[0]
+                if re.fullmatch(r"--[a-z][\w-]*|-[a-z]", name) and name not in allowed_here:
                     yield f"calibray {command} {name}"
 
 
 def options_of(command: Any) -> set[str]:
-    """The options of a command, as they are written.
+    """The options of a command.
 
     Args:
         command: The command.
 
     Returns:
-        All names of each.
+        Every name of every option.
     """
-    return {name for each in command.params for name in [*each.opts, *each.secondary_opts]} | {"--help", "-h"}
+    return {name for parameter in command.params for name in [*parameter.opts, *parameter.secondary_opts]} | {
+        "--help",
+        "-h",
+    }
+
+
+def too_long() -> list[str]:
+    """Find pages with more than `LONGEST` words; measurements may be longer."""
+    pages = [page for kind in KINDS for page in sorted((ROOT / "docs" / kind).rglob("*.md"))]
+    words = {page.relative_to(ROOT): len(page.read_text(encoding="utf-8").split()) for page in pages}
+    return [
+        f"{page}: {count} words; split it below {LONGEST}" for page, count in words.items() if count > LONGEST
+    ]
 
 
 if __name__ == "__main__":
@@ -113,10 +131,10 @@ if __name__ == "__main__":
     commands = {"make": set(targets[1].split()) if targets else set(), "calibray": set(group)}
     options = {
         name: {
-            "": options_of(each),
-            **{k: options_of(own) for k, own in getattr(each, "commands", {}).items()},
+            "": options_of(command),
+            **{sub: options_of(subcommand) for sub, subcommand in getattr(command, "commands", {}).items()},
         }
-        for name, each in group.items()
+        for name, command in group.items()
     }
     folders = [folder for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
     documents = sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in folder.rglob("*.md"))])
@@ -129,5 +147,6 @@ if __name__ == "__main__":
             *missing_options(document.read_text(), options),
         ]
     ]
+    faults += too_long()
     sys.stdout.write("\n".join([*faults, f"{len(documents)} documents, {len(faults)} faults"]) + "\n")
     sys.exit(bool(faults))

@@ -1,8 +1,8 @@
-"""Run every command of Calibray that the documentation prints, page by page, in folders that hold what a reader has.
+"""Run every Calibray command of the documentation, page by page, in folders with the files that a reader has.
 
-Usage: `python tools/run_docs.py [PAGE...]`, for instance `python tools/run_docs.py README.md docs/index.md`. What fails
-is printed with its messages, and the exit status is 1; so is it where a page prints commands that nothing is prepared
-for. Commands that take hours or measured data are named here, with the reason.
+Usage: `python tools/run_docs.py [PAGE...]`, for instance `python tools/run_docs.py README.md docs/index.md`. Failures
+are printed with their messages, and the exit status is then 1. A page with commands needs an entry in `PREPARED`.
+`LEFT_OUT` lists commands that take hours or need measured data.
 """
 
 from __future__ import annotations
@@ -45,29 +45,30 @@ _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _STUDY = re.compile(r"^```toml\n(version = 1\n.*?)^```", re.MULTILINE | re.DOTALL)
 _TYPED = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(calibray .*|cd .*)$")
 
+MEASURED = "measured data are not part of the repository"
 LEFT_OUT = {
-    "calibray run examples/nist_boulder.toml": "measured data is no part of the repository",
-    "calibray run examples/auckland_tower.toml": "measured data is no part of the repository",
-    "calibray validate examples/nist_boulder.toml": "measured data is no part of the repository",
-    "calibray validate examples/auckland_tower.toml": "measured data is no part of the repository",
+    "calibray run examples/nist_boulder.toml": MEASURED,
+    "calibray run examples/auckland_tower.toml": MEASURED,
+    "calibray validate examples/nist_boulder.toml": MEASURED,
+    "calibray validate examples/auckland_tower.toml": MEASURED,
     "calibray run study.toml --out result --scheduler": "needs a cluster; tests/engines/test_dask.py starts one",
     "calibray compare study.toml": "takes an hour; tests/comparison/test_comparison.py runs a small one",
 }
-"""How commands begin that are not run, and why."""
+"""First words of the commands that are not run, and the reason."""
 
 
 def nothing(folder: Path) -> None:
-    """The page's commands need no file."""
+    """Prepare nothing: the commands need no file."""
 
 
 def repository(folder: Path) -> None:
-    """A clone, and links to predict at in the town that is calibrated on its way."""
+    """Copy the examples, with new links for the town."""
     shutil.copytree(EXAMPLES, folder / "examples")
     town(folder / "examples" / "bring_your_own")
 
 
 def town(folder: Path) -> None:
-    """The example town; of its log one phone at every fourth stop, so that it takes seconds."""
+    """Copy the example town, with one phone at every fourth stop of the log, so that a run takes seconds."""
     shutil.copytree(TOWN, folder, dirs_exist_ok=True)
     log = pd.read_csv(TOWN / "rsrp.csv")
     stop = log.groupby(["longitude", "latitude"], sort=False).ngroup()
@@ -76,21 +77,21 @@ def town(folder: Path) -> None:
 
 
 def flat(folder: Path) -> None:
-    """The example flat; of its table every third spot, so that it takes a minute."""
+    """Copy the example flat, with every third position, so that a run takes a minute."""
     shutil.copytree(TOWN / "flat", folder, dirs_exist_ok=True)
     pd.read_csv(TOWN / "flat" / "rss.csv").iloc[::3].to_csv(folder / "rss.csv", index=False)
 
 
 def hill(folder: Path) -> None:
-    """The example hill."""
+    """Copy the example hill."""
     shutil.copytree(TOWN / "hill", folder, dirs_exist_ok=True)
 
 
 def maps(folder: Path) -> None:
-    """The town's map as an extract, the hill's houses as a package, ground that rises, the flat in millimetres."""
+    """Write the town as an extract, the hill's houses as a GeoPackage, a height model, and the flat in millimetres."""
     with osmium.SimpleWriter(str(folder / "town.osm.pbf")) as writer:
-        for thing in osmium.FileProcessor(str(TOWN / "town.osm")):
-            writer.add(thing)
+        for element in osmium.FileProcessor(str(TOWN / "town.osm")):
+            writer.add(element)
     west, south, east, north = 9.985, 50.006, 9.995, 50.014
     ground = np.linspace(100.0, 104.0, 40)[:, None] * np.ones(40)
     with rasterio.open(
@@ -111,7 +112,7 @@ def maps(folder: Path) -> None:
 
 
 def own_scene(folder: Path) -> None:
-    """The study that README prints, houses along a street, and links simulated on them with 1 dB of noise."""
+    """Write the study of README.md, houses along a street, and links simulated there with 1 dB of noise."""
     houses = [
         Building(f"house-{number}", np.array([0.0, side]) + box(28.0 * number - 14.0), 12.0, 0.0)
         for number in range(7)
@@ -136,13 +137,21 @@ def own_scene(folder: Path) -> None:
     new_links(folder / "new-links.csv", (0.0, 0.0, 2.5))
 
 
+def calibrated(folder: Path) -> None:
+    """Prepare the study of README.md and calibrate it."""
+    own_scene(folder)
+    subprocess.run(
+        [CALIBRAY, "run", "study.toml", "--out", "result"], cwd=folder, check=True, capture_output=True
+    )
+
+
 def box(west: float) -> np.ndarray:
     """Footprint of a house, 18 m by 10 m [4, 2], [m]."""
     return np.array([[west, 0.0], [west + 18.0, 0.0], [west + 18.0, 10.0], [west, 10.0]])
 
 
 def new_links(file: Path, tx: tuple[float, float, float], **labels: str) -> None:
-    """Write links to predict at: one transmitter, five receivers in a row."""
+    """Write new links: one transmitter, five receivers in a row."""
     along = np.linspace(2.0, 12.0, 5)
     table = pd.DataFrame(dict(zip(("tx_x", "tx_y", "tx_z"), tx, strict=True)), index=range(5))
     table.assign(rx_x=tx[0] + along, rx_y=tx[1], rx_z=1.5, **labels).to_csv(file, index=False)
@@ -150,29 +159,34 @@ def new_links(file: Path, tx: tuple[float, float, float], **labels: str) -> None
 
 PREPARED: dict[str, tuple[Callable[[Path], None], ...]] = {
     "README.md": (own_scene,),
-    "docs/index.md": (repository,),
-    "docs/install.md": (nothing,),
-    "docs/bring-your-own.md": (town, flat, hill),
-    "docs/scenes.md": (maps,),
-    "docs/choosing-a-method.md": (nothing,),
-    "docs/many-machines.md": (own_scene,),
+    "docs/index.md": (own_scene,),
+    "docs/tutorial/ten-minutes.md": (repository,),
+    "docs/guides/install.md": (nothing,),
+    "docs/guides/bring-your-own.md": (town,),
+    "docs/guides/plans-and-tracks.md": (flat, hill),
+    "docs/guides/scenes.md": (maps,),
+    "docs/guides/predict.md": (calibrated,),
+    "docs/guides/export.md": (calibrated,),
+    "docs/guides/compare-methods.md": (nothing,),
+    "docs/guides/many-machines.md": (own_scene,),
+    "docs/measurements/expensive-engines.md": (repository,),
     "docs/case-studies/boulder.md": (repository,),
     "docs/case-studies/auckland.md": (repository,),
     "examples/README.md": (repository,),
     "examples/octave_canyon/README.md": (repository,),
 }
-"""What a page's reader has: one preparation for all its blocks, or one for each."""
+"""How the files of a page are prepared: once for all its blocks, or once per block."""
 
 
 @dataclass(frozen=True)
 class Ran:
-    """A command, and how it ended.
+    """The outcome of a command.
 
     Attributes:
         page: The page that prints it.
         command: The command.
-        seconds: Time that it took.
-        failure: What it said where it failed; empty if it succeeded.
+        seconds: Its time [s].
+        failure: Its messages if it failed; empty otherwise.
         reason: Why it was not run; empty if it was.
     """
 
@@ -184,7 +198,7 @@ class Ran:
 
 
 def commands(text: str) -> list[list[str]]:
-    """The commands of every block of code of a page that has any, lines that go on in the next one joined."""
+    """Commands of every block of code that has any, with continued lines joined."""
     shell = (block for language, block in _BLOCK.findall(text) if language in {"", "sh"})
     blocks = (re.sub(r"\\\n\s*", "", block).splitlines() for block in shell)
     typed = ([match[1] for line in block if (match := _TYPED.match(line))] for block in blocks)
@@ -199,64 +213,70 @@ def run_page(page: str, blocks: list[list[str]]) -> Iterator[Ran]:
         blocks: Its commands, block by block.
 
     Yields:
-        How each ended.
+        The outcome of each.
     """
     prepared = PREPARED.get(page, ())
     if len(prepared) not in {1, len(blocks)}:
         yield Ran(
-            page, blocks[0][0], failure="nothing is prepared for this page: see PREPARED of tools/run_docs.py"
+            page,
+            blocks[0][0],
+            failure="no files are prepared for this page: add it to PREPARED in tools/run_docs.py",
         )
         return
     with tempfile.TemporaryDirectory(prefix="calibray-docs-") as name:
-        place = Path(name)
+        folder = Path(name)
         for number, block in enumerate(blocks):
             if number < len(prepared):
-                place = Path(name) / f"block-{number}"
-                place.mkdir()
-                prepared[number](place)
+                folder = Path(name) / f"block-{number}"
+                folder.mkdir()
+                prepared[number](folder)
             for command in block:
                 if command.startswith("cd "):
-                    place /= command.removeprefix("cd ")
+                    folder /= command.removeprefix("cd ")
                 else:
-                    yield run(page, command, place)
+                    yield run(page, command, folder)
 
 
-def run(page: str, command: str, place: Path) -> Ran:
+def run(page: str, command: str, folder: Path) -> Ran:
     """Run a command in a folder, unless it is left out."""
     for start, reason in LEFT_OUT.items():
         if command.startswith(start):
             return Ran(page, command, reason=reason)
-    words, began = shlex.split(command, comments=True), time.monotonic()
+    words = shlex.split(command, comments=True)
+    start = time.monotonic()
     try:
-        ended = subprocess.run(
-            [CALIBRAY, *words[1:]], cwd=place, capture_output=True, text=True, check=False, timeout=LIMIT
+        process = subprocess.run(
+            [CALIBRAY, *words[1:]], cwd=folder, capture_output=True, text=True, check=False, timeout=LIMIT
         )
     except subprocess.TimeoutExpired:
         return Ran(page, command, LIMIT, f"took longer than {LIMIT:.0f} s")
-    said = f"exit status {ended.returncode}\n{ended.stdout}{ended.stderr}" if ended.returncode else ""
-    return Ran(page, command, time.monotonic() - began, said)
+    failure = (
+        f"exit status {process.returncode}\n{process.stdout}{process.stderr}" if process.returncode else ""
+    )
+    return Ran(page, command, time.monotonic() - start, failure)
 
 
 def main(pages: list[str]) -> int:
-    """Run the commands of pages, of all if none is named, and print what came of them.
+    """Run the commands of pages and print the outcomes.
 
     Args:
-        pages: The pages, from the repository's root.
+        pages: The pages, from the repository's root; all if empty.
 
     Returns:
         The number of commands that failed.
     """
     texts = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
-    asked = {page: found for page in pages or sorted(texts) if (found := commands(texts[page]))}
+    blocks = {page: commands(texts[page]) for page in pages or sorted(texts)}
+    blocks = {page: lines for page, lines in blocks.items() if lines}
     failed = 0
     with ThreadPoolExecutor(AT_ONCE) as executor:
-        for each in executor.map(lambda page: list(run_page(page, asked[page])), asked):
-            for ran in each:
+        for outcomes in executor.map(lambda page: list(run_page(page, blocks[page])), blocks):
+            for ran in outcomes:
                 failed += bool(ran.failure)
                 ending = ran.failure or (f"not run: {ran.reason}" if ran.reason else f"{ran.seconds:.0f} s")
                 sys.stdout.write(f"{ran.page}: {ran.command}: {ending}\n")
             sys.stdout.flush()
-    sys.stdout.write(f"{len(asked)} pages with commands, {failed} commands failed\n")
+    sys.stdout.write(f"{len(blocks)} pages with commands, {failed} commands failed\n")
     return failed
 
 

@@ -1,12 +1,13 @@
-"""What the site has beyond the files under docs/: the API reference, notebooks, and a place for case studies.
+"""Hooks of MkDocs (`make site`): add the Python reference, the notebooks and the case studies to the site.
 
-These are hooks of MkDocs (`make site`). Pages link to files of the repository too, which are no part of the site: such
-links become plain text there, and `tools/check_docs.py` checks them.
+Pages also link to files of the repository outside docs/. These links become plain text in the site;
+`tools/check_docs.py` checks them.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from importlib import import_module
 from pathlib import Path
@@ -16,15 +17,16 @@ from mkdocs.structure.files import File
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 NOTEBOOKS = DOCS.parent / "examples" / "notebooks"
+API = "reference/python"
 ROOMS = {
     "calibray.engines": "Engines",
     "calibray.optimizers": "Optimizers",
 }
-_OUTSIDE = re.compile(r"\[([^\]]*)\]\((?:\.\./)+[^)\s]*\)")
+_LINK = re.compile(r"\[([^\]]*)\]\(((?:\.\./)+[^)#\s]*)[^)]*\)")
 
 
 def on_config(config: Any) -> Any:
-    """Add the pages that come and go to the navigation.
+    """Add generated pages to the navigation.
 
     Args:
         config: The site's configuration.
@@ -35,18 +37,17 @@ def on_config(config: Any) -> Any:
     studies = [
         {_title(file): f"case-studies/{file.name}"} for file in sorted((DOCS / "case-studies").glob("*.md"))
     ]
-    books = [{_title(file): f"notebooks/{file.stem}.md"} for file in sorted(NOTEBOOKS.glob("*.ipynb"))]
-    before = len(config.nav) - 1
-    config.nav[before:before] = [
-        {name: pages} for name, pages in (("Notebooks", books), ("Case studies", studies)) if pages
-    ]
-    interface = [{"Calibray": "api/calibray.md"}, *({name: f"api/{room}.md"} for room, name in ROOMS.items())]
-    config.nav.append({"Python": interface})
+    notebooks = [{_title(file): f"notebooks/{file.stem}.md"} for file in sorted(NOTEBOOKS.glob("*.ipynb"))]
+    sections = {name: pages for section in config.nav for name, pages in section.items()}
+    sections["Tutorial"] += notebooks
+    sections["Measurements"] += studies
+    sections["Reference"] += [{"Python": f"{API}/calibray.md"}]
+    sections["Reference"] += [{f"Python, {name.lower()}": f"{API}/{room}.md"} for room, name in ROOMS.items()]
     return config
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that are made of code and of notebooks.
+    """Add the pages that are generated from code and from notebooks.
 
     Args:
         files: The site's files.
@@ -56,8 +57,8 @@ def on_files(files: Any, config: Any) -> Any:
         The same.
     """
     pages = {
-        "api/calibray.md": _interface("calibray", "The public interface"),
-        **{f"api/{room}.md": _interface(room, name) for room, name in ROOMS.items()},
+        f"{API}/calibray.md": _interface("calibray", "The public interface"),
+        **{f"{API}/{room}.md": _interface(room, name) for room, name in ROOMS.items()},
     }
     pages |= {f"notebooks/{file.stem}.md": notebook(file) for file in sorted(NOTEBOOKS.glob("*.ipynb"))}
     for name, text in pages.items():
@@ -65,20 +66,27 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Make text of links to what is no part of the site.
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Turn links to files outside docs/ into plain text.
 
     Args:
-        markdown: A page.
+        markdown: The text of a page.
+        page: The page.
 
     Returns:
-        The page.
+        The text.
     """
-    return _OUTSIDE.sub(r"\1", markdown)
+    folder = (DOCS / page.file.src_uri).parent
+
+    def plain(match: re.Match[str]) -> str:
+        target = Path(os.path.normpath(folder / match[2]))
+        return match[0] if target.is_relative_to(DOCS) else match[1]
+
+    return _LINK.sub(plain, markdown)
 
 
 def notebook(file: Path) -> str:
-    """A notebook as a page: its texts, and its code in blocks.
+    """Convert a notebook to Markdown: its text cells, and its code in blocks.
 
     Args:
         file: The notebook.
@@ -96,15 +104,17 @@ def notebook(file: Path) -> str:
 def _title(file: Path) -> str:
     """The first heading of a page or a notebook."""
     text = notebook(file) if file.suffix == ".ipynb" else file.read_text(encoding="utf-8")
-    found = re.search(r"^# (.+)$", text, re.MULTILINE)
-    return file.stem if found is None else found[1]
+    heading = re.search(r"^# (.+)$", text, re.MULTILINE)
+    return file.stem if heading is None else heading[1]
 
 
 def _interface(package: str, title: str) -> str:
     """The page of a package's public names, each described where it is defined."""
     loaded = import_module(package)
-    named = [getattr(loaded, name) for name in sorted(loaded.__all__, key=str.lower)]
-    homes = [f"{each.__module__}.{each.__qualname__}" for each in named if hasattr(each, "__qualname__")]
+    exports = [getattr(loaded, name) for name in sorted(loaded.__all__, key=str.lower)]
+    homes = [
+        f"{value.__module__}.{value.__qualname__}" for value in exports if hasattr(value, "__qualname__")
+    ]
     return (
         "\n\n".join([f"# {title}", f"```python\nimport {package}\n```", *(f"::: {home}" for home in homes)])
         + "\n"

@@ -1,6 +1,6 @@
 function canyon(request_file, response_file, walls)
   % Path loss in a straight street canyon by the image method: the direct path and one reflection each off the ground and
-  % both walls. Plain code for MATLAB and GNU Octave 7 or later; docs/command-engine.md describes the two files.
+  % both walls. Plain code for MATLAB and GNU Octave 7 or later; docs/reference/program-files.md describes the two files.
   % With 'half-space' as third argument it is a simpler model: nothing comes back from behind a surface.
   request = jsondecode(fileread(request_file));
   if ~strcmp(request.schema, 'calibray.request') || request.version ~= 1

@@ -18,7 +18,7 @@ from calibray.study import Setup, Study
 
 REPOSITORY = Path(__file__).parents[2]
 TOWN = REPOSITORY / "examples" / "bring_your_own"
-PAGE = (REPOSITORY / "docs" / "bring-your-own.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "guides" / "plans-and-tracks.md").read_text(encoding="utf-8")
 
 
 def typed(*words: object) -> str:
@@ -82,7 +82,9 @@ def test_a_plan_and_a_wide_table(tmp_path, monkeypatch):
         "init", tmp_path / "flat" / "scene.xml", flat / "rss.csv", "--transmitters", flat / "access_points.csv",
         "--frequency", "2.44e9", "--out", tmp_path / "study.toml",
     )  # fmt: skip
-    assert set(told.splitlines()) <= set(PAGE.splitlines()), "docs/bring-your-own.md shows what is printed"
+    assert set(told.splitlines()) <= set(PAGE.splitlines()), (
+        "docs/guides/plans-and-tracks.md shows what is printed"
+    )
     study = Study.load(tmp_path / "study.toml")
     assert list(study.links.wide) == ["rss_ap1", "rss_ap2", "rss_ap3"]
     assert study.trace.refraction
@@ -106,7 +108,9 @@ def test_footprints_a_height_model_and_a_track(tmp_path, monkeypatch):
         "init", tmp_path / "hill" / "scene.xml", hill / "power.csv", "--transmitters", hill / "masts.csv", "--track",
         hill / "walk.gpx", "--frequency", "2.1e9", "--out", tmp_path / "study.toml",
     )  # fmt: skip
-    assert set(told.splitlines()) <= set(PAGE.splitlines()), "docs/bring-your-own.md shows what is printed"
+    assert set(told.splitlines()) <= set(PAGE.splitlines()), (
+        "docs/guides/plans-and-tracks.md shows what is printed"
+    )
     study = Study.load(tmp_path / "study.toml")
     links = study.measurements()
     # Up to the north-east, as the ground rises.

@@ -310,10 +310,10 @@ def test_diffraction_at_metal_is_reciprocal_across_the_edge(wedge_both_ways: tup
 def test_known_disagreement_of_sionna_2_2_diffraction_along_the_edge_is_not_reciprocal(
     wedge_both_ways: tuple[Paths, Paths],
 ) -> None:
-    """Caused by the same wrong sign as at reflection boundaries, see test_fidelity.py and docs/fidelity.md."""
+    """Caused by the same wrong sign as at reflection boundaries, see test_fidelity.py and docs/explanation/fidelity.md."""
     forth, back = wedge_both_ways
     gap = np.abs(port_loss(forth, 0) - port_loss(back, 0))
-    assert gap.max() > 0.1, "Sionna repaired it: expect a gap of 0, and correct docs/fidelity.md"
+    assert gap.max() > 0.1, "Sionna repaired it: expect a gap of 0, and correct docs/explanation/fidelity.md"
 
 
 # Diffraction
@@ -433,7 +433,7 @@ def test_knife_edge_against_itu_r_p526(tmp_path: Path) -> None:
     """A metal screen halfway between the ends, traced: loss over free space by height of the edge.
 
     ITU-R P.526-15 section 4.1: J(nu) from Fresnel integrals (eq. 30) and its approximation (eq. 31). The electric
-    field stands across the edge; along the edge Sionna is up to 0.4 dB off (docs/fidelity.md).
+    field stands across the edge; along the edge Sionna is up to 0.4 dB off (docs/explanation/fidelity.md).
     """
     metal = (
         '<bsdf type="radio-material" id="mat-sheet"><float name="relative_permittivity" value="1"/>'

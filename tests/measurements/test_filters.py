@@ -15,7 +15,7 @@ from calibray.measurements.filter_language import FUNCTIONS, METHODS, TEXT_METHO
 from calibray.measurements.filters import evaluate
 from calibray.measurements.source_table import SourceTable
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "study-file.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "filters.md"
 
 FRAME = pd.DataFrame(
     {
@@ -186,8 +186,7 @@ def test_a_repeated_column_name_is_refused():
 
 
 def test_the_documentation_names_all_functions_and_methods():
-    text = DOCUMENT.read_text()
-    filters = text[text.index("### Filters") :].split("\n## ")[0]
+    filters = DOCUMENT.read_text(encoding="utf-8")
     for name in FUNCTIONS:
         assert f"`{name}`" in filters, name
     for prefix, methods in ((".", METHODS), (".str.", TEXT_METHODS)):

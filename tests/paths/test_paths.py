@@ -32,7 +32,7 @@ from calibray.paths import (
 from calibray.paths.checksum import BLOCK
 from calibray.paths.file_format import DATASETS
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "path-file.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "path-file.md"
 FLOATS = [name for name, entry in DATASETS.items() if entry.kind == "f"]
 SEQUENCES = st.lists(st.lists(st.sampled_from(Kind), max_size=4), max_size=8)
 

@@ -187,8 +187,8 @@ def test_what_cannot_be_told_is_asked_for(scene, tmp_path, columns, message):
 def test_the_schema_is_that_of_the_model():
     status, out, _ = typed("schema")
     assert (status, out) == (0, schema_text())
-    committed = (REPOSITORY / "docs" / "study.schema.json").read_text(encoding="utf-8")
-    assert committed == out, "run: calibray schema > docs/study.schema.json"
+    committed = (REPOSITORY / "docs" / "reference" / "study.schema.json").read_text(encoding="utf-8")
+    assert committed == out, "run: calibray schema > docs/reference/study.schema.json"
     content = json.loads(out)
     assert content["additionalProperties"] is False
     assert set(content["required"]) == {"version", "scene", "links", "parameters"}

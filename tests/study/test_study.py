@@ -345,19 +345,20 @@ def keys(model, prefix=""):
 
 
 def test_the_reference_names_every_key_and_no_other():
-    text = (REPOSITORY / "docs" / "study-file.md").read_text(encoding="utf-8")
+    pages = (REPOSITORY / "docs" / "reference").glob("study-*.md")
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     documented = re.findall(r"^\| `([^`]+)` \|", text, flags=re.MULTILINE)
     assert sorted(documented) == sorted(keys(Study))
 
 
 def test_the_reference_tells_the_defaults():
-    text = (REPOSITORY / "docs" / "study-file.md").read_text(encoding="utf-8")
+    text = (REPOSITORY / "docs" / "reference" / "study-file.md").read_text(encoding="utf-8")
     table = dict(re.findall(r"^\| `trace\.(\w+)` \| [^|]+ \| (\w+) \|", text, flags=re.MULTILINE))
     assert table == {name: str(value).lower() for name, value in TraceSettings().record().items()}
 
 
 def test_the_example_of_the_reference_is_a_valid_study():
-    text = (REPOSITORY / "docs" / "study-file.md").read_text(encoding="utf-8")
+    text = (REPOSITORY / "docs" / "reference" / "study-file.md").read_text(encoding="utf-8")
     example = re.search(r"```toml\n(.*?)```", text, flags=re.DOTALL).group(1)
     assert Study.from_content(tomllib.loads(example)).scene.frequency == 28.5e9
 

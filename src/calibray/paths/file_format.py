@@ -1,6 +1,6 @@
 """Content of a path file: every dataset with its shape, type and range, all checked when a file is read.
 
-`docs/path-file.md` explains the datasets.
+`docs/reference/path-file.md` explains the datasets.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Dataset:
     """One dataset of a path file.
 
     Attributes:
-        shape: Its sizes: numbers, or the letters of `docs/path-file.md`.
+        shape: Its sizes: numbers, or the letters of `docs/reference/path-file.md`.
         kind: "f" for numbers, "i" for integers, "O" for text.
         lower: Smallest value.
         upper: Largest value.

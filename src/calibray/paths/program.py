@@ -162,7 +162,7 @@ class Paths:
         return {**self.materials, **(materials or {})}
 
     def save(self, path: str | Path) -> None:
-        """Write an HDF5 file (format in docs/path-file.md), readable by h5py and MATLAB.
+        """Write an HDF5 file (format in docs/reference/path-file.md), readable by h5py and MATLAB.
 
         Args:
             path: File to write; replaced only once the new one is complete.

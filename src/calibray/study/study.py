@@ -50,7 +50,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 @final
 class Study(StudyModel):
-    """One calibration problem, as its study file states it; see ``docs/study-file.md``.
+    """One calibration problem, as its study file states it; see ``docs/reference/study-file.md``.
 
     Attributes:
         version: Version of the file format.

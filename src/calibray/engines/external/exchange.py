@@ -1,6 +1,6 @@
 """The files exchanged with an external program: the request of one RT call and its response, in JSON or HDF5.
 
-`docs/command-engine.md` documents the formats for authors of programs.
+`docs/reference/program-files.md` documents the formats for authors of programs.
 """
 
 from __future__ import annotations

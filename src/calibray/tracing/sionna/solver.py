@@ -272,7 +272,7 @@ class Solver:
             if self.settings.diffraction:
                 source = dr.gather(mi.Point3f, traced.source, buffer.source_indices)
                 target = dr.gather(mi.Point3f, traced.target, buffer.target_indices)
-                # Sionna's own lengths, so that replay follows its known error in them (docs/fidelity.md).
+                # Sionna's own lengths, so that replay follows its known error in them (docs/explanation/fidelity.md).
                 after, before = self._calculate_fields._diffraction_compute_s_s_prime(buffer, source, target)
                 wedges: Any = buffer.diffracting_wedges
                 edge, normal_n = (np.array(part, dtype=float).T for part in (wedges.e_hat, wedges.nn))
