@@ -1,4 +1,4 @@
-"""Every method on families of planted problems at equal budgets of RT calls: the tables of docs/measurements/methods-on-families.md.
+"""Every method on families of planted problems at equal budgets of RT calls (docs/measurements/methods-on-families.md).
 
     python benchmarks/family.py --workers 2                      # development: seeds 0 to 19
     python benchmarks/family.py --seeds 1000:1020 --workers 2    # judging: run once, reported whatever it says

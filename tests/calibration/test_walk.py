@@ -39,7 +39,7 @@ def test_scene_init_run(tmp_path, monkeypatch):
         "init", tmp_path / "town" / "scene.xml", tmp_path / "rsrp.csv", "--transmitters", TOWN / "cells.csv",
         "--frequency", "3.6e9", "--out", tmp_path / "study.toml",
     )  # fmt: skip
-    assert "not known: [offset] takes it" in told
+    assert "the transmitted power is unknown" in told
     shown = typed("run", tmp_path / "study.toml", "--out", tmp_path / "result")
     assert "averages too near the noise floor, left out" in shown
     result = Result.load(tmp_path / "result")

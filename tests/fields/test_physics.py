@@ -310,7 +310,7 @@ def test_diffraction_at_metal_is_reciprocal_across_the_edge(wedge_both_ways: tup
 def test_known_disagreement_of_sionna_2_2_diffraction_along_the_edge_is_not_reciprocal(
     wedge_both_ways: tuple[Paths, Paths],
 ) -> None:
-    """Caused by the same wrong sign as at reflection boundaries, see test_fidelity.py and docs/explanation/fidelity.md."""
+    """The cause is the wrong sign at reflection boundaries, see test_fidelity.py and docs/explanation/fidelity.md."""
     forth, back = wedge_both_ways
     gap = np.abs(port_loss(forth, 0) - port_loss(back, 0))
     assert gap.max() > 0.1, "Sionna repaired it: expect a gap of 0, and correct docs/explanation/fidelity.md"

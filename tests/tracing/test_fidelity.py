@@ -260,7 +260,9 @@ def test_known_disagreement_of_sionna_2_2_stale_vertices_after_a_diffraction() -
     shallow, deep = relative_error("munich"), relative_error("simple_street_canyon")  # max_depth 2 and 3
     assert len(shallow) >= 10
     assert shallow.max() < 1e-6
-    assert deep.min() > 1e-3, "Sionna repaired it: drop this test and its entry in docs/explanation/fidelity.md"
+    assert deep.min() > 1e-3, (
+        "Sionna repaired it: drop this test and its entry in docs/explanation/fidelity.md"
+    )
 
 
 def test_known_disagreement_of_sionna_2_2_reflection_boundary_of_a_wedge() -> None:
@@ -291,4 +293,6 @@ def test_known_disagreement_of_sionna_2_2_reflection_boundary_of_a_wedge() -> No
         reflected = np.abs(field[paths.link == 0])[kinds_of(paths)[:3].index((1,))]
         direct = np.abs(field[paths.link == 2]).max()
         assert jumps[1] < 0.02 * direct
-        assert jumps[0] > 1.9 * reflected, "Sionna repaired it: expect no jump, and correct docs/explanation/fidelity.md"
+        assert jumps[0] > 1.9 * reflected, (
+            "Sionna repaired it: expect no jump, correct docs/explanation/fidelity.md"
+        )
