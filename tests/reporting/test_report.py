@@ -127,9 +127,7 @@ tables = "display html markdown text"
 for name in [f"calibray.tables.{each}" for each in tables.split()]:
     importlib.import_module(name)
 assert "pandas" not in sys.modules
-for name in ("calibray.reporting.result_tables", "calibray.comparison.tables", "calibray.comparison.paper_tables"):
-    importlib.import_module(name)
-for name in "doctor_table figures ledger_table trace_tables".split():
+for name in "doctor_table ledger_table trace_tables result_tables figures".split():
     importlib.import_module(f"calibray.reporting.{name}")
 heavy = ("jax", "drjit", "mitsuba", "sionna", "calibray.calibration")
 print([name for name in heavy if name in sys.modules])

@@ -124,7 +124,7 @@ def test_meshes_that_cannot_be_read_are_named(tmp_path):
     file = write_scene(tmp_path, [MeshObject("body", "stone", cube())], STONE)
     mesh = tmp_path / "meshes" / "body.ply"
     mesh.write_bytes(mesh.read_bytes()[:150])
-    with pytest.raises(InputError, match=r"mesh .*body\.ply: cannot be read"):
+    with pytest.raises(InputError, match=r"mesh .*body\.ply: is not a PLY file, or its header is damaged"):
         check_scene(file)
     mesh.unlink()
     with pytest.raises(InputError, match="does not exist"):
