@@ -5,7 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 
-.PHONY: setup demo test lint bench docs site
+QUICK := tests/measurements tests/optimizers tests/parameters tests/result tests/tables tests/public_api tests/comparison/test_comparison.py
+
+.PHONY: setup demo test quick lint package lowest newest bench docs site
 
 setup: $(VENV)/.installed
 	tools/ensure_runtime.sh $(BIN)/python
@@ -15,6 +17,26 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --doctest-modules src tests
+
+# The tests that trace little, in about 90 seconds.
+quick: setup
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile -q $(QUICK)
+
+# The lowest versions that pyproject.toml allows, and the newest that can be had with the newest Python.
+lowest:
+	tools/make_venv.sh $(PYTHON) .venv-lowest
+	$(PYTHON) tools/lowest.py test > .venv-lowest/constraints.txt
+	.venv-lowest/bin/pip install --quiet --constraint .venv-lowest/constraints.txt --editable '.[test]'
+	.venv-lowest/bin/python -m pytest --numprocesses auto --dist loadfile -q $(QUICK)
+
+newest:
+	tools/make_venv.sh python3.13 .venv-newest
+	.venv-newest/bin/pip install --quiet --upgrade --upgrade-strategy eager --editable '.[test]'
+	.venv-newest/bin/python -m pytest --numprocesses auto --dist loadfile -q $(QUICK)
+
+# The built package, installed into a fresh environment, runs the demo.
+package: setup
+	tools/check_package.sh $(BIN)/python
 
 # What builds the pages is checked too, against the packages that it calls.
 lint: $(VENV)/.lint $(VENV)/.docs
