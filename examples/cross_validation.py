@@ -1,9 +1,9 @@
-"""Hold out one block of the map after another, calibrate on the rest, and print how each is predicted.
+"""Hold out one block of links after another, calibrate on the rest, and print the RMSE on each block.
 
 Usage: `python examples/cross_validation.py examples/nist_boulder.toml`
 
-A single hold-out can flatter; here every link is held out once, together with its neighbours. The scene is traced once,
-with the materials before calibration, and not again with those found.
+Every link is held out once, together with its neighbours. The scene is traced once, with the initial materials, and not
+again with the calibrated ones. `calibray validate` does the same with blocks of equal size.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BLOCKS = {
     },
 }
 COLUMNS = (
-    Column("RMSE [dB] of the block held out"),
+    Column("RMSE [dB] of the held-out block"),
     *map(numbers, ("links", "before", "offset only", "after", "log-distance model")),
 )
 
@@ -38,7 +38,7 @@ def main(file: str) -> None:
     """Cross-validate a study.
 
     Args:
-        file: The study file, one of those that `BLOCKS` knows.
+        file: The study file, one of those in `BLOCKS`.
     """
     study = cb.Study.load(file)
     engine = cb.engines.make(study)
@@ -53,10 +53,8 @@ def main(file: str) -> None:
             result.accuracy.log_distance_holdout_rmse_db,
         )
         rows.append((name, str(result.links.held_out.sum()), *(f"{score:.2f}" for score in scores)))
-        found = ", ".join(
-            f"{key} {value:.3g}" for key, value in (result.parameters | result.nuisance.offsets_db).items()
-        )
-        sys.stderr.write(f"{name}: {found}\n")
+        values = (result.parameters | result.nuisance.offsets_db).items()
+        sys.stderr.write(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in values) + "\n")
     sys.stdout.write(render(Table("", COLUMNS, tuple(rows))) + "\n")
 
 

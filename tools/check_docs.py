@@ -20,6 +20,12 @@ ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("tutorial", "guides", "reference", "explanation")
 """Folders of documentation by kind, whose pages are short."""
 
+PYTHON_FILES = [
+    file
+    for folder in ("src", "tests", "benchmarks", "examples", "tools")
+    for file in (ROOT / folder).rglob("*.py")
+]
+
 LONGEST = 1500
 """Largest number of words of such a page."""
 
@@ -101,6 +107,20 @@ def missing_options(text: str, options: dict[str, dict[str, set[str]]]) -> Itera
                     yield f"calibray {command} {name}"
 
 
+def missing_modules(text: str) -> Iterator[str]:
+    """Find Python files that do not exist, in inline code.
+
+    Args:
+        text: The Markdown text.
+
+    Yields:
+        Each such file. A name without its folder may be in any folder.
+    """
+    for name in re.findall(r"`([a-z0-9_/-]+\.py)`", _FENCE.sub("", text)):
+        if not any(file.as_posix().endswith("/" + name) for file in PYTHON_FILES):
+            yield name
+
+
 def options_of(command: Any) -> set[str]:
     """The options of a command.
 
@@ -143,6 +163,7 @@ if __name__ == "__main__":
         for document in documents
         for fault in [
             *missing_links(document, document.read_text()),
+            *missing_modules(document.read_text()),
             *missing_commands(document.read_text(), commands),
             *missing_options(document.read_text(), options),
         ]
