@@ -49,10 +49,8 @@ def test_the_second_drafts_a_study_of_a_map_and_a_log(monkeypatch, cache, capsys
 
 def test_the_third_finds_the_offset_that_was_not_declared(monkeypatch, cache, capsys):
     left = run("3-what-the-data-can-tell.ipynb", monkeypatch, cache)
-    assert left["without"].free_offset_db == pytest.approx(
-        left["cable"], abs=3 * left["without"].free_offset_error_db
-    )
-    assert left["result"].offsets_db[""] == pytest.approx(left["cable"], abs=1.0)
+    assert left["offset"] == pytest.approx(left["cable"], abs=3 * left["error"])
+    assert left["result"].nuisance.offsets_db[""] == pytest.approx(left["cable"], abs=1.0)
     assert len(left["suggested"]) == 2
     assert left["result"].rmse_db < left["without"].rmse_db
     assert "offset" in capsys.readouterr().out
