@@ -35,7 +35,7 @@ from scipy.special import expit, fdtri
 
 from calibray import engines
 from calibray.fitting.problem import Problem
-from calibray.prediction.experiment_design import Beliefs, Errors, choose
+from calibray.prediction.experiment_design import Beliefs, Errors, choose_candidates
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import AVENUES, STREETS, district, scene_objects
 from calibray.scenes import write_scene
@@ -172,7 +172,7 @@ class Exact:
             (square[rows] - square.min()) / noise**2,
         )
         errors = Errors(noise, np.zeros((len(others), 0)), self.place[others])
-        found = choose(beliefs, self.loss[np.ix_(rows, others)], slope[:, others], errors, MORE)
+        found = choose_candidates(beliefs, self.loss[np.ix_(rows, others)], slope[:, others], errors, MORE)
         return others[[each.index for each in found]], found[-1].narrowed
 
     def best(

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from calibray.measurements import read_measurements as read_measurements
     from calibray.paths import Paths as Paths
     from calibray.prediction.coverage_map import coverage_map as coverage_map
-    from calibray.prediction.map_files import save_map as save_map
     from calibray.prediction.suggestion import suggest as suggest
     from calibray.reporting.page import report as report
     from calibray.study import Setup as Setup
@@ -50,7 +49,6 @@ _HOMES = {
     "engines": "calibray.engines",
     "optimizers": "calibray.optimizers",
     "coverage_map": "calibray.prediction.coverage_map",
-    "save_map": "calibray.prediction.map_files",
     "report": "calibray.reporting.page",
 }
 

@@ -23,8 +23,8 @@ from calibray.engines.cluster.chunks import cut, trace_in_chunks
 from calibray.engines.cluster.workers import InProcess
 from calibray.errors import InputError
 from calibray.measurements import Measurements, PiecedTable, links_from_frame
-from calibray.prediction import batches as shared_out
-from calibray.prediction.batches import predicted, predicted_in_pieces
+from calibray.prediction import batches
+from calibray.prediction.batches import predict_batches, predict_links
 from calibray.study import Setup
 from calibray.support.output_files import growing_table
 from calibray.validation.validate import validate
@@ -61,8 +61,8 @@ def new_links(count: int = 40) -> pd.DataFrame:
 def test_predictions_in_blocks_are_those_of_one_piece(found, level):
     setup = Setup.open(found.study, two_ray.TwoRay, links_from_frame(new_links()))
     told: list[tuple[str, int, int | None]] = []
-    whole = predicted(found, setup, level, remarked=True)
-    parts = predicted(
+    whole = predict_links(found, setup, level, remarked=True)
+    parts = predict_links(
         found, setup, level, lambda *each: told.append(each), InProcess(at_most=1), remarked=True
     )
     assert any(np.diff(np.concatenate(cut(setup.links, 7))) < 0)
@@ -162,10 +162,12 @@ def test_what_is_written_in_pieces_is_what_is_written_at_once(found, tmp_path, m
         plain = pyarrow.Table.from_pandas(mixed(40), preserve_index=False).replace_schema_metadata(None)
         parquet.write_table(plain, source)
     found.save(tmp_path / "out")
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
+    monkeypatch.setattr(
+        batches, "open_for_links", lambda result, links, allow_changed_inputs: opened(result, links)
+    )
     written = []
     for size in (40, 9):
-        monkeypatch.setattr(shared_out, "PIECE", size)
+        monkeypatch.setattr(batches, "BATCH", size)
         out = tmp_path / f"told{size}{kind}"
         words = ["predict", str(tmp_path / "out"), str(source), "-o", str(out), "--level", "0.9"]
         outcome = CliRunner().invoke(app, words)
@@ -181,10 +183,12 @@ def test_a_row_that_cannot_be_used_is_refused_before_any_is_traced(found, tmp_pa
     table = new_links()
     table.loc[37, "rx_x"] = np.nan
     table.to_parquet(tmp_path / "links.parquet")
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
-    monkeypatch.setattr(shared_out, "PIECE", 9)
+    monkeypatch.setattr(
+        batches, "open_for_links", lambda result, links, allow_changed_inputs: opened(result, links)
+    )
+    monkeypatch.setattr(batches, "BATCH", 9)
     monkeypatch.setattr(Setup, "trace", None)
-    rows = predicted_in_pieces(found, PiecedTable.open(tmp_path / "links.parquet"), None)
+    rows = predict_batches(found, PiecedTable.open(tmp_path / "links.parquet"), None)
     with pytest.raises(InputError, match="'rx_x' is missing or not finite in 1 of 4 rows"):
         next(rows)
 
@@ -207,9 +211,11 @@ def test_memory_does_not_grow_with_the_rows(found, tmp_path, monkeypatch, kind):
     def cheap(result, setup, *_, **__):
         return pd.DataFrame({"path_loss_db": setup.links.distance, "remark": ""})
 
-    monkeypatch.setattr(shared_out, "opened", lambda result, links, **_: opened(result, links))
-    monkeypatch.setattr(shared_out, "predicted", cheap)
-    monkeypatch.setattr(shared_out, "PIECE", 500)
+    monkeypatch.setattr(
+        batches, "open_for_links", lambda result, links, allow_changed_inputs: opened(result, links)
+    )
+    monkeypatch.setattr(batches, "predict_links", cheap)
+    monkeypatch.setattr(batches, "BATCH", 500)
     peaks = []
     for count in (500, 2_000, 16_000):
         source = tmp_path / f"links{count}.parquet"
@@ -218,7 +224,7 @@ def test_memory_does_not_grow_with_the_rows(found, tmp_path, monkeypatch, kind):
         tracemalloc.start()
         arrow = 0
         with growing_table(tmp_path / f"told{count}{kind}") as append:
-            for links, told in predicted_in_pieces(found, PiecedTable.open(source), None):
+            for links, told in predict_batches(found, PiecedTable.open(source), None):
                 append(links.frame.assign(path_loss_db=told["path_loss_db"]))
                 arrow = max(arrow, pyarrow.total_allocated_bytes() - before)
         peaks.append(tracemalloc.get_traced_memory()[1] + arrow)

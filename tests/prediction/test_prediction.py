@@ -1,4 +1,4 @@
-"""What predictions say beside path loss: what was measured, odd places, and what measured links nearby tell."""
+"""Predictions: the measured quantity, remarks on positions, and the residual field near measured links."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import planted
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.cli.app import app
-from calibray.prediction.position_checks import standing
-from calibray.prediction.residual_field import carried, measured_errors
+from calibray.prediction.position_checks import locate
+from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.prediction.suggestion import suggest
 from calibray.result.prediction_model import ResidualField
 from calibray.scenes import Triangles
@@ -46,68 +46,68 @@ def received(tmp_path_factory) -> Result:
         return calibrate(plan, engine=planted.engine())
 
 
-def test_received_power_is_predicted_as_it_was_measured(received):
+def test_received_power_is_predicted_in_the_measured_quantity(received):
     table = planted.links(blocked=True).assign(sent_dbm=33.0)
-    told = received.predict_interval(table)
-    assert told.received_power_dbm.to_numpy() == pytest.approx(33.0 - told.path_loss_db.to_numpy())
-    reached = np.isfinite(told.lower_db)
-    ends = told[reached]
+    predictions = received.predict_interval(table)
+    assert predictions.received_power_dbm.to_numpy() == pytest.approx(
+        33.0 - predictions.path_loss_db.to_numpy()
+    )
+    reached = np.isfinite(predictions.lower_db)
+    ends = predictions[reached]
     assert (ends.received_power_lower_dbm < ends.received_power_dbm).all()
     assert ends.received_power_upper_dbm.to_numpy() == pytest.approx(33.0 - ends.lower_db.to_numpy())
     # Without the power there is path loss alone.
     assert "received_power_dbm" not in received.predict_interval(planted.links())
-    assert (told.remark[planted.INSIDE], told.basis[planted.INSIDE]) == (
-        "receiver inside a building",
-        "no path",
-    )
-    assert set(told.remark[reached]) == {""}
+    assert predictions.remark[planted.INSIDE] == "receiver inside a building"
+    assert predictions.basis[planted.INSIDE] == "no path"
+    assert set(predictions.remark[reached]) == {""}
 
 
-def test_a_table_like_the_measured_one_is_predicted_at(tmp_path):
-    """Columns that the study names, the transmitter's place with it: by Python, and by the command."""
+def test_a_table_with_the_columns_of_the_measurements_is_predicted(tmp_path):
+    """The study names the columns and gives the transmitter's position."""
     names = {"rx_x": "east", "rx_y": "north"}
     table = planted.campaign(noise_db=0.3).rename(columns=names)[["east", "north", "path_loss_db"]]
     links = {
         "file": "links.csv", "tx": [0.0, 0.0, 3.0], "rx": ["east", "north", 1.5], "value": "path_loss_db",
     }  # fmt: skip
     method = {"name": "auto", "options": {"starts": 16}}
-    found = calibrate(planted.study(tmp_path, table, links=links, method=method), engine=planted.engine())
+    result = calibrate(planted.study(tmp_path, table, links=links, method=method), engine=planted.engine())
     standard = planted.links().iloc[::3]
-    theirs = standard.rename(columns=names)[["east", "north"]]
-    told = found.predict(standard)
-    assert np.isfinite(told).all()
-    assert found.predict(theirs) == pytest.approx(told)
-    assert found.predict_interval(theirs).upper_db.to_numpy() == pytest.approx(
-        found.predict_interval(standard).upper_db.to_numpy()
+    own_columns = standard.rename(columns=names)[["east", "north"]]
+    predicted = result.predict(standard)
+    assert np.isfinite(predicted).all()
+    assert result.predict(own_columns) == pytest.approx(predicted)
+    assert result.predict_interval(own_columns).upper_db.to_numpy() == pytest.approx(
+        result.predict_interval(standard).upper_db.to_numpy()
     )
-    assert suggest(found, theirs, 1).row.tolist() == suggest(found, standard, 1).row.tolist()
-    found.save(tmp_path / "out")
-    theirs.to_csv(tmp_path / "new.csv", index=False)
-    outcome = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "new.csv")])
-    assert outcome.exit_code == 0, outcome.output
-    printed = pd.read_csv(io.StringIO(outcome.stdout))
+    assert suggest(result, own_columns, 1).row.tolist() == suggest(result, standard, 1).row.tolist()
+    result.save(tmp_path / "out")
+    own_columns.to_csv(tmp_path / "new.csv", index=False)
+    run = CliRunner().invoke(app, ["predict", str(tmp_path / "out"), str(tmp_path / "new.csv")])
+    assert run.exit_code == 0, run.output
+    printed = pd.read_csv(io.StringIO(run.stdout))
     assert printed.columns.tolist() == ["east", "north", "path_loss_db"]
-    assert printed.path_loss_db.to_numpy() == pytest.approx(told)
+    assert printed.path_loss_db.to_numpy() == pytest.approx(predicted)
 
 
-def test_the_command_adds_the_columns_and_warns_of_odd_places(received, tmp_path):
+def test_the_command_adds_columns_and_warns_of_implausible_positions(received, tmp_path):
     received.save(tmp_path / "out")
     table = planted.links().head(3).assign(sent_dbm=30.0)
     table.loc[1, "rx_z"], table.loc[2, "rx_x"] = -2.0, 5000.0
     table.to_csv(tmp_path / "new.csv", index=False)
     arguments = ["predict", str(tmp_path / "out"), str(tmp_path / "new.csv"), "--level", "0.9"]
-    outcome = CliRunner().invoke(app, arguments)
-    assert outcome.exit_code == 0, outcome.output
-    told = pd.read_csv(io.StringIO(outcome.stdout), keep_default_na=False)
-    words = ["basis", "received_power_dbm", "received_power_lower_dbm", "received_power_upper_dbm", "remark"]
-    assert told.columns.tolist() == [*table.columns, "path_loss_db", "lower_db", "upper_db", *words]
-    assert told.remark.tolist() == ["", "receiver under the ground", "receiver beyond the scene"]
-    assert "receiver under the ground: 1 of 3 links, row 3" in outcome.stderr
-    assert "receiver beyond the scene: 1 of 3 links, row 4" in outcome.stderr
+    run = CliRunner().invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    predictions = pd.read_csv(io.StringIO(run.stdout), keep_default_na=False)
+    added = ["basis", "received_power_dbm", "received_power_lower_dbm", "received_power_upper_dbm", "remark"]
+    assert predictions.columns.tolist() == [*table.columns, "path_loss_db", "lower_db", "upper_db", *added]
+    assert predictions.remark.tolist() == ["", "receiver under the ground", "receiver beyond the scene"]
+    assert "receiver under the ground: 1 of 3 links, row 3" in run.stderr
+    assert "receiver beyond the scene: 1 of 3 links, row 4" in run.stderr
 
 
-def test_where_a_point_stands():
-    """A box on a wide sheet, with another sheet as a bridge of two surfaces beside it."""
+def test_points_are_located():
+    """A box on a wide sheet, next to a bridge of two surfaces."""
     x, y = np.array([[-50, -50], [50, -50], [50, 50], [-50, 50]]).T
     ground = np.column_stack([x, y, np.zeros(4)])
 
@@ -122,64 +122,65 @@ def test_where_a_point_stands():
     points = np.array(
         [[0, 0, 1.5], [0, 0, 12], [20, 0, 1.5], [20, 0, 5.5], [30, 0, 1.5], [30, 0, -1], [90, 0, 1.5]]
     )
-    assert standing(scene, points).tolist() == [
+    assert locate(scene, points).tolist() == [
         "inside a building", "", "", "inside a building", "", "under the ground", "beyond the scene"
     ]  # fmt: skip
 
 
-def test_errors_are_carried_to_neighbours_and_no_further():
+def test_residuals_are_kriged_to_neighbours_only():
     random = np.random.default_rng(3)
-    known = np.column_stack([random.uniform(0, 100, (200, 2)), np.zeros((200, 4))])
-    place = np.column_stack([random.uniform(0, 100, (400, 2)), np.zeros((400, 4))])
-    every = np.vstack([known, place])
-    distance = np.linalg.norm(every[:, None, :2] - every[None, :, :2], axis=2)
+    measured = np.column_stack([random.uniform(0, 100, (200, 2)), np.zeros((200, 4))])
+    position = np.column_stack([random.uniform(0, 100, (400, 2)), np.zeros((400, 4))])
+    all_positions = np.vstack([measured, position])
+    distance = np.linalg.norm(all_positions[:, None, :2] - all_positions[None, :, :2], axis=2)
     root = np.linalg.cholesky(np.exp(-distance / FIELD.range_m) + 1e-9 * np.eye(600))
     errors = FIELD.shared_db * root @ random.standard_normal(600) + FIELD.own_db * random.standard_normal(600)
-    added, share = carried(FIELD, known, errors[:200], place)
-    left = errors[200:] - added
-    # What is left scatters as the share says.
+    correction, share = krige_residuals(FIELD, measured, errors[:200], position)
+    remaining = errors[200:] - correction
+    # The scatter of the remaining errors agrees with the share.
     deviation = np.sqrt((1 - share) * (FIELD.shared_db**2 + FIELD.own_db**2) + share * FIELD.own_db**2)
-    assert np.mean(np.abs(left) < 1.645 * deviation) == pytest.approx(0.9, abs=0.04)
-    assert left.std() < 0.8 * errors[200:].std()
-    far = carried(FIELD, known, errors[:200], place + 1e4)
+    assert np.mean(np.abs(remaining) < 1.645 * deviation) == pytest.approx(0.9, abs=0.04)
+    assert remaining.std() < 0.8 * errors[200:].std()
+    far = krige_residuals(FIELD, measured, errors[:200], position + 1e4)
     assert np.abs(far).max() < 1e-9
-    few = carried(FIELD, known[:60], errors[:60], place[:5])
-    many = carried(FIELD, np.vstack([known[:60], known[:60] + 1e4] * 10), np.tile(errors[:60], 20), place[:5])
+    few = krige_residuals(FIELD, measured[:60], errors[:60], position[:5])
+    many = krige_residuals(
+        FIELD, np.vstack([measured[:60], measured[:60] + 1e4] * 10), np.tile(errors[:60], 20), position[:5]
+    )
     assert many[0] == pytest.approx(few[0], abs=1.5)
-    found = shared_errors(errors, every)
-    assert found is not None
-    assert found.shared_db == pytest.approx(FIELD.shared_db, rel=0.5)
+    correlation = shared_errors(errors, all_positions)
+    assert correlation is not None
+    assert correlation.shared_db == pytest.approx(FIELD.shared_db, rel=0.5)
 
 
-def test_predictions_lean_towards_measured_links_nearby_with_a_narrower_interval(received, tmp_path):
-    assert received.residual_field is None
+def test_measured_links_nearby_correct_predictions_and_narrow_the_interval(received, tmp_path):
+    assert received.prediction.residual_field is None
     table = planted.links().assign(sent_dbm=30.0)
     plain = received.predict_interval(table)
-    field = ResidualField(
-        range_m=20.0, shared_db=0.9 * received.residual_db, own_db=0.4 * received.residual_db
-    )
-    fielded = changed(received, residual_field=field)
-    told = fielded.predict_interval(table)
-    _, errors = measured_errors(received.links)
-    moved = told.path_loss_db.to_numpy() - plain.path_loss_db.to_numpy()
-    assert np.corrcoef(moved, errors)[0, 1] > 0.8
-    assert ((told.upper_db - told.lower_db) < (plain.upper_db - plain.lower_db)).all()
-    assert told.basis.str.endswith(", beside measured links").all()
-    assert told.path_loss_db.to_numpy() == pytest.approx(fielded.predict(table), abs=1e-6)
-    fielded.save(tmp_path / "out")
+    size = received.accuracy.residual_db
+    field = ResidualField(range_m=20.0, shared_db=0.9 * size, own_db=0.4 * size)
+    with_field = changed(received, residual_field=field)
+    predictions = with_field.predict_interval(table)
+    _, errors = calibration_residuals(received.links)
+    correction = predictions.path_loss_db.to_numpy() - plain.path_loss_db.to_numpy()
+    assert np.corrcoef(correction, errors)[0, 1] > 0.8
+    assert ((predictions.upper_db - predictions.lower_db) < (plain.upper_db - plain.lower_db)).all()
+    assert predictions.basis.str.endswith(", near measured links").all()
+    assert predictions.path_loss_db.to_numpy() == pytest.approx(with_field.predict(table), abs=1e-6)
+    with_field.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
     assert loaded.prediction.residual_field == field
     # The table of links is written with ten digits.
-    pd.testing.assert_frame_equal(loaded.predict_interval(table), told, rtol=1e-6)
+    pd.testing.assert_frame_equal(loaded.predict_interval(table), predictions, rtol=1e-6)
 
 
-def test_of_many_errors_the_share_within_reach_is_what_was_asked_for():
+def test_the_interval_of_many_errors_has_the_requested_coverage():
     random = np.random.default_rng(1)
-    held = []
+    inside = []
     for _ in range(300):
         errors = np.abs(random.standard_t(3, 61))
-        held.append(errors[-1] <= interval_half_width(np.sort(errors[:-1]), 0.9))
-    assert np.mean(held) == pytest.approx(0.9, abs=0.05)
+        inside.append(errors[-1] <= interval_half_width(np.sort(errors[:-1]), 0.9))
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
     few = np.abs(random.standard_normal(FEWEST_FOR_RANKS - 1))
     assert interval_half_width(np.sort(few), 0.9) == pytest.approx(1.685 * np.sqrt(np.mean(few**2)), rel=1e-2)
     assert interval_half_width(np.ones(50), 0.999) > 3.0

@@ -1,4 +1,4 @@
-"""Where to measure next, of a whole calibration: a flat ground seen by two rays, and the command."""
+"""Suggestions for a calibration of a flat ground with two rays per link, and the command."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ GROUND = (
 )
 
 
-def places(distance: np.ndarray) -> pd.DataFrame:
-    """Links of some lengths from a mast of 10 m, all at one site."""
+def links_at(distance: np.ndarray) -> pd.DataFrame:
+    """Links of given lengths [m] from a mast of 10 m, all at one site."""
     count = len(distance)
     rx = np.stack([distance, np.zeros(count), np.full(count, 1.5)], axis=1)
     return pd.DataFrame(np.hstack([np.tile([0.0, 0.0, 10.0], (count, 1)), rx]), columns=COLUMNS).assign(
@@ -43,22 +43,22 @@ def places(distance: np.ndarray) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory):
-    """A noisy campaign over a flat ground, calibrated into `out`; wherever Sionna would trace, two rays are."""
+    """A noisy campaign over a flat ground, calibrated into `out`; a two-ray model replaces Sionna."""
     folder = tmp_path_factory.mktemp("suggest")
     corners = [(-300.0, -300.0, 0.0), (300.0, -300.0, 0.0), (300.0, 300.0, 0.0), (-300.0, 300.0, 0.0)]
     file, antenna = write_scene(folder, {"floor": [corners]}, GROUND, "mat-ground"), Antenna("dipole")
     truth = {"ground": {"relative_permittivity": TRUTH, "conductivity": 0.5, "thickness": 1.0}}
     tracer = TwoRay(read_scene(file, FREQUENCY, truth), FREQUENCY, TraceSettings(), antenna, antenna)
-    table = places(np.geomspace(40, 150, 14))
+    table = links_at(np.geomspace(40, 150, 14))
     loss = path_loss(tracer.trace(links_from_frame(table)), combining="coherent")
     loss = loss + 0.5 * np.random.default_rng(4).standard_normal(len(loss))
     table.assign(path_loss_db=loss).to_csv(folder / "links.csv", index=False, float_format="%.17g")
-    places(np.geomspace(3, 290, 25)).to_csv(folder / "candidates.csv", index=False)
+    links_at(np.geomspace(3, 290, 25)).to_csv(folder / "candidates.csv", index=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", str(folder / "cache"))
         patch.setattr("calibray.tracing.default_tracer.SionnaFactory.versions", {"two-ray": "1"})
         patch.setattr(
-            "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *given: TwoRay(*given)
+            "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *arguments: TwoRay(*arguments)
         )
         cb.calibrate(study(folder), out=folder / "out")
         yield folder
@@ -88,35 +88,34 @@ def table(folder: Path) -> pd.DataFrame:
     return pd.read_csv(folder / "candidates.csv")
 
 
-def test_the_first_point_is_the_one_that_a_measurement_there_tells_most(result, table):
-    """Against the textbook: one parameter and one offset, linear around the optimum."""
-    found = cb.suggest(result, table, 1)
-    told = np.abs(_slope(result, table) - _slope(result, result.links.assign(site="a")).mean())
-    assert told[table.rx_x == found.rx_x[0]] > 0.9 * np.sort(told)[-3]
+def test_the_first_suggestion_has_the_largest_slope(result, table):
+    """Reference: one parameter and one offset, linear around the optimum."""
+    suggestions = cb.suggest(result, table, 1)
+    slope = np.abs(_slope(result, table) - _slope(result, result.links.assign(site="a")).mean())
+    assert slope[table.rx_x == suggestions.rx_x[0]] > 0.9 * np.sort(slope)[-3]
 
 
 def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
-    """Change of path loss by the permittivity, from predictions of results that differ in it."""
+    """Derivative of path loss with respect to the permittivity, by central differences [dB]."""
     loss = [_predicted(result, links, result.parameters[NAME] * factor) for factor in (0.99, 1.01)]
     return (loss[1] - loss[0]) / (0.02 * result.parameters[NAME])
 
 
 def _predicted(result: Result, links: pd.DataFrame, value: float) -> np.ndarray:
     """Path loss of links for another permittivity, with the result's offset."""
-    ground = changed(result.materials["ground"], relative_permittivity=value)
+    ground = replace(result.materials["ground"], relative_permittivity=value)
     return changed(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]])
 
 
-def test_intervals_are_expected_to_narrow_with_every_point(result, table):
+def test_intervals_are_expected_to_narrow_with_every_suggestion(result, table):
     interval, width = result.intervals[NAME], cb.suggest(result, table, 6)[f"{NAME}_width"].to_numpy()
     assert width[-1] < 0.9 * (interval.upper - interval.lower)
     assert (np.diff(width) < 1e-9).all()
 
 
-def test_what_is_expected_comes_about(folder, result, table):
-    """Measured there in truth, the intervals become about as narrow as was said."""
-    found = cb.suggest(result, table, 4)
-    chosen = table[table.rx_x.isin(found.rx_x)]
+def test_measured_suggestions_narrow_the_interval_as_expected(folder, result, table):
+    suggestions = cb.suggest(result, table, 4)
+    chosen = table[table.rx_x.isin(suggestions.rx_x)]
     scene = read_scene(folder / "scene.xml", FREQUENCY, {"ground": {"relative_permittivity": TRUTH}})
     antenna = Antenna("dipole")
     tracer = TwoRay(scene, FREQUENCY, TraceSettings(), antenna, antenna)
@@ -131,34 +130,34 @@ def test_what_is_expected_comes_about(folder, result, table):
         content["links"] = {**content["links"], "file": "more.csv"}
         interval = cb.calibrate(Study.from_content(content, folder / "study.toml")).intervals[NAME]
         widths.append(interval.upper - interval.lower)
-    # What is expected takes errors for independent and Gaussian, the intervals average over other kinds as well.
-    assert np.mean(widths) == pytest.approx(found[f"{NAME}_width"].iloc[-1], rel=0.5)
+    # The expectation assumes independent Gaussian errors; the intervals average over other noise models as well.
+    assert np.mean(widths) == pytest.approx(suggestions[f"{NAME}_width"].iloc[-1], rel=0.5)
 
 
-def test_a_site_never_measured_tells_little(result, table):
-    """Its offset is anybody's guess, which the first point there goes to."""
-    known, strange = (cb.suggest(result, table.assign(site=site), 2)[f"{NAME}_width"] for site in ("a", "b"))
+def test_a_new_site_gains_little(result, table):
+    """The first measurement there determines the offset of the site."""
+    measured, new = (cb.suggest(result, table.assign(site=site), 2)[f"{NAME}_width"] for site in ("a", "b"))
     interval = result.intervals[NAME]
-    assert strange[0] > 0.97 * (interval.upper - interval.lower) > known[0]
-    assert strange[1] < strange[0]
+    assert new[0] > 0.97 * (interval.upper - interval.lower) > measured[0]
+    assert new[1] < new[0]
 
 
-def test_the_command_prints_and_writes_what_the_function_finds(folder, result, table):
+def test_the_command_prints_and_writes_the_suggestions(folder, result, table):
     command = ["suggest", str(folder / "out"), str(folder / "candidates.csv"), "--count", "3"]
-    told = CliRunner().invoke(app, [*command, "--json", "--out", str(folder / "next.csv")])
-    assert told.exit_code == 0, told.output
-    written, found = pd.read_csv(folder / "next.csv"), cb.suggest(result, table, 3)
-    assert written.rx_x.tolist() == found.rx_x.tolist()
-    assert [each["rx_x"] for each in json.loads(told.stdout)] == pytest.approx(found.rx_x.tolist())
-    shown = CliRunner().invoke(app, command).stdout
-    assert "Where to measure next" in shown
-    assert "(now " in shown
+    run = CliRunner().invoke(app, [*command, "--json", "--out", str(folder / "next.csv")])
+    assert run.exit_code == 0, run.output
+    written, suggestions = pd.read_csv(folder / "next.csv"), cb.suggest(result, table, 3)
+    assert written.rx_x.tolist() == suggestions.rx_x.tolist()
+    assert [row["rx_x"] for row in json.loads(run.stdout)] == pytest.approx(suggestions.rx_x.tolist())
+    printed = CliRunner().invoke(app, command).stdout
+    assert "Where to measure next" in printed
+    assert "(now " in printed
 
 
-def test_what_cannot_be_suggested_is_refused(result, table):
+def test_impossible_suggestions_are_refused(result, table):
     with pytest.raises(InputError, match="count = 0"):
         cb.suggest(result, table, 0)
-    with pytest.raises(InputError, match="kept no draws"):
+    with pytest.raises(InputError, match="has no draws from the posterior"):
         cb.suggest(changed(result, draws={}), table)
     with pytest.raises(InputError, match="tx_x"):
         cb.suggest(result, table.drop(columns="tx_x"))
@@ -166,10 +165,10 @@ def test_what_cannot_be_suggested_is_refused(result, table):
         cb.suggest(changed(result, files={name: "0" * 64 for name in result.provenance.files}), table)
 
 
-def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
-    """Of 128 draws three lie in the second range; to narrow the first, another place would come before."""
+def test_where_two_ranges_fit_the_first_suggestion_distinguishes_them(result, table):
+    """Three of 128 draws lie in the second range; another point would narrow the first range more."""
     values = np.where(np.arange(128) % 50 == 1, 14.0, np.linspace(3.0, 9.0, 128))
-    interval = changed(result.intervals[NAME], lower=3.0, upper=14.1, pieces=((3.0, 9.0), (13.9, 14.1)))
+    interval = replace(result.intervals[NAME], lower=3.0, upper=14.1, pieces=((3.0, 9.0), (13.9, 14.1)))
     two = changed(result, rmse_db=1.0, draws={NAME: values.tolist()}, intervals={NAME: interval})
     one = changed(two, intervals={NAME: replace(interval, pieces=((3.0, 14.1),))})
     loss = [
@@ -177,12 +176,12 @@ def test_where_two_ranges_fit_the_first_point_tells_them_apart(result, table):
         for links in (table, result.links.assign(site="a"))
         for value in (6.0, 14.0)
     ]
-    apart = np.abs(loss[1] - loss[0] - (loss[3] - loss[2]).mean())
-    told, alone = cb.suggest(two, table, 1), cb.suggest(one, table, 1)
-    assert apart[table.rx_x == told.rx_x[0]] == apart.max()
-    assert apart[table.rx_x == alone.rx_x[0]] < apart.max()
-    assert told[f"{NAME}_sure"][0] < 1
-    assert f"{NAME}_sure" not in alone
+    difference = np.abs(loss[1] - loss[0] - (loss[3] - loss[2]).mean())
+    for_two, for_one = cb.suggest(two, table, 1), cb.suggest(one, table, 1)
+    assert difference[table.rx_x == for_two.rx_x[0]] == difference.max()
+    assert difference[table.rx_x == for_one.rx_x[0]] < difference.max()
+    assert for_two[f"{NAME}_sure"][0] < 1
+    assert f"{NAME}_sure" not in for_one
     even = np.where(np.arange(128) % 2 == 1, 14.0, values)
     gain = cb.suggest(changed(two, draws={NAME: even.tolist()}), table, 1).gain[0]
-    assert f"{NAME}'s right range known with" in gain
+    assert f"right range of {NAME} known with" in gain

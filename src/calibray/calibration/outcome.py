@@ -19,7 +19,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
-from calibray.prediction.residual_field import measured_errors
+from calibray.prediction.residual_field import calibration_residuals
 from calibray.result.held_out import Model
 from calibray.result.prediction_model import ResidualField
 from calibray.result.record import Accuracy, Cost, Fit, Nuisance, Prediction, Provenance, Uncertainty
@@ -260,7 +260,7 @@ def _residual_field(problem: Problem, table: pd.DataFrame) -> ResidualField | No
     links, noise = problem.setup.links, problem.setup.study.noise
     if links.frequency is not None or noise.range_m == 0 or noise.kind == HEAVY:
         return None
-    reached, errors = measured_errors(table)
+    reached, errors = calibration_residuals(table)
     correlation = shared_errors(errors, np.hstack([links.tx, links.rx])[reached])
     if correlation is None:
         return None

@@ -1,4 +1,4 @@
-"""`calibray predict`: path loss at links that were never measured."""
+"""`calibray predict`: path loss at new links."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def predict(
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict path loss at links that were never measured, with the calibrated scene."""
+    """Predict path loss at new links with the calibrated scene."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
@@ -71,9 +71,8 @@ def predict(
         from calibray.calibration.result import Result
         from calibray.engines import open_workers
         from calibray.measurements import PiecedTable
-        from calibray.prediction.batches import predicted_in_pieces
-        from calibray.prediction.predict import as_links
-        from calibray.prediction.quantity import as_measured
+        from calibray.prediction.batches import predict_batches
+        from calibray.prediction.predict import as_links, as_measured
         from calibray.support.output_files import check_table, growing_table
 
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
@@ -89,7 +88,7 @@ def predict(
             open_workers(workers, scheduler) as pool,
             _printed() if out is None else growing_table(out) as append,
         ):
-            for links, told in predicted_in_pieces(
+            for links, told in predict_batches(
                 result, table, level, progress, pool, allow_changed_inputs=allow_changed_inputs
             ):
                 own = as_measured(study, links, told)

@@ -38,8 +38,8 @@ def suggest(
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
-        from calibray.prediction.suggestion import shown
         from calibray.prediction.suggestion import suggest as find
+        from calibray.prediction.suggestion import suggestion_tables
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
@@ -49,6 +49,8 @@ def suggest(
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
         found = find(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
-    typer.echo(json.dumps(found.to_dict("records"), indent=2) if as_json else render(*shown(found)))
+    typer.echo(
+        json.dumps(found.to_dict("records"), indent=2) if as_json else render(*suggestion_tables(found))
+    )
     if out is not None:
         write_table(out, found)

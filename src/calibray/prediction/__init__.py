@@ -1,1 +1,1 @@
-"""Prediction: path loss where nobody measured, coverage maps, and where to measure next."""
+"""Prediction: path loss at new links, coverage maps, and suggestions where to measure next."""

@@ -1,4 +1,4 @@
-"""Predictions in pieces of links, and in blocks on the workers of a cluster; path losses come back, paths do not."""
+"""Predictions of many links with bounded memory: batch by batch, and in chunks on workers that return no paths."""
 
 from __future__ import annotations
 
@@ -13,87 +13,87 @@ from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
 from calibray.prediction.position_checks import remarks
-from calibray.prediction.predict import as_links, check_groups, interval, opened
+from calibray.prediction.predict import as_links, check_groups, interval, open_for_links
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress, with_total
 
-PIECE: Final = 10_000
-"""Links that are traced and evaluated at once."""
+BATCH: Final = 10_000
+"""Links that are traced and evaluated together."""
 
-DIFFUSE_PIECE: Final = 50
-"""The same with diffuse reflection, which makes tens of thousands of paths a link."""
+DIFFUSE_BATCH: Final = 50
+"""The same with diffuse reflection, which gives tens of thousands of paths per link."""
 
-BLOCKS: Final = 100
-"""Blocks that workers are given at once."""
+CHUNKS_PER_BATCH: Final = 100
+"""Chunks that the workers are given together."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Shared:
-    """What a worker needs to predict: the calibration, its study opened, and what is asked for."""
+class _Task:
+    """The input of a worker: the calibration, its opened study, and the requested columns."""
 
     result: Record
     setup: Setup
     level: float | None
-    remarked: bool
+    with_remarks: bool
 
 
-def piece_size(setup: Setup, workers: Workers | None) -> int:
-    """Links to predict at once, so that memory does not grow with their number.
+def batch_size(setup: Setup, workers: Workers | None) -> int:
+    """Number of links to predict together, so that memory does not grow with the number of links.
 
     Args:
         setup: The opened study.
-        workers: Where blocks live; None for this process.
+        workers: Workers that predict chunks of links; None for this process.
 
     Returns:
-        The number.
+        The number of links.
     """
     if workers is not None:
-        return BLOCKS * _block_size(setup)
-    return DIFFUSE_PIECE if setup.study.trace.diffuse_reflection else PIECE
+        return CHUNKS_PER_BATCH * _chunk_size(setup)
+    return DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else BATCH
 
 
-def predicted(
+def predict_links(
     result: Record,
     setup: Setup,
     level: float | None,
     progress: Progress | None = None,
     workers: Workers | None = None,
     *,
-    remarked: bool = False,
+    with_remarks: bool = False,
 ) -> pd.DataFrame:
-    """Path loss at links, its interval and remarks on their places, here or on the workers of a cluster.
+    """Predict path loss, intervals and remarks on positions, in this process or on workers.
 
     Args:
         result: The calibration.
         setup: Its study, opened for the links.
-        level: Probability that a measurement lies within the interval; None for path loss alone.
+        level: Probability that the interval contains a measurement; None for path loss alone.
         progress: Called with the stage "tracing" as links are traced.
-        workers: Where blocks live; None for this process.
-        remarked: Whether places are remarked on.
+        workers: Workers that predict chunks of links; None for this process.
+        with_remarks: Whether positions are checked.
 
     Returns:
-        What `interval` gives, and a column `remark`, empty where nothing is to be said or nothing was asked for.
+        The table of `interval` with a column `remark`, empty where there is none or positions are not checked.
 
     Raises:
         InputError: What `interval` refuses.
-        EngineError: There are more paths than fit into memory, or workers die again and again.
+        EngineError: There are more paths than fit into memory, or workers fail repeatedly.
     """
     links = setup.links
-    if workers is None and len(links) > piece_size(setup, None):
+    if workers is None and len(links) > batch_size(setup, None):
         workers = InProcess(at_most=0)
     if workers is None:
-        return _predicted(_Shared(result, setup, level, remarked), links, progress)
-    # Neither the steps of the search nor the paths have a say in predictions.
+        return _predict_chunk(_Task(result, setup, level, with_remarks), links, progress)
+    # Predictions need neither the history nor the paths, so that these are not sent to the workers.
     light = replace(result, history=result.history.iloc[:0], paths=None, scene=None)
-    shared = _Shared(light, setup.at(select_links(links, np.array([0]))), level, remarked)
-    parts = for_each_chunk(workers, _predicted, shared, links, _block_size(setup), progress)
-    place = np.concatenate([block for block, _ in parts])
-    joined = pd.concat([told for _, told in parts], ignore_index=True)
-    return joined.iloc[np.argsort(place)].reset_index(drop=True)
+    task = _Task(light, setup.at(select_links(links, np.array([0]))), level, with_remarks)
+    chunks = for_each_chunk(workers, _predict_chunk, task, links, _chunk_size(setup), progress)
+    order = np.argsort(np.concatenate([link_indices for link_indices, _ in chunks]))
+    table = pd.concat([predictions for _, predictions in chunks], ignore_index=True)
+    return table.iloc[order].reset_index(drop=True)
 
 
-def predicted_in_pieces(
+def predict_batches(
     result: Record,
     table: PiecedTable,
     level: float | None,
@@ -102,30 +102,30 @@ def predicted_in_pieces(
     *,
     allow_changed_inputs: bool = False,
 ) -> Iterator[tuple[Measurements, pd.DataFrame]]:
-    """Predict at the links of a table, some at a time, so that memory does not grow with their number.
+    """Predict the links of a table batch by batch, so that memory does not grow with their number.
 
     All rows are checked before any is traced.
 
     Args:
         result: The calibration.
         table: The table, with the columns that `predict` takes.
-        level: Probability that a measurement lies within the interval; None for path loss alone.
-        progress: Called with the stages "checking" and "tracing", the links done and all of them.
-        workers: Where blocks live; None for this process.
+        level: Probability that the interval contains a measurement; None for path loss alone.
+        progress: Called with the stages "checking" and "tracing", the number of links done, and of all links.
+        workers: Workers that predict chunks of links; None for this process.
         allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Yields:
-        Links, and what `predicted` tells of them, in the order of the table.
+        Links and their predictions, as `predict_links` returns them, in the order of the table.
 
     Raises:
         InputError: What `predict` and `predict_interval` refuse.
-        EngineError: There are more paths than fit into memory, or workers die again and again.
+        EngineError: There are more paths than fit into memory, or workers fail repeatedly.
     """
     setup, done = None, 0
-    for rows in table.pieces(PIECE):
+    for rows in table.pieces(BATCH):
         links = as_links(result, rows)
         if setup is None:
-            setup = opened(result, links, allow_changed_inputs=allow_changed_inputs)
+            setup = open_for_links(result, links, allow_changed_inputs=allow_changed_inputs)
         setup.parameters.check_carriers([frequency for frequency, _ in links.carriers])
         if level is None:
             check_groups(result, links)
@@ -134,21 +134,21 @@ def predicted_in_pieces(
             progress("checking", done, table.rows)
     if setup is None:
         return
-    done, size = 0, PIECE if workers is None else piece_size(setup, workers)
+    done, size = 0, BATCH if workers is None else batch_size(setup, workers)
     for rows in table.pieces(size):
         setup = setup.at(as_links(result, rows))
-        told = predicted(result, setup, level, with_total(progress, done, table.rows), workers, remarked=True)
+        batch_progress = with_total(progress, done, table.rows)
+        predictions = predict_links(result, setup, level, batch_progress, workers, with_remarks=True)
         done += len(rows)
-        yield setup.links, told
+        yield setup.links, predictions
 
 
-def _block_size(setup: Setup) -> int:
-    return stated_chunk_size(setup) or (
-        DIFFUSE_PIECE if setup.study.trace.diffuse_reflection else CHUNK_LINKS
-    )
+def _chunk_size(setup: Setup) -> int:
+    default = DIFFUSE_BATCH if setup.study.trace.diffuse_reflection else CHUNK_LINKS
+    return stated_chunk_size(setup) or default
 
 
-def _predicted(shared: _Shared, links: Measurements, progress: Progress | None = None) -> pd.DataFrame:
-    here = shared.setup.at(links)
-    told = interval(shared.result, here, shared.level, progress)
-    return told.assign(remark=remarks(shared.result, here) if shared.remarked else "")
+def _predict_chunk(task: _Task, links: Measurements, progress: Progress | None = None) -> pd.DataFrame:
+    setup = task.setup.at(links)
+    predictions = interval(task.result, setup, task.level, progress)
+    return predictions.assign(remark=remarks(task.result, setup) if task.with_remarks else "")

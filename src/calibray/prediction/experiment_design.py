@@ -1,22 +1,26 @@
-"""Where to measure next: candidates ranked by what their measurement would leave open.
+"""Design of the next measurements: candidates ranked by the uncertainty expected after measuring them.
 
-Draws from the posterior stand for what is still possible. Each in turn plays the truth, and the others are weighed by
-how well they would agree with what is measured then: what remains of their scatter is the interval to be expected. That
-sees minima apart from one another, which disagree about some candidates and not about others, but it sees a parameter
-only against its whole range. Curvature sees how much closer each draw would be held where it lies, and nothing else.
-A candidate is ranked by the sum of both: the mean logarithm of the standard deviations, over draws and parameters, by
-scatter and by curvature (an A-optimal design in relative units, averaged over the posterior). Where separate ranges of
-a parameter fit, the probability of ruling out all but one counts beside it (`ranges.py`): scatter hardly sees a range
-that few draws lie in.
+The posterior draws represent the possible values. In turn, each draw is taken as the truth, and the others are weighted
+by their agreement with the measurement that this truth would give. A candidate is ranked by the mean logarithm of the
+remaining standard deviations over draws and parameters (an A-optimal design in relative units, averaged over the
+posterior; K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995). The
+standard deviations are computed in two ways, and the logarithms added:
 
-Candidates are chosen one after another. What their errors share, an offset that is hardly known or neighbours' common
-clutter, is taken off by the conditional distribution after each choice, so that one point is not worth as much as a
-second time beside it.
+- by scatter, from the weighted draws: this distinguishes separate minima, but resolves a parameter only relative to its
+  whole range;
+- by curvature at each draw: this shows how much a single minimum narrows.
 
-Tried and not kept: the probability, among draws, of taking the wrong one of separate ranges for the right one. It told
-apart as many as scatter does, not more.
+Scatter hardly sees a range of a parameter with few draws. Where separate ranges of a parameter fit, the probability of
+ruling out all but one is therefore added to the rank. Values that explain the links so far lie in each range, each with
+its excess sum of squares over the best. At a candidate, the squared difference from the truth is added to it. The least
+sum in a range is what a fit would reach there with all other parameters free. A range is ruled out once its least sum
+exceeds that of the true range by the quantile of an interval. Between two models this is the T-optimal design of A. C.
+Atkinson and V. V. Fedorov, The design of experiments for discriminating between two rival models, Biometrika 62, 1975,
+with the expectation over the truth of G. E. P. Box and W. J. Hill, Discrimination among mechanistic models,
+Technometrics 9, 1967.
 
-K. Chaloner and I. Verdinelli, Bayesian experimental design: a review, Statistical Science 10, 1995.
+Candidates are chosen one after another. The part of the errors that candidates share, from an unknown offset or common
+clutter, is removed by conditioning after each choice, so that a second measurement at the same point is worth less.
 """
 
 from __future__ import annotations
@@ -27,29 +31,37 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from scipy.special import ndtr
 
-from calibray.prediction.mode_separation import BATCH, told_apart
+UNIFORM_INFORMATION: Final = 12.0
+"""Inverse variance of the uniform distribution over the unit interval: the information before any link."""
 
-FLAT: Final = 12.0
-"""Inverse variance of a value that lies anywhere in the unit interval: what is known without any link."""
+LEAST_VARIANCE: Final = 1e-5
+"""Variance in the unit cube that scatter of about a hundred draws cannot resolve."""
 
-LEAST: Final = 1e-5
-"""Variance in the unit cube below which a narrower scatter of so few draws tells nothing."""
+SEPARATION_WEIGHT: Final = 8.0
+"""Weight of ruling out all ranges of a parameter but one, compared with narrowing it by a factor e."""
 
-APART: Final = 8.0
-"""What it is worth to rule out all ranges of a parameter but one, by narrowing it e times."""
+RULED_OUT: Final = 4.3
+"""Excess of the sum of squares, in noise variances, that rules a range out: F(0.95; 1, about 20)."""
+
+EXCESS_DEVIATION: Final = 3.0
+"""Standard deviation of the excess that the noise of the candidates causes, in noise variances."""
+
+BATCH: Final = 4_000_000
+"""Numbers per batch (draws times values times candidates), which bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors to be expected of candidates, for given parameters.
+    """Expected errors of the candidates' measurements, for given parameters.
 
     Attributes:
-        own_db: Standard deviation of each one's own part [dB].
-        common: What they share, a column for each unknown: times its standard deviation [c, r], [dB].
-        position: Where they stand [c, k], [m]: their receivers, or both ends.
-        shared_db: Standard deviation of what neighbours share [dB]; 0 for nothing.
-        range_m: Distance at which that has fallen to 1/e [m].
+        own_db: Standard deviation of each candidate's uncorrelated part [dB].
+        common: Effect of each common unknown times its standard deviation [candidates, unknowns], [dB].
+        position: Positions of the receivers, or of both ends [candidates, k], [m].
+        shared_db: Standard deviation of the part that neighbours share [dB]; 0 for none.
+        range_m: Distance at which its correlation has fallen to 1/e [m].
     """
 
     own_db: float
@@ -60,45 +72,44 @@ class Errors:
 
     @property
     def variance(self) -> NDArray[np.float64]:
-        """Variance of every candidate's error [c], [dB^2]."""
+        """Variance of every candidate's error [candidates], [dB^2]."""
         return self.own_db**2 + self.shared_db**2 + np.sum(self.common**2, axis=1)
 
     def covariance(self, index: int) -> NDArray[np.float64]:
-        """Covariance of one candidate's error with those of all [c], [dB^2]."""
-        found = self.common @ self.common[index]
+        """Covariance of one candidate's error with those of all [candidates], [dB^2]."""
+        covariance = self.common @ self.common[index]
         if self.shared_db:
-            apart = cdist(self.position, self.position[index : index + 1])[:, 0]
-            found = found + self.shared_db**2 * np.exp(-apart / self.range_m)
-        found[index] += self.own_db**2
-        return found
+            distance = cdist(self.position, self.position[index : index + 1])[:, 0]
+            covariance = covariance + self.shared_db**2 * np.exp(-distance / self.range_m)
+        covariance[index] += self.own_db**2
+        return covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What is to be expected once one candidate more is measured.
+    """The uncertainty expected after measuring one more candidate.
 
     Attributes:
         index: The candidate.
-        narrowed: Standard deviation of every parameter, by that before any [d]; 1 where nothing is learned.
-        sure: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 where there is one.
+        narrowed: Standard deviation of every parameter relative to that before any candidate [d]; at most 1.
+        range_probability: Probability of knowing in which of its separate ranges a parameter lies [d]; 1 for one range.
     """
 
     index: int
     narrowed: NDArray[np.float64]
-    sure: NDArray[np.float64]
+    range_probability: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What is believed before anything more is measured.
+    """What the calibration says before any candidate is measured.
 
     Attributes:
         point: Draws from the posterior in the unit cube [n, d].
-        information: Information of the links measured so far, at every draw [n, d, d].
-        piece: Which of its separate ranges each parameter lies in [m, d]: of the draws, and after them of further
-            values that explain the links so far, for ranges that few draws lie in.
-        excess: Sum of squares by which each of these explains the links worse than the best, in variances of the
-            noise [m].
+        information: Information matrix of the links measured so far, at every draw [n, d, d].
+        piece: Index of the separate range that each parameter lies in [m, d]: first for the draws, then for further
+            values that explain the links so far, in ranges with few draws.
+        excess: Sum of squares of each of these values above the least, in noise variances [m].
     """
 
     point: NDArray[np.float64]
@@ -107,7 +118,7 @@ class Beliefs:
     excess: NDArray[np.float64]
 
 
-def choose(
+def choose_candidates(
     beliefs: Beliefs,
     predicted: NDArray[np.float64],
     slope: NDArray[np.float64],
@@ -117,97 +128,143 @@ def choose(
     """Choose candidates one after another.
 
     Args:
-        beliefs: What is believed so far.
-        predicted: Path loss of the candidates by every draw, and the further values [m, c], [dB].
-        slope: Its derivatives by the coordinates of the unit cube, for the draws [n, c, d], [dB].
-        errors: Errors to be expected of their measurements.
-        count: How many to choose.
+        beliefs: What the calibration says.
+        predicted: Path loss of the candidates for every draw and further value [m, candidates], [dB].
+        slope: Its derivatives with respect to the coordinates of the unit cube, for the draws [n, candidates, d], [dB].
+        errors: Expected errors of the measurements.
+        count: Number of candidates to choose.
 
     Returns:
-        The candidates in the order of their choice, each with what is to be expected once it is measured as well.
+        The candidates in the order of their choice, each with the uncertainty expected after it and those before.
     """
-    beliefs = replace(beliefs, information=beliefs.information + FLAT * np.eye(beliefs.point.shape[1]))
+    prior_information = UNIFORM_INFORMATION * np.eye(beliefs.point.shape[1])
+    beliefs = replace(beliefs, information=beliefs.information + prior_information)
     predicted, slope, variance = predicted.copy(), slope.copy(), errors.variance.copy()
     draws = len(beliefs.point)
-    known, taken = np.zeros((draws, len(predicted))), np.zeros(len(variance), dtype=bool)
-    passed, found = np.zeros((0, len(variance))), []
-    before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST))
+    # Squared differences between draws and values at the chosen candidates, in error variances.
+    squares = np.zeros((draws, len(predicted)))
+    taken = np.zeros(len(variance), dtype=bool)
+    conditioned, outlooks = np.zeros((0, len(variance))), []
+    before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
     for _ in range(min(count, len(variance))):
-        size = np.sqrt(variance)
-        value = _by_scatter(beliefs.point, known[:, :draws], predicted[:draws] / size)
-        value += _by_curvature(beliefs.information, slope / size[:, None])
-        value -= APART * told_apart(beliefs.excess, beliefs.piece, known, predicted / size)
-        value[taken] = np.inf
-        best = int(np.argmin(value))
+        deviation = np.sqrt(variance)
+        rank = _rank_by_scatter(beliefs.point, squares[:, :draws], predicted[:draws] / deviation)
+        rank += _rank_by_curvature(beliefs.information, slope / deviation[:, None])
+        separation = separation_probability(beliefs.excess, beliefs.piece, squares, predicted / deviation)
+        rank -= SEPARATION_WEIGHT * separation
+        rank[taken] = np.inf
+        best = int(np.argmin(rank))
         taken[best] = True
-        told = predicted[:, best] / size[best]
-        known = known + (told[:draws, None] - told) ** 2
-        row = slope[:, best] / size[best]
-        beliefs = replace(beliefs, information=beliefs.information + row[:, :, None] * row[:, None, :])
-        # What is shared with the one chosen is known by then: the rest is taken conditional on it.
-        whole = errors.covariance(best) - passed.T @ passed[:, best]
-        share = whole / size[best]
-        predicted -= told[:, None] * share
-        slope -= row[:, None, :] * share[:, None]
+        best_predicted = predicted[:, best] / deviation[best]
+        squares = squares + (best_predicted[:draws, None] - best_predicted) ** 2
+        best_slope = slope[:, best] / deviation[best]
+        added = best_slope[:, :, None] * best_slope[:, None, :]
+        beliefs = replace(beliefs, information=beliefs.information + added)
+        # Condition the other candidates on the chosen one: one step of a Cholesky factorization.
+        covariance = errors.covariance(best) - conditioned.T @ conditioned[:, best]
+        share = covariance / deviation[best]
+        predicted -= best_predicted[:, None] * share
+        slope -= best_slope[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
-        passed = np.vstack([passed, share])
-        narrowed = np.minimum(_scatter(beliefs.point, known[:, :draws]) / before, 1.0)
-        found.append(Outlook(best, narrowed, _sure(beliefs.piece[:draws], known[:, :draws])))
-    return found
+        conditioned = np.vstack([conditioned, share])
+        narrowed = np.minimum(_scatter(beliefs.point, squares[:, :draws]) / before, 1.0)
+        probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
+        outlooks.append(Outlook(best, narrowed, probability))
+    return outlooks
 
 
-def certain(piece: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Probability of knowing in which of its separate ranges a parameter lies, before anything more is measured.
+def initial_range_probability(piece: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Probability of knowing in which of its separate ranges a parameter lies, before any candidate is measured.
 
     Args:
         piece: Range of every draw [n, d].
 
     Returns:
-        The probability that two draws lie in the same one [d].
+        The probability that two draws lie in the same range [d].
     """
-    return _sure(piece, np.zeros((len(piece), len(piece))))
+    return _range_probability(piece, np.zeros((len(piece), len(piece))))
 
 
-def _by_scatter(
-    point: NDArray[np.float64], known: NDArray[np.float64], predicted: NDArray[np.float64]
+def separation_probability(
+    excess: NDArray[np.float64],
+    piece: NDArray[np.int64],
+    squares: NDArray[np.float64],
+    predicted: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Mean logarithm of the draws' standard deviations once a candidate is measured [c]."""
-    count, candidates = predicted.shape
-    found, size = np.empty(candidates), max(BATCH // count**2, 1)
+    """Probability of ruling out all ranges of a parameter but one, once a candidate is measured.
+
+    Args:
+        excess: Sum of squares of every value above the least, in noise variances [m]; the first n values are the draws.
+        piece: Range that each parameter lies in [m, d].
+        squares: Squared differences between draws and values at the candidates chosen before [n, m].
+        predicted: Path loss of the candidates for every value, in standard deviations of their errors [m, candidates].
+
+    Returns:
+        The probability, averaged over draws and parameters; a parameter with one range adds nothing [candidates].
+    """
+    draws, candidates = len(squares), predicted.shape[1]
+    ambiguous = [column for column in piece.T if np.ptp(column)]
+    probability, size = np.zeros(candidates), max(BATCH // squares.size, 1)
+    if not ambiguous:
+        return probability
     for start in range(0, candidates, size):
-        part = predicted[:, start : start + size].T
-        weight = _weights(known + (part[:, :, None] - part[:, None, :]) ** 2)
+        batch = predicted[:, start : start + size]
+        total = (excess + squares)[:, :, None] + (batch[:draws, None] - batch[None]) ** 2
+        for column in ambiguous:
+            probability[start : start + size] += _others_ruled_out(total, column).mean(axis=0)
+    return probability / piece.shape[1]
+
+
+def _others_ruled_out(total: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Probability that all ranges but the true draw's are ruled out [n, c], from sums of squares [n, m, c]."""
+    ranges, value_range = np.unique(piece, return_inverse=True)
+    least = np.stack([total[:, value_range == k].min(axis=1) for k in range(len(ranges))])
+    is_true = value_range[: len(total)] == np.arange(len(ranges))[:, None]
+    best_rival = np.where(is_true[:, :, None], np.inf, least).min(axis=0)
+    best_true = np.where(is_true[:, :, None], least, np.inf).min(axis=0)
+    return ndtr((best_rival - best_true - RULED_OUT) / EXCESS_DEVIATION)
+
+
+def _rank_by_scatter(
+    point: NDArray[np.float64], squares: NDArray[np.float64], predicted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean logarithm of the draws' standard deviations once a candidate is measured [candidates]."""
+    draws, candidates = predicted.shape
+    rank, size = np.empty(candidates), max(BATCH // draws**2, 1)
+    for start in range(0, candidates, size):
+        batch = predicted[:, start : start + size].T
+        weight = _weights(squares + (batch[:, :, None] - batch[:, None, :]) ** 2)
         mean = weight @ point
         variance = np.maximum(weight @ point**2 - mean**2, 0.0)
-        found[start : start + size] = 0.5 * np.log(variance + LEAST).mean(axis=(1, 2))
-    return found
+        rank[start : start + size] = 0.5 * np.log(variance + LEAST_VARIANCE).mean(axis=(1, 2))
+    return rank
 
 
-def _by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean logarithm of standard deviations by curvature at the draws, once a candidate is measured [c]."""
+def _rank_by_curvature(information: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean logarithm of the standard deviations by curvature once a candidate is measured [candidates]."""
     covariance = np.linalg.inv(information)
-    # Sherman and Morrison: one row more.
-    pull = slope @ covariance
-    left = np.diagonal(covariance, axis1=1, axis2=2)[:, None] - pull**2 / (
-        1.0 + np.sum(pull * slope, axis=2, keepdims=True)
+    # Sherman-Morrison: the inverse after adding one row of slopes.
+    gain = slope @ covariance
+    variance = np.diagonal(covariance, axis1=1, axis2=2)[:, None] - gain**2 / (
+        1.0 + np.sum(gain * slope, axis=2, keepdims=True)
     )
-    return 0.5 * np.log(np.maximum(left, LEAST**2)).mean(axis=(0, 2))
+    return 0.5 * np.log(np.maximum(variance, LEAST_VARIANCE**2)).mean(axis=(0, 2))
 
 
-def _scatter(point: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of every parameter to be expected [d]."""
-    weight = _weights(known)
+def _scatter(point: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected standard deviation of every parameter [d]."""
+    weight = _weights(squares)
     variance = weight @ point**2 - (weight @ point) ** 2
     return np.sqrt(np.maximum(variance, 0.0)).mean(axis=0)
 
 
-def _sure(piece: NDArray[np.int64], known: NDArray[np.float64]) -> NDArray[np.float64]:
-    weight = _weights(known)
-    same = [weight[np.equal.outer(column, column)].sum() for column in piece.T]
-    return np.array(same) / len(piece)
+def _range_probability(piece: NDArray[np.int64], squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    weight = _weights(squares)
+    same_range = [weight[np.equal.outer(column, column)].sum() for column in piece.T]
+    return np.array(same_range) / len(piece)
 
 
-def _weights(known: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights of the draws, the row's draw being the truth and its errors as large as they may be expected."""
-    weight = np.exp(-0.5 * known)
+def _weights(squares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of the draws [..., n, n]: each row takes its own draw as the truth."""
+    weight = np.exp(-0.5 * squares)
     return weight / weight.sum(axis=-1, keepdims=True)

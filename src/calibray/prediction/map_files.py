@@ -1,13 +1,15 @@
-"""A coverage map for people and for other tools: GeoTIFF, picture and table."""
+"""A coverage map and its files: GeoTIFF, picture and table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, final
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
@@ -15,10 +17,10 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from calibray.coordinates import parse_crs
+from calibray.coordinates import Frame, parse_crs
 from calibray.errors import InputError
-from calibray.prediction.predicted_grid import PredictedGrid
 from calibray.scenes.building_outlines import footprints
+from calibray.scenes.triangles import Triangles
 from calibray.support.extras import library
 from calibray.support.figure_style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write
 from calibray.support.output_files import check_outputs, replacing
@@ -26,77 +28,131 @@ from calibray.support.output_files import check_outputs, replacing
 FILES: Final = ("map.tif", "map.png", "map.csv")
 GEOTIFF, PICTURE, TABLE = FILES
 
-LOSS: Final = "viridis_r"
-POWER: Final = "viridis"
+LOSS_COLORS: Final = "viridis_r"
+POWER_COLORS: Final = "viridis"
 WIDTH_COLORS: Final = "cividis"
-"""Matplotlib's scales that stay ordered for colour-blind people and in grey; what is strong is bright."""
+"""Matplotlib's colour scales that keep their order for colour-blind readers and in grey; strong signals are bright."""
 
 
-def save_map(
-    coverage: PredictedGrid, folder: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False
-) -> tuple[str, ...]:
-    """Write a coverage map as GeoTIFF, picture and table.
+@final
+@dataclass(frozen=True, eq=False)
+class CoverageMap:
+    """Path loss, or received power, over a grid of square cells.
 
-    Args:
-        coverage: The map.
-        folder: Folder to write `map.tif`, `map.png` and `map.csv` into; made if absent.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace files that Calibray did not write.
-
-    Returns:
-        Names of the files; without rasterio the GeoTIFF is not among them.
-
-    Raises:
-        InputError: The folder cannot be written, or a file there must not be replaced.
+    Attributes:
+        tx: Position of the transmitter [3], [m].
+        height: Height of the receivers over the ground [m].
+        cell: Width of the cells [m].
+        x: Eastings of the cells' centres, ascending [nx], [m].
+        y: Northings of the cells' centres, ascending [ny], [m].
+        z: Heights of the receivers [ny, nx], [m].
+        path_loss_db: Path loss with nuisances [ny, nx], [dB]; +inf without a path, NaN at the transmitter.
+        lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a path or without a level.
+        upper_db: Upper end of the interval [ny, nx], [dB].
+        level: Probability that the interval contains a measurement; None for a map without interval.
+        power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
+        frame: Position of the scene on the globe; None where it is unknown.
+        triangles: The scene, for drawing.
     """
-    target = check_outputs(folder, FILES, inputs, overwrite)
-    names = FILES if find_spec("rasterio") else FILES[1:]
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        with replacing(target / TABLE) as partial:
-            coverage.table().to_csv(partial, index=False, float_format="%.8g")
-        write(figure(coverage), target / PICTURE)
-        if GEOTIFF in names:
-            geotiff(coverage, target / GEOTIFF)
-    except OSError as error:
-        raise InputError(
-            f"output folder {target}: cannot be written ({error.strerror}); name another"
-        ) from None
-    return names
+
+    tx: NDArray[np.float64]
+    height: float
+    cell: float
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    path_loss_db: NDArray[np.float64]
+    lower_db: NDArray[np.float64]
+    upper_db: NDArray[np.float64]
+    level: float | None
+    power_dbm: float | None
+    frame: Frame | None
+    triangles: Triangles
+
+    @property
+    def layers(self) -> dict[str, NDArray[np.float64]]:
+        """The mapped quantity and its interval by name, each [ny, nx]: path loss [dB] or received power [dBm]."""
+        if self.power_dbm is None:
+            best = {"path_loss_db": self.path_loss_db}
+            interval = {"lower_db": self.lower_db, "upper_db": self.upper_db}
+        else:
+            # The upper end of path loss is the lower end of power.
+            best = {"received_power_dbm": self.power_dbm - self.path_loss_db}
+            interval = {
+                "lower_dbm": self.power_dbm - self.upper_db,
+                "upper_dbm": self.power_dbm - self.lower_db,
+            }
+        return best if self.level is None else best | interval
+
+    def table(self) -> pd.DataFrame:
+        """One row per cell, from south to north and west to east: x_m, y_m, z_m and the layers."""
+        x, y = np.meshgrid(self.x, self.y)
+        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers}
+        return pd.DataFrame({name: values.reshape(-1) for name, values in columns.items()})
+
+    def save(
+        self, folder: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False
+    ) -> tuple[str, ...]:
+        """Write the map as GeoTIFF, picture and table.
+
+        Args:
+            folder: Folder to write `map.tif`, `map.png` and `map.csv` into; made if absent.
+            inputs: Files that the calculation reads; none of them is ever replaced.
+            overwrite: Replace files that Calibray did not write.
+
+        Returns:
+            Names of the files; without rasterio there is no GeoTIFF.
+
+        Raises:
+            InputError: The folder cannot be written, or a file there must not be replaced.
+        """
+        target = check_outputs(folder, FILES, inputs, overwrite)
+        names = FILES if find_spec("rasterio") else FILES[1:]
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            with replacing(target / TABLE) as partial:
+                self.table().to_csv(partial, index=False, float_format="%.8g")
+            write(figure(self), target / PICTURE)
+            if GEOTIFF in names:
+                geotiff(self, target / GEOTIFF)
+        except OSError as error:
+            raise InputError(
+                f"output folder {target}: cannot be written ({error.strerror}); name another"
+            ) from None
+        return names
 
 
-def geotiff(coverage: PredictedGrid, path: Path) -> None:
-    """Write a map as a GeoTIFF: a band for each layer, north up, missing where there is no path.
+def geotiff(coverage: CoverageMap, path: Path) -> None:
+    """Write a map as a GeoTIFF with one band per layer, north up; cells without a path have no data.
 
     Args:
-        coverage: The map. Where its frame is not known, coordinates are the scene's own metres, and no reference system
-            is stated.
+        coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.
         path: The file.
 
     Raises:
-        InputError: rasterio is not installed, or the frame's projection is not known.
+        InputError: rasterio is not installed, or the frame's projection is unknown.
     """
     rasterio = library("rasterio", "scenes")
     frame, bands = coverage.frame, coverage.layers
     west, north = coverage.x[0] - coverage.cell / 2, coverage.y[-1] + coverage.cell / 2
-    place: dict[str, Any] = {}
+    georeference: dict[str, Any] = {}
     if frame is not None:
         west, north = west + frame.easting, north + frame.northing
-        place["crs"] = rasterio.crs.CRS.from_wkt(parse_crs(frame.crs).to_wkt())
-    place["transform"] = rasterio.Affine(coverage.cell, 0, west, 0, -coverage.cell, north)
+        georeference["crs"] = rasterio.crs.CRS.from_wkt(parse_crs(frame.crs).to_wkt())
+    georeference["transform"] = rasterio.Affine(coverage.cell, 0, west, 0, -coverage.cell, north)
     rows, columns = coverage.z.shape
     layout = {"width": columns, "height": rows, "count": len(bands), "dtype": "float32", "nodata": np.nan}
     compressed = {"driver": "GTiff", "compress": "deflate", "predictor": 3}
-    # By way of memory: GDAL takes no names but those in UTF-8.
+    # GDAL only accepts file names in UTF-8, so that the file is made in memory.
     with rasterio.MemoryFile() as memory:
-        with memory.open(**compressed, **layout, **place) as file:
+        with memory.open(**compressed, **layout, **georeference) as file:
             for number, (name, values) in enumerate(bands.items(), start=1):
-                known = np.where(np.isfinite(values), values, np.nan)
-                file.write(known[::-1].astype("float32"), number)
+                finite = np.where(np.isfinite(values), values, np.nan)
+                file.write(finite[::-1].astype("float32"), number)
                 file.set_band_description(number, name)
                 file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
             file.update_tags(
-                tx_m=" ".join(f"{each:g}" for each in coverage.tx),
+                tx_m=" ".join(f"{coordinate:g}" for coordinate in coverage.tx),
                 receiver_height_m=f"{coverage.height:g}",
                 **({} if coverage.level is None else {"interval_level": f"{coverage.level:g}"}),
             )
@@ -105,8 +161,8 @@ def geotiff(coverage: PredictedGrid, path: Path) -> None:
 
 
 @styled()
-def figure(coverage: PredictedGrid) -> Figure:
-    """A map as a picture, over the outlines of buildings; beside it half the width of the interval, if there is one.
+def figure(coverage: CoverageMap) -> Figure:
+    """Draw a map over the outlines of buildings, with a second panel for half the width of the interval.
 
     Args:
         coverage: The map.
@@ -114,39 +170,42 @@ def figure(coverage: PredictedGrid) -> Figure:
     Returns:
         The figure.
     """
-    (name, best), *ends = coverage.layers.items()
-    power = name.endswith("dbm")
+    best, *ends = coverage.layers.values()
     panels: list[tuple[str, NDArray[np.float64], str]] = [
-        ("Received power [dBm]" if power else "Path loss [dB]", best, POWER if power else LOSS)
+        ("Path loss [dB]", best, LOSS_COLORS)
+        if coverage.power_dbm is None
+        else ("Received power [dBm]", best, POWER_COLORS)
     ]
     if ends:
-        half = (ends[1][1] - ends[0][1]) / 2
+        lower, upper = ends
+        half = (upper - lower) / 2
         panels.append((f"Half of the {coverage.level:.0%} interval [dB]", half, WIDTH_COLORS))
     rows, columns = coverage.z.shape
-    across = len(panels) == 1 or columns < 2 * rows
+    side_by_side = len(panels) == 1 or columns < 2 * rows
     size = np.array([7.0, float(np.clip(5.6 * rows / columns, 2.5, 9.0)) + 0.9])
-    drawn = Figure(
-        figsize=tuple(size * ([len(panels), 1] if across else [1, len(panels)])),
+    picture = Figure(
+        figsize=tuple(size * ([len(panels), 1] if side_by_side else [1, len(panels)])),
         dpi=150,
         layout="constrained",
     )
-    shape = (1, len(panels)) if across else (len(panels), 1)
-    for axes, (label, values, colors) in zip(drawn.subplots(*shape, squeeze=False).flat, panels, strict=True):
+    shape = (1, len(panels)) if side_by_side else (len(panels), 1)
+    all_axes = picture.subplots(*shape, squeeze=False).flat
+    for axes, (label, values, colors) in zip(all_axes, panels, strict=True):
         _panel(axes, coverage, values, label, colors)
-    return drawn
+    return picture
 
 
-def _panel(axes: Axes, coverage: PredictedGrid, values: NDArray[np.float64], label: str, colors: str) -> None:
+def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label: str, colors: str) -> None:
     dress(axes, "x, east [m]", "y, north [m]")
     axes.grid(visible=False)
     half = coverage.cell / 2
     west, east = coverage.x[0] - half, coverage.x[-1] + half
     south, north = coverage.y[0] - half, coverage.y[-1] + half
-    known = np.where(np.isfinite(values), values, np.nan)
-    low, high = _range(known)
+    finite = np.where(np.isfinite(values), values, np.nan)
+    low, high = _range(finite)
     axes.set_facecolor(LINE)
-    shown = axes.imshow(
-        known, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
+    image = axes.imshow(
+        finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
     for loop in footprints(coverage.triangles, west, south, east, north):
@@ -161,19 +220,19 @@ def _panel(axes: Axes, coverage: PredictedGrid, values: NDArray[np.float64], lab
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     figure = axes.get_figure()
     if isinstance(figure, Figure):
-        bar = figure.colorbar(shown, ax=axes, label=label, shrink=0.8, extend="both")
+        bar = figure.colorbar(image, ax=axes, label=label, shrink=0.8, extend="both")
         bar.outline.set_edgecolor(FAINT)  # pyright: ignore[reportCallIssue]
-    if np.isnan(known).any():
+    if np.isnan(finite).any():
         axes.annotate(
             "grey: no path", (1, 1.01), xycoords="axes fraction", ha="right", color=FAINT, fontsize=8
         )
 
 
 def _range(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Where colours begin and end: all but the outermost 1 % on either side, at least 1 dB apart."""
-    known = values[np.isfinite(values)]
-    if not len(known):
+    """Ends of the colour scale: the 1 % and 99 % quantiles, at least 1 dB apart."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return 0.0, 1.0
-    low, high = np.quantile(known, [0.01, 0.99])
+    low, high = np.quantile(finite, [0.01, 0.99])
     middle, half = (low + high) / 2, max((high - low) / 2, 0.5)
     return float(middle - half), float(middle + half)

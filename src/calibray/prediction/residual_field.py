@@ -1,9 +1,8 @@
-"""The residual field: what neighbouring links' errors share, carried over to links beside them.
+"""The residual field: the correlated part of the calibration residuals, kriged to nearby links.
 
-Clutter that the scene lacks shades neighbours alike, so that beside a measured link the model's error there is known in
-part. What is shared follows an exponential covariance whose range and size are those of the largest restricted
-likelihood (`noise.fit_correlation`), and the errors of the links calibrated on are kriged. Far from all of them nothing
-is added, and nothing is gained.
+Clutter that the scene lacks affects neighbouring links alike, so that the residual near a measured link is partly
+known. The correlated part has an exponential covariance whose range and size maximize the restricted likelihood
+(`uncertainty.noise.fit_correlation`). Far from all measured links the field is zero and explains nothing.
 """
 
 from __future__ import annotations
@@ -19,68 +18,69 @@ from scipy.spatial.distance import cdist
 
 from calibray.result.prediction_model import ResidualField
 
-EXACT: Final = 1000
-"""Measured links up to which all of them count; of more, the nearest to each place."""
+MOST_EXACT: Final = 1000
+"""Most measured links that are all used at every new link; with more, only the nearest ones are used."""
 
 NEAREST: Final = 50
-"""How many of these."""
+"""Number of nearest measured links used at each new link."""
 
 
-def carried(
+def krige_residuals(
     field: ResidualField,
-    known: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    place: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What the errors of measured links say of those of others.
+    """Krige the residual field from measured links to new ones.
 
     Args:
-        field: What errors share.
-        known: Where the ends of the measured links stand [m, 6], [m].
-        errors: Measured less modelled path loss there [m], [dB].
-        place: Where those of the others stand [n, 6], [m].
+        field: The field's range and standard deviations.
+        measured: Positions of both ends of the measured links [m, 6], [m].
+        residuals: Measured minus modelled path loss there [m], [dB].
+        position: Positions of both ends of the new links [n, 6], [m].
 
     Returns:
-        What is to be added to the modelled path loss [n], [dB], and the share of the shared variance that is known
-        then, 0 far from all measured links and below 1 beside one [n].
+        Correction of the modelled path loss [n], [dB], and the share of the field's variance that the measured links
+        explain, 0 far from all of them and below 1 near one [n].
     """
-    if len(known) <= EXACT:
-        return _kriged(field, known, errors, place)
-    added, share = np.zeros(len(place)), np.zeros(len(place))
-    near = np.asarray(KDTree(known).query(place, k=NEAREST)[1])
-    for index, mine in enumerate(near):
-        added[index : index + 1], share[index : index + 1] = _kriged(
-            field, known[mine], errors[mine], place[index : index + 1]
-        )
-    return added, share
+    if len(measured) <= MOST_EXACT:
+        return _krige(field, measured, residuals, position)
+    correction, share = np.zeros(len(position)), np.zeros(len(position))
+    neighbours = np.asarray(KDTree(measured).query(position, k=NEAREST)[1])
+    for index, nearest in enumerate(neighbours):
+        link = slice(index, index + 1)
+        correction[link], share[link] = _krige(field, measured[nearest], residuals[nearest], position[link])
+    return correction, share
 
 
-def _kriged(
+def _krige(
     field: ResidualField,
-    known: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    place: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    shared = field.shared_db**2
-    covariance = shared * np.exp(-cdist(known, known) / field.range_m) + field.own_db**2 * np.eye(len(known))
+    """Simple kriging with an exponential covariance: c^T K^-1 r, and c^T K^-1 c over the field's variance."""
+    variance = field.shared_db**2
+    covariance = variance * np.exp(-cdist(measured, measured) / field.range_m)
+    covariance = covariance + field.own_db**2 * np.eye(len(measured))
     factor = cho_factor(covariance, lower=True)
-    cross = shared * np.exp(-cdist(place, known) / field.range_m)
-    added = cross @ cho_solve(factor, errors)
-    return added, np.einsum("nm,mn->n", cross, cho_solve(factor, cross.T)) / shared
+    cross = variance * np.exp(-cdist(position, measured) / field.range_m)
+    correction = cross @ cho_solve(factor, residuals)
+    return correction, np.einsum("nm,mn->n", cross, cho_solve(factor, cross.T)) / variance
 
 
-def measured_errors(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Errors of the model that predictions go by, at the links calibrated on.
+def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Residuals of the prediction model at the calibration links.
 
     Args:
         links: A result's table of links.
 
     Returns:
-        Places of the links that have one [m], and measured less modelled path loss there [m], [dB].
+        Rows of the calibration links that have a path [m], and their measured minus modelled path loss [m], [dB].
     """
     modelled = links["chosen_db" if "chosen_db" in links else "after_db"].to_numpy(float)
     counted = links["has_path"].to_numpy(bool) & ~links["held_out"].to_numpy(bool) & np.isfinite(modelled)
     if "faint" in links:
         counted &= ~links["faint"].to_numpy(bool)
-    known = np.flatnonzero(counted)
-    return known, links["measured_db"].to_numpy(float)[known] - modelled[known]
+    rows = np.flatnonzero(counted)
+    return rows, links["measured_db"].to_numpy(float)[rows] - modelled[rows]

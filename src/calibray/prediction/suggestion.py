@@ -1,4 +1,4 @@
-"""Where to measure next: candidates, ranked by what their measurement would leave open of a finished calibration."""
+"""Suggestions where to measure next: candidates ranked by the parameter uncertainty expected after measuring them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,16 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
-from calibray.prediction.experiment_design import FLAT, Beliefs, Errors, Outlook, certain, choose
-from calibray.prediction.predict import as_links, opened
+from calibray.prediction.experiment_design import (
+    UNIFORM_INFORMATION,
+    Beliefs,
+    Errors,
+    Outlook,
+    choose_candidates,
+    initial_range_probability,
+)
+from calibray.prediction.position_checks import POSITION_COLUMNS
+from calibray.prediction.predict import as_links, open_for_links
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
@@ -24,16 +32,14 @@ from calibray.tables import Column, Table, numbers
 from calibray.uncertainty.noise import Correlation
 from calibray.uncertainty.residuals import shared_errors
 
-DRAWS: Final = 96
-"""Draws from the posterior that candidates are judged by."""
+MOST_DRAWS: Final = 96
+"""Most posterior draws that the candidates are ranked by."""
 
-RIVALS: Final = 24
-"""Further values in every separate range of a parameter: few draws lie in some."""
+VALUES_PER_RANGE: Final = 24
+"""Further values in each separate range of a parameter, since few draws lie in some ranges."""
 
-SPOKEN: Final = 0.02
-"""Narrowing of an interval, of its width, or probability of a range, that words are worth."""
-
-PLACES: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
+LEAST_GAIN: Final = 0.02
+"""Least narrowing of an interval, relative to its width, or gain in probability that is reported as text."""
 
 
 def suggest(
@@ -44,94 +50,94 @@ def suggest(
     *,
     allow_changed_inputs: bool = False,
 ) -> pd.DataFrame:
-    """Where to measure next, by how much narrower the parameters' intervals are expected to be.
+    """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
-    Every candidate is traced and replayed by draws from the posterior: where these agree, a measurement tells nothing;
-    where they differ by more than the errors of a link, it tells which of them to drop. Points are chosen one after
-    another, each as the best beside those before.
+    Each candidate is traced and replayed for draws from the posterior. Where the draws predict the same path loss, a
+    measurement adds nothing; where they differ by more than the error of a link, it rules some of them out. Candidates
+    are chosen one after another, each as the best in addition to those before.
 
     Args:
-        result: The calibration; one on the engine "replay" or "retrace", whose draws were kept.
-        candidates: Where one could measure: links, or a table, as for `Record.predict`.
-        count: How many to suggest.
+        result: The calibration, on the engine "replay" or "retrace", with draws from the posterior.
+        candidates: Possible measurements: links, or a table, as for `Result.predict`.
+        count: Number of suggestions.
         progress: Called with the stage "tracing" after every launch.
-        allow_changed_inputs: Go on although a file of the scene or an antenna changed since the calibration.
+        allow_changed_inputs: Continue although a file of the scene or an antenna changed since the calibration.
 
     Returns:
         One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
-        spread_db, mean and standard deviation of what the draws predict [dB]; for every parameter its name with
-        `_width`, the width of its 95 % interval to be expected once this point and those above are measured, and, where
-        several ranges fit, its name with `_sure`, the probability of knowing which is the right one; and all that in
-        words as gain.
+        spread_db, mean and standard deviation of the draws' predictions [dB]; NAME_width for every parameter, the
+        expected width of its 95 % interval once this candidate and those above are measured; NAME_sure, where several
+        ranges fit, the expected probability of knowing the right one; and gain, a summary as text.
 
     Raises:
-        InputError: What `Record.predict` refuses but for groups, the calibration has no draws, or no path leads to any
-            candidate.
+        InputError: What `Result.predict` refuses except unknown groups, the calibration has no draws, or no candidate
+            has a path.
     """
     if count < 1:
         raise InputError(f"count = {count}: must be at least 1")
     study = result.study
     if study.engine.external:
         raise InputError(
-            f"{study.path}: the engine {study.engine.name!r} answers path loss without derivatives, and suggestions "
-            "need them; calibrate on the engine 'replay'"
+            f"{study.path}: the engine {study.engine.name!r} gives no derivatives, which suggestions need; "
+            "calibrate on the engine 'replay'"
         )
     if not result.uncertainty.draws:
         raise InputError(
-            f"{study.path}: the calibration kept no draws of what else explains the links: run it again on the engine "
-            "'replay', with more links than unknowns"
+            f"{study.path}: the result has no draws from the posterior; calibrate on the engine 'replay', with more "
+            "links than unknowns"
         )
-    candidates = as_links(result, candidates)
-    there = opened(result, candidates, allow_changed_inputs=allow_changed_inputs)
-    model = _Model(result, Setup.open(study), progress)
-    predicted, slope, errors = model.at(there)
+    links = as_links(result, candidates)
+    setup = open_for_links(result, links, allow_changed_inputs=allow_changed_inputs)
+    model = _ReplayedDraws(result, Setup.open(study), progress)
+    predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):
         raise InputError(
-            f"{candidates.source}: no path leads to any of {len(candidates)} candidates; name other places"
+            f"{links.source}: none of {len(links)} candidates has a path; choose other positions"
         )
     errors = replace(errors, common=errors.common[reached], position=errors.position[reached])
     beliefs = model.beliefs()
-    chosen = choose(beliefs, predicted[:, reached], slope[:, reached], errors, count)
-    chosen = [replace(each, index=int(reached[each.index])) for each in chosen]
+    outlooks = choose_candidates(beliefs, predicted[:, reached], slope[:, reached], errors, count)
+    outlooks = [replace(outlook, index=int(reached[outlook.index])) for outlook in outlooks]
     draws = len(beliefs.point)
-    return _table(result, candidates, predicted[:draws], chosen, certain(beliefs.piece[:draws]))
+    before = initial_range_probability(beliefs.piece[:draws])
+    return _table(result, links, predicted[:draws], outlooks, before)
 
 
-def shown(found: pd.DataFrame) -> tuple[Table, ...]:
-    """Suggestions for people.
+def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
+    """Suggestions as tables for the terminal.
 
     Args:
-        found: What `suggest` gave.
+        suggestions: The suggestions, from `suggest`.
 
     Returns:
-        A table of places, and one of what each point is expected to gain with those above it.
+        A table of positions, and a table of the gain expected from each suggestion and those above it.
     """
-    grouped = ["group"] if "group" in found else []
+    grouped = ["group"] if "group" in suggestions else []
     columns = (
         numbers("rank"),
         numbers("row"),
-        *(numbers(name, "m") for name in PLACES),
+        *(numbers(name, "m") for name in POSITION_COLUMNS),
         *map(Column, grouped),
         numbers("path loss", "dB"),
         numbers("draws differ by", "dB"),
     )
     rows, gains = [], []
-    for rank, each in enumerate(found.to_dict("records"), start=1):
-        losses = (f"{each['path_loss_db']:.1f}", f"{each['spread_db']:.1f}")
-        places = (f"{each[name]:.2f}" for name in PLACES)
-        rows.append((str(rank), str(each["row"]), *places, *(str(each[name]) for name in grouped), *losses))
-        gains.append((str(rank), each["gain"]))
+    for rank, row in enumerate(suggestions.to_dict("records"), start=1):
+        losses = (f"{row['path_loss_db']:.1f}", f"{row['spread_db']:.1f}")
+        position = (f"{row[name]:.2f}" for name in POSITION_COLUMNS)
+        rows.append((str(rank), str(row["row"]), *position, *(str(row[name]) for name in grouped), *losses))
+        gains.append((str(rank), row["gain"]))
     expected = Table(
-        "Expected of the 95 % intervals once it and those above are measured",
+        "Expected 95 % intervals once it and those above are measured",
         (numbers("rank"), Column("gain")),
         tuple(gains),
     )
     return Table("Where to measure next", columns, tuple(rows)), expected
 
 
-class _Model:
-    """A calibration's draws, replayed at the links that it was fitted to and at candidates.
+class _ReplayedDraws:
+    """A calibration's draws, replayed at its own links and at candidates.
 
     Args:
         result: The calibration.
@@ -146,171 +152,191 @@ class _Model:
         parameters, objective = problem.parameters, problem.objective
         if problem.freedom < 1:
             raise InputError(
-                f"{result.study.path}: {objective.num_counted} links are too few to tell the size of errors"
+                f"{result.study.path}: {objective.num_counted} links are too few to estimate the size of residuals; "
+                "measure more, or calibrate fewer parameters"
             )
         self.noise_db = max(result.rmse_db * float(np.sqrt(objective.num_counted / problem.freedom)), 1e-3)
         self.problem = replace(problem, objective=replace(objective, noise_db=self.noise_db))
         self.lower, upper = parameters.search_bounds
         self.width = upper - self.lower
-        drawn = np.stack([result.uncertainty.draws[name] for name in parameters.names], axis=1)
-        draws = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), DRAWS)).round().astype(int)]
-        self.draws, self.values = len(draws), np.vstack([draws, self._rivals(drawn)])
-        self.told = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)
+        all_draws = np.stack([result.uncertainty.draws[name] for name in parameters.names], axis=1)
+        chosen = np.linspace(0, len(all_draws) - 1, min(len(all_draws), MOST_DRAWS)).round().astype(int)
+        self.num_draws = len(chosen)
+        self.values = np.vstack([all_draws[chosen], self._further_values(all_draws)])
+        self.evaluation = self.problem.evaluate(parameters.to_search(self.values), derivatives=True)
 
     def beliefs(self) -> Beliefs:
-        """What the calibration says so far."""
-        told, draws = self.told, slice(self.draws)
-        square = told.value**2 * told.num_rows / self.noise_db**2
+        """What the calibration says before any candidate is measured."""
+        evaluation, draws = self.evaluation, slice(self.num_draws)
+        square = evaluation.value**2 * evaluation.num_rows / self.noise_db**2
         unit = (self.problem.parameters.to_search(self.values[draws]) - self.lower) / self.width
-        return Beliefs(unit, self._information(told)[draws], self._pieces(self.values), square - square.min())
+        information = self._information(evaluation)[draws]
+        return Beliefs(unit, information, self._pieces(self.values), square - square.min())
 
     def at(self, setup: Setup) -> tuple[NDArray[np.float64], NDArray[np.float64], Errors]:
-        """Path loss of candidates by every value [m, c], derivatives in the unit cube by draws [n, c, d], errors."""
+        """Predict the candidates.
+
+        Args:
+            setup: The study, opened for the candidates.
+
+        Returns:
+            Path loss for every value [m, candidates], [dB]; its derivatives with respect to the coordinates of the unit
+            cube for the draws [n, candidates, d], [dB]; and the expected errors of measurements.
+        """
         objective, links = self.problem.objective, setup.links
-        loss, slope = self._replayed(self._engine(setup))
+        loss, slope = self._replay(self._engine(setup))
         if objective.ceiling_db is not None:
             slope[loss >= objective.ceiling_db] = 0.0
             loss = objective.capped(loss)
         design, common = self._nuisance(links)
         coefficients, _ = objective.nuisance.filled(
-            objective.coefficients(self.told.modelled), objective.weight > 0
+            objective.coefficients(self.evaluation.modelled), objective.weight > 0
         )
-        place, shared = np.hstack([links.rx, links.tx]), self._shared()
-        errors = Errors(self.noise_db, common, place)
-        if shared is not None:
-            errors = Errors(shared.own_db, common, place, shared.shared_db, shared.range_m)
-        following = objective.coefficient_slopes(*self._replayed(self.engine))
-        return loss + coefficients @ design.T, (slope + design @ following)[: self.draws], errors
+        position, correlation = np.hstack([links.rx, links.tx]), self._correlation()
+        errors = Errors(self.noise_db, common, position)
+        if correlation is not None:
+            errors = Errors(correlation.own_db, common, position, correlation.shared_db, correlation.range_m)
+        coefficient_slopes = objective.coefficient_slopes(*self._replay(self.engine))
+        path_loss_db = loss + coefficients @ design.T
+        return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
 
     def _engine(self, setup: Setup) -> Differentiable:
         section = setup.study.engine
-        compress = section.compress_db if isinstance(section, ReplaySection) else None
-        # As they were traced for the calibration, so that the cache knows them.
+        compress_db = section.compress_db if isinstance(section, ReplaySection) else None
+        # The same materials as in the calibration's last trace, so that the cache of traces answers.
         materials = None if self.result.fit.retrace_gap_db is None else self.result.materials
-        return replay(setup, setup.trace(materials, self.progress), compress)
+        return replay(setup, setup.trace(materials, self.progress), compress_db)
 
-    def _replayed(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of an engine's links by every value, and its derivatives by the unit cube's coordinates."""
+    def _replay(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Path loss for every value [m, links] and its derivatives in the unit cube [m, links, d], [dB]."""
         loss, slope = engine.path_loss_and_jacobian(self.values)
         return loss, slope * (self.problem.parameters.search_slope(self.values) * self.width)[:, None, :]
 
-    def _information(self, told: Evaluation) -> NDArray[np.float64]:
-        """Information of the links in the unit cube [m, d, d]."""
-        slopes = told.slopes * self.width / self.noise_db
+    def _information(self, evaluation: Evaluation) -> NDArray[np.float64]:
+        """Information matrix of the links in the unit cube [m, d, d]."""
+        slopes = evaluation.slopes * self.width / self.noise_db
         return np.einsum("nmi,nmj->nij", slopes, slopes)
 
-    def _rivals(self, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values around the draws in every separate range, as far from them as curvature leaves open."""
-        parameters, piece = self.problem.parameters, self._pieces(drawn)
-        around = [
-            np.flatnonzero(piece[:, k] == which)
+    def _further_values(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values around the draws in every separate range, distributed as the curvature there allows [k, d]."""
+        parameters, piece = self.problem.parameters, self._pieces(draws)
+        members = [
+            np.flatnonzero(piece[:, k] == number)
             for k in np.flatnonzero(np.ptp(piece, axis=0))
-            for which in np.unique(piece[:, k])
+            for number in np.unique(piece[:, k])
         ]
-        if not around:
-            return np.empty((0, drawn.shape[1]))
+        if not members:
+            return np.empty((0, draws.shape[1]))
         random = np.random.default_rng(self.result.study.method.seed)
-        chosen = np.concatenate([random.choice(each, RIVALS) for each in around])
-        points = parameters.to_search(drawn[chosen])
+        chosen = np.concatenate([random.choice(indices, VALUES_PER_RANGE) for indices in members])
+        points = parameters.to_search(draws[chosen])
         information = self._information(self.problem.evaluate(points, derivatives=True))
-        root = np.linalg.cholesky(np.linalg.inv(information + FLAT * np.eye(drawn.shape[1])))
-        moved = np.einsum("nij,nj->ni", root, random.standard_normal(points.shape)) * self.width
-        return parameters.from_search(np.clip(points + moved, self.lower, self.lower + self.width))
+        prior_information = UNIFORM_INFORMATION * np.eye(draws.shape[1])
+        root = np.linalg.cholesky(np.linalg.inv(information + prior_information))
+        step = np.einsum("nij,nj->ni", root, random.standard_normal(points.shape)) * self.width
+        return parameters.from_search(np.clip(points + step, self.lower, self.lower + self.width))
 
     def _pieces(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Which of its separate ranges every value of a parameter lies in, or nearest to."""
-        found = np.zeros(values.shape, dtype=np.int64)
+        """Index of the separate range that contains, or is nearest to, each parameter's value [m, d]."""
+        piece = np.zeros(values.shape, dtype=np.int64)
         for k, name in enumerate(self.problem.parameters.names):
             interval = self.result.intervals.get(name)
             if interval is not None and len(interval.pieces) > 1:
                 ends = np.array(interval.pieces)
-                apart = np.maximum(ends[:, 0, None] - values[:, k], values[:, k] - ends[:, 1, None])
-                found[:, k] = np.argmin(apart, axis=0)
-        return found
+                outside = np.maximum(ends[:, 0, None] - values[:, k], values[:, k] - ends[:, 1, None])
+                piece[:, k] = np.argmin(outside, axis=0)
+        return piece
 
     def _nuisance(self, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Columns of the nuisance at candidates [c, q], and what of it is unknown there [c, r], [dB]."""
+        """Design of the nuisance at candidates [candidates, q], and its uncertainty there.
+
+        The uncertainty [candidates, unknowns], [dB] has a column for each coefficient, from its posterior given the
+        calibration links, and one for each group without measurements.
+        """
         objective = self.problem.objective
         nuisance, counted = objective.nuisance, objective.weight > 0
         if not nuisance.terms:
             return np.zeros((len(links), 0)), np.zeros((len(links), 0))
-        known = nuisance.design[counted].toarray()
+        measured = nuisance.design[counted].toarray()
         weight = objective.weight[counted] * counted.sum() / objective.weight.sum()
-        vague = np.where(objective.determined, np.inf, UNKNOWN_DB)
-        gram = known.T @ (weight[:, None] * known)
-        gram += np.diag((self.noise_db / nuisance.prior) ** 2 + (self.noise_db / vague) ** 2)
+        # Coefficients that the links do not determine get a wide prior, which keeps the matrix regular.
+        wide_prior = np.where(objective.determined, np.inf, UNKNOWN_DB)
+        gram = measured.T @ (weight[:, None] * measured)
+        gram += np.diag((self.noise_db / nuisance.prior) ** 2 + (self.noise_db / wide_prior) ** 2)
         root = self.noise_db * np.linalg.cholesky(np.linalg.inv(gram))
-        parts = [self._columns(term, links) for term in nuisance.terms]
-        design = np.concatenate([column for column, _ in parts], axis=1)
-        return design, np.concatenate([design @ root, *(extra for _, extra in parts)], axis=1)
+        parts = [self._term(term, links) for term in nuisance.terms]
+        design = np.concatenate([columns for columns, _ in parts], axis=1)
+        return design, np.concatenate([design @ root, *(unknown for _, unknown in parts)], axis=1)
 
-    def _columns(self, term: Term, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Columns of a term at candidates, and one for each group that was never seen."""
+    def _term(self, term: Term, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns of a term at candidates, and a column for each group without measurements."""
         study = self.result.study
         if term.name == OFFSET:
             labels = links.group if study.offset is not None and study.offset.per is not None else None
         else:
             per = study.nuisance[term.name].per
             labels = None if per is None else links.table.labels(per)
-        known = self.result.nuisance.coefficients.get(term.name, {})
-        there = term.at(links, labels)
-        # A group never seen gets the mean of those that were.
+        coefficients = self.result.nuisance.coefficients.get(term.name, {})
+        at_links = term.at(links, labels)
+        # A group without measurements gets the mean of the others.
         share = np.where(
-            there.group[:, None] < 0, 1.0 / len(term.labels), np.eye(len(term.labels))[there.group]
+            at_links.group[:, None] < 0, 1.0 / len(term.labels), np.eye(len(term.labels))[at_links.group]
         )
-        strange = np.flatnonzero(there.group < 0)
-        names, place = np.unique(np.asarray([] if labels is None else labels)[strange], return_inverse=True)
-        found = np.zeros((len(links), len(names)))
-        size = np.std(list(known.values()), ddof=1) if len(known) > 1 else UNKNOWN_DB
-        found[strange, place] = there.value[strange] * size
-        return share * there.value[:, None], found
+        new = np.flatnonzero(at_links.group < 0)
+        new_labels = np.asarray([] if labels is None else labels)[new]
+        new_groups, group = np.unique(new_labels, return_inverse=True)
+        unknown = np.zeros((len(links), len(new_groups)))
+        spread = np.std(list(coefficients.values()), ddof=1) if len(coefficients) > 1 else UNKNOWN_DB
+        unknown[new, group] = at_links.value[new] * spread
+        return share * at_links.value[:, None], unknown
 
-    def _shared(self) -> Correlation | None:
-        """What errors of neighbouring links share, where they show it."""
+    def _correlation(self) -> Correlation | None:
+        """Correlation of the residuals of neighbouring links; None where they show none."""
         problem, objective = self.problem, self.problem.objective
         values = np.array([[self.result.parameters[name] for name in problem.parameters.names]])
-        told = problem.evaluate(problem.parameters.to_search(values))
-        errors = told.residuals[0, : objective.num_counted]
+        evaluation = problem.evaluate(problem.parameters.to_search(values))
+        residuals = evaluation.residuals[0, : objective.num_counted]
         links = problem.setup.links
-        return shared_errors(errors, np.hstack([links.rx, links.tx])[objective.weight > 0])
+        return shared_errors(residuals, np.hstack([links.rx, links.tx])[objective.weight > 0])
 
 
 def _table(
     result: Record,
     candidates: Measurements,
     predicted: NDArray[np.float64],
-    chosen: list[Outlook],
-    sure: NDArray[np.float64],
+    outlooks: list[Outlook],
+    probability_before: NDArray[np.float64],
 ) -> pd.DataFrame:
     """The suggestions as a table."""
-    index = np.array([each.index for each in chosen])
+    index = np.array([outlook.index for outlook in outlooks])
+    positions = np.hstack([candidates.tx, candidates.rx])
     table: dict[str, object] = {"row": candidates.row[index]}
-    ends = np.hstack([candidates.tx, candidates.rx])
-    table |= {name: ends[index, k] for k, name in enumerate(PLACES)}
+    table |= {name: positions[index, k] for k, name in enumerate(POSITION_COLUMNS)}
     if candidates.group is not None:
         table["group"] = candidates.group[index]
     table["path_loss_db"] = predicted[:, index].mean(axis=0)
     table["spread_db"] = predicted[:, index].std(axis=0)
-    words: list[list[str]] = [[] for _ in chosen]
+    gains: list[list[str]] = [[] for _ in outlooks]
     for k, name in enumerate(result.study.parameters):
-        now = _width(result, name, 1.0)
-        then = [_width(result, name, float(each.narrowed[k])) for each in chosen]
-        table[f"{name}_width"] = then
-        for said, width, each in zip(words, then, chosen, strict=True):
-            if each.narrowed[k] < 1 - SPOKEN:
-                said.append(f"{name} to a width of {width:.3g} (now {now:.3g})")
-        if sure[k] < 1:
-            table[f"{name}_sure"] = [float(each.sure[k]) for each in chosen]
-            for said, each in zip(words, chosen, strict=True):
-                if each.sure[k] > sure[k] + SPOKEN:
-                    said.append(f"{name}'s right range known with {each.sure[k]:.0%} (now {sure[k]:.0%})")
-    nothing = "no interval narrower by more than 2 %"
-    table["gain"] = [", ".join(said) or nothing for said in words]
+        width_before = _width(result, name, 1.0)
+        widths = [_width(result, name, float(outlook.narrowed[k])) for outlook in outlooks]
+        table[f"{name}_width"] = widths
+        for gain, width, outlook in zip(gains, widths, outlooks, strict=True):
+            if outlook.narrowed[k] < 1 - LEAST_GAIN:
+                gain.append(f"{name} to a width of {width:.3g} (now {width_before:.3g})")
+        before = probability_before[k]
+        if before < 1:
+            probabilities = [float(outlook.range_probability[k]) for outlook in outlooks]
+            table[f"{name}_sure"] = probabilities
+            for gain, probability in zip(gains, probabilities, strict=True):
+                if probability > before + LEAST_GAIN:
+                    gain.append(f"right range of {name} known with {probability:.0%} (now {before:.0%})")
+    table["gain"] = [", ".join(gain) or "no interval narrower by more than 2 %" for gain in gains]
     return pd.DataFrame(table)
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval once it is narrowed, on the scale of the search."""
+    """Width of a parameter's interval once it is narrowed by a factor, on the scale of the search."""
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)
     if section.scale == "log":

@@ -1,0 +1,154 @@
+"""The nuisance at new links: what it adds to path loss, and how uncertain it is for groups without measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
+from calibray.measurements import Measurements
+from calibray.result.prediction_model import PredictionModel
+from calibray.result.record import Record
+
+TRANSMITTER: Final = "transmitter"
+"""`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""
+
+
+@dataclass(frozen=True, eq=False)
+class TermAtLinks:
+    """A fitted nuisance term at new links.
+
+    Attributes:
+        name: Its name.
+        column: Its column [links].
+        labels: Labels of the links' groups [links]; None for a term without groups.
+        coefficients: Coefficient by group, [dB] per unit of the column.
+    """
+
+    name: str
+    column: NDArray[np.float64]
+    labels: NDArray[np.str_] | None
+    coefficients: dict[str, float]
+
+
+class Shift(NamedTuple):
+    """The contribution of the nuisance to path loss.
+
+    Attributes:
+        value_db: With the best coefficients, then with each draw [1 + draws, links], [dB].
+        spread_db: Standard deviation at links of groups without a coefficient, else 0 [links], [dB].
+    """
+
+    value_db: NDArray[np.float64]
+    spread_db: NDArray[np.float64]
+
+
+def calibrated_terms(result: Record, links: Measurements) -> Iterator[TermAtLinks]:
+    """Terms of the calibrated model.
+
+    Args:
+        result: The calibration.
+        links: The new links.
+
+    Yields:
+        The terms.
+
+    Raises:
+        InputError: The links lack a column.
+    """
+    study, nuisance = result.study, result.nuisance
+    for name, coefficients in nuisance.coefficients.items():
+        if not coefficients:
+            continue
+        if name == OFFSET:
+            grouped = study.offset is not None and study.offset.per is not None
+            yield TermAtLinks(name, np.ones(len(links)), links.group if grouped else None, coefficients)
+        else:
+            section = study.nuisance[name]
+            labels = None if section.per is None else links.table.labels(section.per)
+            column = _column(links, section.by, nuisance.centres.get(name, 0.0))
+            yield TermAtLinks(name, column, labels, coefficients)
+
+
+def chosen_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
+    """Terms of the prediction model that validation chose.
+
+    Args:
+        model: The model.
+        links: The new links.
+
+    Yields:
+        The terms.
+
+    Raises:
+        InputError: The links lack a column.
+    """
+    for term in model.terms:
+        if term.per == TRANSMITTER:
+            labels = transmitters(links)
+        elif term.per == OFFSET:
+            labels = links.group
+        else:
+            labels = links.table.labels(term.per) if term.per else None
+        yield TermAtLinks(term.name, _column(links, term.by, term.centre), labels, term.coefficients)
+
+
+def nuisance_shift(
+    terms: Iterator[TermAtLinks],
+    links: Measurements,
+    draws: Mapping[str, list[float]] | None = None,
+    *,
+    new_groups: bool = False,
+) -> Shift:
+    """The contribution of nuisance terms to the path loss of new links.
+
+    A group without a coefficient gets the mean of the others. Its spread is their standard deviation s, enlarged by the
+    uncertainty of a mean of n values: s sqrt(1 + 1 / n).
+
+    Args:
+        terms: The terms.
+        links: The links.
+        draws: Draws from the posterior by coefficient [draws]; none if None.
+        new_groups: Whether groups without a coefficient are allowed.
+
+    Returns:
+        The contribution.
+
+    Raises:
+        InputError: A group has no coefficient, and `new_groups` is False.
+    """
+    draws = draws or {}
+    num_draws = len(next(iter(draws.values()), ()))
+    value, variance = np.zeros((1 + num_draws, len(links))), np.zeros(len(links))
+    for term in terms:
+        best = np.array(list(term.coefficients.values()))
+        columns = []
+        for label, coefficient in term.coefficients.items():
+            drawn = draws.get(f"{term.name}[{label}]" if label else term.name, [coefficient] * num_draws)
+            columns.append(np.array([coefficient, *drawn]))
+        coefficients = np.stack(columns, axis=1)
+        labels = np.full(len(links), "") if term.labels is None else term.labels
+        position = {label: index for index, label in enumerate(term.coefficients)}
+        group = np.array([position.get(str(label), -1) for label in labels])
+        if (group < 0).any() and not new_groups:
+            new_label = str(labels[int(np.argmax(group < 0))])
+            raise InputError(
+                f"{links.source}: group {new_label!r} has no calibrated {term.name}; the calibrated groups are "
+                f"{', '.join(term.coefficients)}"
+            )
+        mean = coefficients.mean(axis=1, keepdims=True)
+        value += term.column * np.where(group >= 0, coefficients[:, group], mean)
+        spread = np.std(best, ddof=1) if len(best) > 1 else UNKNOWN_DB
+        variance += np.where(group >= 0, 0.0, (term.column * spread) ** 2 * (1 + 1 / len(best)))
+    return Shift(value, np.sqrt(variance))
+
+
+def _column(links: Measurements, by: str, centre: float) -> NDArray[np.float64]:
+    if by == CONSTANT:
+        return np.ones(len(links))
+    return (np.log10(links.distance) if by == LOG_DISTANCE else links.table.numbers(by)) - centre
