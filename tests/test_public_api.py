@@ -1,7 +1,8 @@
-"""The public surface, frozen: a change here is a breaking change and belongs into the changelog."""
+"""The public names and signatures are frozen: a change here is a breaking change and belongs in the changelog."""
 
 import ast
 import inspect
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -20,13 +21,24 @@ SIGNATURES = {
     "report": "result, file, figures, overwrite, progress",
     "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
     "allow_changed_inputs",
-    "save_map": "coverage, folder, inputs, overwrite",
     "validate": "study, blocks, by, workers, progress, tracer",
     "suggest": "result, candidates, count, progress, allow_changed_inputs",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }
 NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Setup", "Study", "engines", "optimizers"}
+
+RESULT_METHODS = {
+    "load": "folder, allow_changed_inputs",
+    "save": "self, folder, overwrite",
+    "predict": "self, links, progress, allow_changed_inputs",
+    "predict_interval": "self, links, level, progress, allow_changed_inputs",
+    "coverage_map": "self, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
+    "allow_changed_inputs",
+    "suggest": "self, candidates, count, progress, allow_changed_inputs",
+    "report": "self, file, overwrite, progress",
+    "export": "self, folder, copy, overwrite",
+}
 
 
 def test_names_are_frozen():
@@ -36,9 +48,14 @@ def test_names_are_frozen():
 
 def test_type_checkers_see_every_name():
     module = ast.parse(Path(cb.__file__).read_text(encoding="utf-8"))
-    guarded = next(each for each in module.body if isinstance(each, ast.If))
-    seen = {alias.asname for each in guarded.body if isinstance(each, ast.ImportFrom) for alias in each.names}
-    assert seen == NAMES
+    guarded = next(statement for statement in module.body if isinstance(statement, ast.If))
+    imports = [statement for statement in guarded.body if isinstance(statement, ast.ImportFrom)]
+    assert {alias.asname for statement in imports for alias in statement.names} == NAMES
+
+
+def test_the_version_is_that_of_the_package():
+    assert cb.__version__ == version("calibray")
+    assert "__version__" in dir(cb)
 
 
 @pytest.mark.parametrize("name", SIGNATURES)
@@ -46,20 +63,29 @@ def test_signatures_are_frozen(name):
     assert ", ".join(inspect.signature(getattr(cb, name)).parameters) == SIGNATURES[name]
 
 
-def test_parts_of_the_design_are_there():
+@pytest.mark.parametrize("name", RESULT_METHODS)
+def test_the_methods_of_a_result_are_frozen(name):
+    assert ", ".join(inspect.signature(getattr(cb.Result, name)).parameters) == RESULT_METHODS[name]
+
+
+def test_a_coverage_map_saves_itself():
+    coverage = inspect.signature(cb.coverage_map, eval_str=True).return_annotation
+    assert ", ".join(inspect.signature(coverage.save).parameters) == "self, folder, inputs, overwrite"
+
+
+def test_the_names_of_the_design_exist():
     assert callable(cb.engines.make)
     assert {"GWO", "SGWOIM"} <= set(dir(cb.optimizers))
     assert callable(cb.Paths.load)
     assert callable(cb.Paths.save)
     assert callable(cb.Study.load)
-    assert callable(cb.Result.predict)
+    assert callable(cb.Setup.open)
     assert {"rmse_db", "initial_rmse_db", "holdout_rmse_db", "rt_calls", "materials", "parameters"} <= set(
         dir(cb.Result)
     )
     assert {"fit", "accuracy", "uncertainty", "nuisance", "prediction", "cost", "provenance"} <= set(
         cb.Result.__dataclass_fields__
     )
-    assert all(callable(getattr(cb.Result, verb)) for verb in ("report", "export", "coverage_map", "suggest"))
 
 
 def test_unknown_names_are_refused():

@@ -61,9 +61,9 @@ def new_links(count: int = 40) -> pd.DataFrame:
 def test_predictions_in_blocks_are_those_of_one_piece(found, level):
     setup = Setup.open(found.study, two_ray.TwoRay, links_from_frame(new_links()))
     told: list[tuple[str, int, int | None]] = []
-    whole = predict_links(found, setup, level, remarked=True)
+    whole = predict_links(found, setup, level, with_remarks=True)
     parts = predict_links(
-        found, setup, level, lambda *each: told.append(each), InProcess(at_most=1), remarked=True
+        found, setup, level, lambda *each: told.append(each), InProcess(at_most=1), with_remarks=True
     )
     assert any(np.diff(np.concatenate(cut(setup.links, 7))) < 0)
     assert list(parts) == list(whole)

@@ -111,10 +111,12 @@ def test_a_map_is_written_into_a_folder_of_any_name(coverage, tmp_path):
         assert file.count == len(coverage.layers)
 
 
-def test_the_position_of_the_transmitter_has_no_path_loss(result, monkeypatch):
+def test_the_position_of_the_transmitter_has_no_path_loss(result, coverage, monkeypatch):
     monkeypatch.setattr(cb.Setup, "trace", None)
-    predictions = cb.coverage_map(result, TX, height=12.0, cell=10.0, bounds=(-5, -5, 5, 5), columns=WEST)
-    assert np.isnan(predictions.path_loss_db).all()
+    x, y, z = coverage.x[0], coverage.y[0], coverage.z[0, 0]
+    bounds = (x - 5, y - 5, x + 5, y + 5)
+    one_cell = cb.coverage_map(result, (x, y, z), cell=10.0, bounds=bounds, columns=WEST)
+    assert np.isnan(one_cell.path_loss_db).all()
 
 
 def test_received_power_is_transmitted_power_minus_path_loss(coverage):
