@@ -26,7 +26,17 @@ SIGNATURES = {
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }
-NAMES = {*SIGNATURES, "Measurements", "Paths", "Result", "Setup", "Study", "engines", "optimizers"}
+NAMES = {
+    *SIGNATURES,
+    "Measurements",
+    "Paths",
+    "Result",
+    "Setup",
+    "Study",
+    "__version__",
+    "engines",
+    "optimizers",
+}
 
 RESULT_METHODS = {
     "load": "folder, allow_changed_inputs",

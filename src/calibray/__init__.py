@@ -1,6 +1,14 @@
 """Calibrate the radio materials of a ray-traced scene from measurements.
 
-Names are loaded when first used, so that importing the package costs nothing.
+Most users need `Study`, `calibrate` and `Result`. Names are imported when first used, so that importing the package is
+fast.
+
+Example:
+    >>> import calibray as cb
+    >>> from calibray.scenarios import demo_study_path
+    >>> study = cb.Study.load(demo_study_path())
+    >>> len(study.parameters)
+    3
 """
 
 from typing import TYPE_CHECKING
@@ -28,7 +36,9 @@ if TYPE_CHECKING:
     from calibray.study import Study as Study
     from calibray.study.trace import trace as trace
     from calibray.validation.validate import validate as validate
+    from calibray.version import __version__ as __version__
 
+# The module that defines each name.
 _HOMES = {
     "Material": "calibray.materials",
     "itu_material": "calibray.materials",
@@ -50,6 +60,7 @@ _HOMES = {
     "optimizers": "calibray.optimizers",
     "coverage_map": "calibray.prediction.coverage_map",
     "report": "calibray.reporting.page",
+    "__version__": "calibray.version",
 }
 
 __all__ = sorted(_HOMES)
