@@ -19,6 +19,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 NOTEBOOKS = DOCS.parent / "examples" / "notebooks"
 API = "reference/python"
 ROOMS = {
+    "calibray.result": "Result, sections",
     "calibray.engines": "Engines",
     "calibray.optimizers": "Optimizers",
 }
