@@ -43,7 +43,7 @@ lint: $(VENV)/.lint $(VENV)/.docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 
 bench: setup
 	$(BIN)/python benchmarks/replay.py
