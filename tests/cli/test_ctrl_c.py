@@ -21,7 +21,7 @@ from test_cli_run import write_study
 from typer.testing import CliRunner
 
 import programs
-from calibray.calibration import calibrate
+from calibray import calibrate
 from calibray.cli.app import app
 from calibray.cli.progress_bars import progress_bars
 from calibray.engines import open_ledger
