@@ -18,7 +18,7 @@ from calibray.prediction.residual_field import calibration_residuals, krige_resi
 from calibray.prediction.suggestion import suggest
 from calibray.result.prediction_model import ResidualField
 from calibray.scenes import Triangles
-from calibray.uncertainty.residuals import shared_errors
+from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width
 from changed import changed
 

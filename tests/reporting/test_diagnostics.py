@@ -10,7 +10,7 @@ import shown
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
 from calibray.reporting.diagnostics import remarkable
-from calibray.uncertainty.link_diagnostics import _passed
+from calibray.uncertainty.link_diagnostics import _depth_and_power
 from changed import changed
 from made_up_report import made_up
 
@@ -69,7 +69,7 @@ def test_links_held_out_take_no_part(result):
 
 def test_shares_of_power_are_those_of_paths_that_meet_a_material(result):
     paths = result.paths
-    depth, shares = _passed(paths, paths.materials)
+    depth, shares = _depth_and_power(paths, paths.materials)
     gain = np.abs(path_gains(paths).reshape(paths.num_paths, -1)) ** 2
     power = gain.sum(axis=1)
     for index, name in enumerate(paths.materials):

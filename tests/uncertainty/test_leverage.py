@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibray.uncertainty.residuals import leverage, shared_errors, variogram
+from calibray.uncertainty.residual_correlation import leverage, shared_errors, variogram
 
 COUNT = 60
 

@@ -27,9 +27,9 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.study import Study
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
-from calibray.uncertainty.link_diagnostics import examined
+from calibray.uncertainty.link_diagnostics import diagnose_links
 from calibray.uncertainty.noise_models import HEAVY
-from calibray.uncertainty.residuals import shared_errors
+from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance
 from calibray.validation.choice import choose_model
 from calibray.validation.held_out_statistics import compare
@@ -109,7 +109,7 @@ def outcome(
         log_distance(links, objective, study.scene.frequency),
     )
     paths = _traced(problem)
-    diagnostics = examined(problem, trail.best, paths)
+    diagnostics = diagnose_links(problem, trail.best, paths)
     table = pd.DataFrame(
         {
             "row": links.row,

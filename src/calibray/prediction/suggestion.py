@@ -29,8 +29,7 @@ from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers
-from calibray.uncertainty.noise import Correlation
-from calibray.uncertainty.residuals import shared_errors
+from calibray.uncertainty.residual_correlation import Correlation, shared_errors
 
 MOST_DRAWS: Final = 96
 """Most posterior draws that the candidates are ranked by."""

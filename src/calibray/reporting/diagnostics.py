@@ -177,7 +177,7 @@ def _searched(result: Record, name: str) -> NDArray[np.float64]:
 
 
 def _neighbours(result: Record) -> pd.DataFrame:
-    from calibray.uncertainty.residuals import variogram
+    from calibray.uncertainty.residual_correlation import variogram
 
     links, left = _used(result)
     ends = _ends(links)

@@ -1,4 +1,4 @@
-"""How far a finished calibration can be trusted: draws from the posterior, what they tell, and a free offset beside."""
+"""Uncertainty of a finished calibration: posterior draws, intervals, verdicts and remarks."""
 
 from __future__ import annotations
 
@@ -19,78 +19,77 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.support.blas_threads import single_blas_thread
 from calibray.support.progress import Progress
-from calibray.uncertainty.buildings import over_buildings
-from calibray.uncertainty.curvature import alone, by_curvature, covariances
-from calibray.uncertainty.emulator import ensemble
+from calibray.uncertainty.between_buildings import population_means
+from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.importance_sampling import ENOUGH, Draws, pooled, sample
-from calibray.uncertainty.likelihood import Explaining
-from calibray.uncertainty.remarks import departures, missed, outside_interval
-from calibray.uncertainty.undeclared_offset import forgotten_offset
-from calibray.uncertainty.verdicts import verdicts
-from calibray.uncertainty.widening import widened
+from calibray.uncertainty.likelihood import PosteriorDensity
+from calibray.uncertainty.linear_theory import covariances, local_intervals, with_reason
+from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
+from calibray.uncertainty.verdicts import verdicts, widened
 
 COST: Final = 10
-"""Replays of the draws by those of the calibration, at most; these take derivatives, which doubles their cost."""
+"""Replays for draws, at most, per replay of the calibration; the latter compute derivatives and cost twice as much."""
 
 INTERACTIONS: Final = 100_000_000
 """Interactions times replays that draws may take in any case: some seconds."""
 
 SIZES: Final = ((512, 20), (512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
-"""Points of a round and rounds, the first that the cost allows; most posteriors take two to four rounds."""
+"""Points per round and number of rounds; the first pair within the cost is used. Most posteriors take two to four
+rounds."""
 
-SHARED: Final = ((128, 4), (64, 3))
-"""The same where several engines share them."""
+SHARED_SIZES: Final = ((128, 4), (64, 3))
+"""`SIZES` if several engines share the cost."""
 
-PLACE: Final = 4
-"""Points of the first round for each place that draws start around, where that makes more places than `BASINS`: of many
-parameters that hardly matter, each place of one that does is found many times."""
+POINTS_PER_START: Final = 4
+"""Points of the first round per start, if that gives more starts than `BASINS`. With many parameters of little effect,
+each mode of the others is found at many minima."""
 
-ROUNDS: Final = 20
-"""Rounds at most, where those before cost less than they might have: noise that explains little asks no replays."""
+MAX_ROUNDS: Final = 20
+"""Largest number of rounds if earlier rounds cost less than planned: points of low density need fewer replays."""
 
-TIMES: Final = 3
-"""How many times as many rounds as the cost was thought to allow there may be then."""
+MORE_ROUNDS: Final = 3
+"""Largest ratio of these rounds to the planned ones."""
 
-ALIKE: Final = 0.1
-"""Differences of functions that stand in for an engine, by the links' errors, below which their mean does as well."""
+EQUAL: Final = 0.1
+"""Difference between emulators, relative to the errors of the links, below which only their mean is used."""
 
-KNOWN: Final = 200
-"""Minima by least squares that may be such."""
+MINIMA: Final = 200
+"""Largest number of least-squares minima evaluated as starts."""
 
-WEIGHED: Final = 250
-"""Draws that models of the noise are weighed at."""
+NOISE_DRAWS: Final = 250
+"""Draws at which noise models are compared."""
 
-KEPT: Final = 128
-"""Draws that are kept with the result."""
+KEPT_DRAWS: Final = 128
+"""Draws kept with the result."""
 
-FEW: Final = 500
+FEW_LINKS: Final = 500
 """Links up to which linear algebra takes one thread."""
 
-LINKS: Final = 10_000
-"""Links beyond which errors that neighbours share are not looked at: all pairs of them would have to be."""
+MAX_LINKS: Final = 10_000
+"""Links beyond which no draws are made: the correlation models need all pairs of links."""
 
-COLUMNS: Final = 100
-"""Columns of the nuisance beyond which draws leave them as they are at the optimum."""
+MAX_COLUMNS: Final = 100
+"""Columns of the nuisance up to which the draws include its coefficients."""
 
 EXACT_DB: Final = 1e-6
-"""RMSE of data without noise, which tell everything [dB]."""
+"""RMSE below which the data have no noise, so that linear theory is exact [dB]."""
 
 
 @dataclass(frozen=True)
 class Certainty:
-    """How far a calibration can be trusted.
+    """Uncertainty of a calibration.
 
     Attributes:
         intervals: Interval and verdict by parameter.
-        draws: Values of the parameters, by name, that explain the data about as well as those found.
-        posterior: All draws, in the search space, of what explains the links; None where none were made.
-        means: The same of what buildings have on the mean, where those that were seen may differ from it.
-        noise: Weights of the kinds of noise, and of a forgotten offset.
-        free_offset_db: The offset that fits best beside the study's model, where that has none [dB].
+        draws: Posterior draws of parameters and nuisance coefficients, by name.
+        posterior: All draws for the measured buildings, in the search space; None if none were made.
+        means: Draws of the means over all buildings; the posterior itself if buildings do not differ.
+        noise: Posterior weights of the kinds of noise, and of an undeclared offset.
+        free_offset_db: The best offset in addition to the study's model, if that has none [dB].
         free_offset_error_db: Its standard error [dB].
         remarks: Warnings and advice.
-        calls: Replays that this took.
-        seconds: Time that this took [s].
+        calls: Replays that the draws took.
+        seconds: Time of the assessment [s].
     """
 
     intervals: dict[str, Interval] = field(default_factory=dict)
@@ -105,237 +104,255 @@ class Certainty:
     seconds: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Budget:
+    """Cost of the draws from one engine.
+
+    Attributes:
+        points: Points per round.
+        rounds: Planned rounds.
+        replays: Largest number of replays in total.
+    """
+
+    points: int
+    rounds: int
+    replays: int
+
+
 def certainty(
     problem: Problem, trail: Trail, progress: Progress | None = None, model: ReplayedModel | None = None
 ) -> Certainty:
-    """Work out how far a calibration can be trusted.
+    """Assess the uncertainty of a calibration.
 
     Args:
         problem: The problem.
         trail: Its finished search.
         progress: Called with the stage "drawing" after every round.
-        model: The replay of the study's own scene, where the search had one as a cheap model.
+        model: The replay of the study's scene, if the search had one as a cheap model.
 
     Returns:
-        What the data tell of the parameters.
+        The uncertainty.
     """
     started = time.perf_counter()
-    # Matrices of few links are small: threads of the linear algebra cost more there than they give.
-    with single_blas_thread(problem.objective.num_counted <= FEW):
+    # Matrices of few links are small; BLAS threads cost more than they save.
+    with single_blas_thread(problem.objective.num_counted <= FEW_LINKS):
         if problem.differentiable:
             calls = problem.engine.calls
-            found = _certain(problem, [problem], trail, trail.rt_calls, progress)
+            assessment = _assess(problem, [problem], trail, trail.rt_calls, progress)
             calls = problem.engine.calls - calls
         else:
-            found, calls = _approximate(problem, trail, progress, model)
-    return replace(found, calls=calls, seconds=time.perf_counter() - started)
+            assessment, calls = _assess_emulated(problem, trail, progress, model)
+    return replace(assessment, calls=calls, seconds=time.perf_counter() - started)
 
 
-def _approximate(
+def _assess_emulated(
     problem: Problem, trail: Trail, progress: Progress | None, model: ReplayedModel | None
 ) -> tuple[Certainty, int]:
-    """The same by what stands in for an engine without derivatives, and the replays that it took."""
-    stands, name = ensemble(problem, trail, model), problem.setup.study.engine.name
-    if stands is None:
+    """Uncertainty from emulators of an engine without derivatives, and the number of replays."""
+    ensemble, name = emulate(problem, trail, model), problem.setup.study.engine.name
+    if ensemble is None:
         reason = Reason(ReasonKind.TOO_FEW_CALLS, {"calls": len(trail.candidates)})
-        return Certainty(_whole(problem.parameters, reason)), 0
+        return Certainty(_full_ranges(problem.parameters, reason)), 0
     mean, *drawn = (
-        replace(problem, engine=engine, observable=PATH_LOSS) for engine in (stands.mean, *stands.drawn)
+        replace(problem, engine=engine, observable=PATH_LOSS) for engine in (ensemble.mean, *ensemble.drawn)
     )
-    alike = stands.apart_db < ALIKE * trail.best_value
+    equal = ensemble.apart_db < EQUAL * trail.best_value
     spent = trail.rt_calls if model is None else model.calls
-    found = _certain(mean, [mean] if alike else drawn, trail, spent, progress)
+    assessment = _assess(mean, [mean] if equal else drawn, trail, spent, progress)
     remark = Remark(
         RemarkKind.APPROXIMATE_INTERVALS,
         {
             "engine": name,
-            "calls": stands.calls,
-            "error_db": float(stands.error_db),
-            "replay": stands.replayed is not None,
+            "calls": ensemble.calls,
+            "error_db": float(ensemble.error_db),
+            "replay": ensemble.replayed is not None,
         },
     )
-    intervals = {name: replace(each, approximate=True) for name, each in found.intervals.items()}
-    calls = 0 if stands.replayed is None else stands.replayed.calls
-    return replace(found, intervals=intervals, remarks=(remark, *found.remarks)), calls
+    intervals = {name: replace(interval, approximate=True) for name, interval in assessment.intervals.items()}
+    calls = 0 if ensemble.replayed is None else ensemble.replayed.calls
+    return replace(assessment, intervals=intervals, remarks=(remark, *assessment.remarks)), calls
 
 
-def _whole(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
-    """Intervals that tell nothing."""
+def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
+    """Intervals over the whole range, with the standard deviation of a uniform distribution."""
     return {
-        each.name: Interval(
-            (each.upper - each.lower) / np.sqrt(12.0),
-            each.lower,
-            each.upper,
+        parameter.name: Interval(
+            (parameter.upper - parameter.lower) / np.sqrt(12.0),
+            parameter.lower,
+            parameter.upper,
             Verdict.NOT_IDENTIFIABLE,
-            (),
-            reason,
-            True,
+            reason=reason,
+            approximate=True,
         )
-        for each in parameters
+        for parameter in parameters
     }
 
 
-def _certain(
+def _assess(
     problem: Problem, engines: Sequence[Problem], trail: Trail, spent: int, progress: Progress | None
 ) -> Certainty:
-    """What the data tell, by a problem and by those that differ in their engine alone, each as likely as the others."""
-    told = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
-    local = by_curvature(problem, trail, told)
-    freedom = told.num_rows - problem.unknowns
+    """Uncertainty of a problem; draws come from problems with equally likely engines."""
+    optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
+    local = local_intervals(problem, trail, optimum)
+    freedom = optimum.num_rows - problem.unknowns
     if freedom < 1:
-        reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": told.num_rows})
-        return Certainty(
-            {
-                name: replace(each, verdict=Verdict.NOT_IDENTIFIABLE, reason=reason)
-                for name, each in local.items()
-            }
-        )
-    if told.value[0] < EXACT_DB:
-        reason = Reason(ReasonKind.NO_NOISE)
-        return Certainty({name: replace(each, reason=reason) for name, each in local.items()})
-    return _from_draws(problem, engines, trail, local, freedom, spent, progress)
-
-
-def _from_draws(
-    problem: Problem,
-    engines: Sequence[Problem],
-    trail: Trail,
-    local: dict[str, Interval],
-    freedom: int,
-    spent: int,
-    progress: Progress | None,
-) -> Certainty:
-    known, square = find_minima(problem, trail)
-    lowest, least = relevant_minima(known, square, freedom), float(square.min())
-    offset = forgotten_offset(problem, lowest, least, freedom)
-    found = Certainty(
+        reason = Reason(ReasonKind.TOO_FEW_LINKS, {"links": optimum.num_rows})
+        unknown = {
+            name: replace(interval, verdict=Verdict.NOT_IDENTIFIABLE) for name, interval in local.items()
+        }
+        return Certainty(with_reason(unknown, reason))
+    if optimum.value[0] < EXACT_DB:
+        return Certainty(with_reason(local, Reason(ReasonKind.NO_NOISE)))
+    minima, squares = find_minima(problem, trail)
+    relevant, least = relevant_minima(minima, squares, freedom), float(squares.min())
+    offset = fit_undeclared_offset(problem, relevant, least, freedom)
+    assessment = Certainty(
         free_offset_db=offset.offset_db, free_offset_error_db=offset.error_db, remarks=offset.remarks
     )
-    if problem.objective.num_counted > LINKS:
-        crowd = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": LINKS})
-        return replace(found, intervals=alone(local, crowd))
-    explaining = Explaining.of(problem, lowest[0], least, freedom)
-    tried = explaining.marginal.models
-    size = _size(problem, spent, len(engines), explaining.replays)
-    if size is None:
-        return replace(found, intervals=alone(local, Reason(ReasonKind.TOO_EXPENSIVE)))
-    # What fits worse by least squares may fit best where errors are alike or have heavy tails.
-    places = np.concatenate([known[np.argsort(square)[:KNOWN]], offset.minima[:BASINS]])
-    explained = explaining(places)
-    order = np.argsort(-np.logaddexp.reduce(explained, axis=1), kind="stable")
-    starts = places[order[: max(BASINS, size[0] // PLACE)]]
-    explaining = explaining.without_negligible(explained)
-    wide = covariances(problem, starts, freedom)
-    posterior = pooled(_drawn(explaining, engines, starts, wide, size, progress))
-    each = explaining(posterior.resampled(WEIGHED))
-    noise = explaining.kinds(np.exp(each - np.logaddexp.reduce(each, axis=1, keepdims=True)))
-    means = over_buildings(explaining, posterior, each, tried)
-    told = _told(explaining, posterior, means, local)
-    behind = float(posterior.density.max() - np.logaddexp.reduce(explained[0]))
-    top = problem.parameters.from_search(posterior.point[np.argmax(posterior.density)])
-    best, likeliest = problem.parameters.named(trail.best), problem.parameters.named(top)
-    said = (
-        *offset.remarks, *departures(noise), *(missed(problem, posterior, trail) if problem in engines else ()),
-        *outside_interval(problem, best, told, likeliest, behind, noise),
-        *(Remark(RemarkKind.FEW_DRAWS),) * posterior.flattened,
-    )  # fmt: skip
+    if problem.objective.num_counted > MAX_LINKS:
+        reason = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": MAX_LINKS})
+        return replace(assessment, intervals=with_reason(local, reason))
+    density = PosteriorDensity.of(problem, relevant[0], least, freedom)
+    budget = _budget(problem, spent, len(engines), density.replays)
+    if budget is None:
+        return replace(assessment, intervals=with_reason(local, Reason(ReasonKind.TOO_EXPENSIVE)))
+    tried = density.marginal.models
+    # A higher minimum of least squares may have the highest density under correlated or heavy-tailed errors.
+    points = np.concatenate([minima[np.argsort(squares)[:MINIMA]], offset.minima[:BASINS]])
+    at_minima = density(points)
+    order = np.argsort(-np.logaddexp.reduce(at_minima, axis=1), kind="stable")
+    starts = points[order[: max(BASINS, budget.points // POINTS_PER_START)]]
+    density = density.without_negligible(at_minima)
+    posterior = _draw(density, engines, starts, covariances(problem, starts, freedom), budget, progress)
+    at_draws = density(posterior.resampled(NOISE_DRAWS))
+    noise = density.kinds(np.exp(at_draws - np.logaddexp.reduce(at_draws, axis=1, keepdims=True)))
+    means = population_means(density, posterior, at_draws, tried)
+    intervals = _intervals(density, posterior, means, local)
+    log_odds = float(posterior.density.max() - np.logaddexp.reduce(at_minima[0]))
+    most_probable = problem.parameters.from_search(posterior.point[np.argmax(posterior.density)])
+    best, most_probable = problem.parameters.named(trail.best), problem.parameters.named(most_probable)
+    remarks = [*offset.remarks, *departures(noise)]
+    if problem in engines:
+        remarks += missed(problem, posterior, trail)
+    remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)
+    if posterior.flattened:
+        remarks.append(Remark(RemarkKind.FEW_DRAWS))
     return replace(
-        found,
-        intervals=told,
-        draws=_draws(problem, posterior),
+        assessment,
+        intervals=intervals,
+        draws=_named_draws(problem, posterior),
         posterior=posterior,
         means=means,
         noise=noise,
-        remarks=said,
+        remarks=tuple(remarks),
     )
 
 
-def _drawn(
-    explaining: Explaining,
+def _draw(
+    density: PosteriorDensity,
     engines: Sequence[Problem],
     starts: NDArray[np.float64],
-    wide: NDArray[np.float64],
-    size: tuple[int, int, int],
+    covariance: NDArray[np.float64],
+    budget: _Budget,
     progress: Progress | None,
-) -> list[Draws]:
-    """Draws by every engine: from minima [k, d] of so much covariance [k, d, d], as many as `_size` allows."""
-    (batch, turns, allowed), done = size, 0
+) -> Draws:
+    """Draw from the posterior of every engine: starts [k, d] with covariances [k, d, d]."""
+    done = 0
 
-    def drawn(engine: Problem) -> Draws:
-        own, before, first = replace(explaining, problem=engine), engine.engine.calls, done
+    def draw(engine: Problem) -> Draws:
+        of_engine, before, first = replace(density, problem=engine), engine.engine.calls, done
 
         def more() -> bool:
+            within_rounds = done - first <= min(MAX_ROUNDS, MORE_ROUNDS * budget.rounds)
             spent = engine.engine.calls - before
-            return (
-                done - first <= min(ROUNDS, TIMES * turns) and spent + batch * explaining.replays <= allowed
-            )
+            return within_rounds and spent + budget.points * density.replays <= budget.replays
 
-        def density(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        def log_density(points: NDArray[np.float64]) -> NDArray[np.float64]:
             nonlocal done
             done += 1
             if progress is not None:
-                progress("drawing", done, max(done, (turns + 1) * len(engines)))
-            return np.logaddexp.reduce(own(points), axis=1)
+                progress("drawing", done, max(done, (budget.rounds + 1) * len(engines)))
+            return np.logaddexp.reduce(of_engine(points), axis=1)
 
         return sample(
-            density, *engine.parameters.search_bounds, starts, wide, batch=batch, rounds=turns, more=more,
-            enough=ENOUGH / len(engines), seed=engine.setup.study.method.seed,
-        )  # fmt: skip
+            log_density,
+            *engine.parameters.search_bounds,
+            starts,
+            covariance,
+            batch=budget.points,
+            rounds=budget.rounds,
+            more=more,
+            enough=ENOUGH / len(engines),
+            seed=engine.setup.study.method.seed,
+        )
 
-    return [drawn(engine) for engine in engines]
+    return pooled([draw(engine) for engine in engines])
 
 
-def _told(
-    explaining: Explaining, posterior: Draws, means: Draws, local: dict[str, Interval]
+def _intervals(
+    density: PosteriorDensity, posterior: Draws, means: Draws, local: dict[str, Interval]
 ) -> dict[str, Interval]:
-    """Interval and verdict by parameter, from draws of the buildings seen and of the mean over all."""
-    parameters = explaining.problem.parameters
+    """Interval and verdict by parameter, from draws for the measured buildings and of the means over all."""
+    parameters = density.problem.parameters
     lower, upper = parameters.search_bounds
 
-    def shown(index: int, value: float) -> float:
+    def value_at(index: int, coordinate: float) -> float:
         point = lower.copy()
-        point[index] = value
+        point[index] = coordinate
         return float(parameters.from_search(point)[index])
 
-    def in_unit(index: int, value: float) -> float:
-        point = parameters.lower.copy()
-        point[index] = value
-        return float(parameters.to_unit(point)[index])
-
-    told = verdicts(
-        means, explaining.modelled, parameters.names, lower, upper, explaining.marginal.noise_db,
-        level=CONFIDENCE, shown=shown, seen=posterior,
-    )  # fmt: skip
-    found = {}
-    for index, (name, verdict) in enumerate(zip(parameters.names, told, strict=True)):
-        pieces = tuple((shown(index, low), shown(index, high)) for low, high in verdict.pieces)
-        found[name] = Interval(
+    judged = verdicts(
+        means,
+        density.modelled,
+        parameters.names,
+        lower,
+        upper,
+        density.marginal.noise_db,
+        level=CONFIDENCE,
+        shown=value_at,
+        seen=posterior,
+    )
+    intervals = {}
+    for index, (name, verdict) in enumerate(zip(parameters.names, judged, strict=True)):
+        pieces = tuple((value_at(index, low), value_at(index, high)) for low, high in verdict.pieces)
+        interval = Interval(
             local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
         )
         if posterior.flattened:
-            found[name] = widened(found[name], local[name], lambda value, k=index: in_unit(k, value))
-    return found
+
+            def to_unit(value: float, index: int = index) -> float:
+                point = parameters.lower.copy()
+                point[index] = value
+                return float(parameters.to_unit(point)[index])
+
+            interval = widened(interval, local[name], to_unit)
+        intervals[name] = interval
+    return intervals
 
 
-def _size(problem: Problem, spent: int, engines: int, replays: int) -> tuple[int, int, int] | None:
-    """Points of a round, rounds that their cost of so many replays each allows, and replays that may be spent in all.
+def _budget(problem: Problem, spent: int, engines: int, replays: int) -> _Budget | None:
+    """The largest budget within the cost; None if the smallest is too expensive.
 
-    None where not even the fewest are. Where several engines share the draws, each needs the fewest that do.
+    Args:
+        problem: The problem.
+        spent: Replays of the calibration.
+        engines: Number of engines that share the cost.
+        replays: Replays per point.
     """
     interactions = getattr(problem.engine, "interactions", 1)
     allowed = max(COST * spent, INTERACTIONS // max(interactions, 1)) // engines
-    sizes = SIZES if engines == 1 else SHARED
-    fitting = ((batch, turns) for batch, turns in sizes if batch * (turns + 2) * replays <= allowed)
-    return next(((batch, turns, allowed) for batch, turns in fitting), None)
+    for points, rounds in SIZES if engines == 1 else SHARED_SIZES:
+        if points * (rounds + 2) * replays <= allowed:
+            return _Budget(points, rounds, allowed)
+    return None
 
 
-def _draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
-    """Draws from the posterior by parameter, in the fields' units."""
-    parameters = problem.parameters
-    found = posterior.resampled(KEPT, problem.setup.study.method.seed)
-    named = dict(zip(parameters.names, parameters.from_search(found).T.tolist(), strict=True))
-    columns = problem.objective.nuisance.columns
-    if len(columns) > COLUMNS:
-        return named
-    coefficients = problem.objective.coefficients(problem.modelled(found))
-    return named | dict(zip(columns, coefficients.T.tolist(), strict=True))
+def _named_draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
+    """Draws of equal weight by name: parameters in the fields' units, and coefficients of the nuisance."""
+    parameters, columns = problem.parameters, problem.objective.nuisance.columns
+    points = posterior.resampled(KEPT_DRAWS, problem.setup.study.method.seed)
+    draws = dict(zip(parameters.names, parameters.from_search(points).T.tolist(), strict=True))
+    if len(columns) <= MAX_COLUMNS:
+        coefficients = problem.objective.coefficients(problem.modelled(points))
+        draws |= dict(zip(columns, coefficients.T.tolist(), strict=True))
+    return draws

@@ -1,11 +1,10 @@
-"""What stands in for an engine without derivatives: its calls, and functions of the parameters that agree with them.
+"""Emulators of an engine without derivatives, made from its calls.
 
-Intervals take thousands of evaluations, and calls are dear. A Gaussian process for the path loss of every link passes
-through what was answered (`multifidelity/discrepancy.py`): what the replay of the study's own scene leaves of it, once
-corrected, where there is one and it does not mislead; else all of it, around planes. What the process does not know
-must not narrow an interval. So whole functions are drawn from it, each as good an engine as the others, and intervals
-are those of their posteriors together. Every call is also foretold from all the others: where that fails by more than
-the process expects, functions are drawn as much further apart.
+Intervals need thousands of evaluations, and calls are expensive. A Gaussian process for the path loss of every link
+interpolates the calls (`multifidelity/discrepancy.py`). Its mean is the corrected replay of the study's scene, if
+there is one that does not mislead; otherwise a constant. The uncertainty of the process must widen the intervals. We
+therefore draw functions from it, use each as an engine, and pool their posteriors. Every call is also predicted from
+all others; if these leave-one-out errors exceed the expected ones, the drawn functions vary by as much more.
 """
 
 from __future__ import annotations
@@ -36,35 +35,35 @@ from calibray.optimizers.sampling import design
 from calibray.parameters import Parameters
 
 FUNCTIONS: Final = 8
-"""Functions drawn."""
+"""Number of functions drawn."""
 
-MOST: Final = 200
-"""Calls that they pass through, for the matrix is factored some hundred times."""
+MAX_CALLS: Final = 200
+"""Largest number of calls that the process interpolates; its matrix is factored some hundred times."""
 
 TRIALS: Final = 8
-"""Constants drawn from their prior that the input mapping starts from, beside the believed ones."""
+"""Starting points of the input mapping, drawn from the prior of the constants, in addition to the declared values."""
 
 NEAR: Final = 0.005
-"""Distance in the unit cube below which one call tells as much as two, where there are more."""
+"""Distance in the unit cube below which a call is redundant, if there are more than `MAX_CALLS`."""
 
 
-class Ground(Protocol):
-    """What is known of the links before any call."""
+class MeanFunction(Protocol):
+    """The mean of the Gaussian process: path loss predicted without calls."""
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """Path loss [k, m] at points of the unit cube [k, d], and these as the process sees them."""
+        """Path loss [k, m] at points of the unit cube [k, d], and the inputs of the process."""
         ...
 
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """The same with derivatives [k, m, d], and those of the responses [k, r, d]."""
+        """Path loss, its derivatives [k, m, d], the inputs, and the derivatives of their responses [k, r, d]."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class Planes:
-    """Nothing is known but that links change evenly rather than not.
+class ConstantMean:
+    """A constant mean with linear responses, if there is no replay.
 
     Attributes:
         centre: Mean path loss [m], [dB].
@@ -73,13 +72,13 @@ class Planes:
     centre: NDArray[np.float64]
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """See `Ground.base`."""
+        """See `MeanFunction.base`."""
         return np.tile(self.centre, (len(unit), 1)), Inputs(unit, _steepness(unit) * (unit - 0.5))
 
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """See `Ground.base_and_slope`."""
+        """See `MeanFunction.base_and_slope`."""
         (count, d), (base, inputs) = unit.shape, self.base(unit)
         change = np.broadcast_to(_steepness(unit) * np.eye(d), (count, d, d))
         return base, np.zeros((*base.shape, d)), inputs, change
@@ -87,11 +86,11 @@ class Planes:
 
 @dataclass(frozen=True, eq=False)
 class LossRows:
-    """The path loss of the links that count, as a cheap model's rows.
+    """The path loss of the links with weight as residuals of a cheap model.
 
     Attributes:
-        objective: What says which count, and what a lost link counts as.
-        links: Their places [m].
+        objective: The objective, which holds ceiling and measured values.
+        links: Indices of the m links with weight [m].
     """
 
     objective: Objective
@@ -99,7 +98,7 @@ class LossRows:
 
     @property
     def filling(self) -> NDArray[np.float64]:
-        """The measured path loss, or the ceiling where one stands for a link without a path [L], [dB]."""
+        """The ceiling, or without one the measured path loss [L], [dB]."""
         ceiling = self.objective.ceiling_db
         return self.objective.measured if ceiling is None else np.full(len(self.objective.measured), ceiling)
 
@@ -121,13 +120,13 @@ class LossRows:
         return np.where(capped[:, :, None], 0.0, slope)[:, self.links]
 
 
-class Asked(NamedTuple):
-    """What is known of an engine: its calls.
+class Calls(NamedTuple):
+    """The calls of an engine.
 
     Attributes:
         unit: Distinct points, in the unit cube [n, d].
-        loss: Path loss of the links that count [n, m], [dB].
-        value: What was minimized there [n].
+        loss: Path loss of the m links with weight [n, m], [dB].
+        value: Objective [n].
     """
 
     unit: NDArray[np.float64]
@@ -136,45 +135,45 @@ class Asked(NamedTuple):
 
 
 @dataclass(eq=False)
-class StandIn:
-    """A function of the parameters that takes an engine's place; it has derivatives.
+class EmulatedEngine:
+    """A function of the parameters that replaces an engine, with derivatives.
 
     Attributes:
-        parameters: What a candidate's components stand for.
-        materials: The scene's materials before calibration.
-        interactions: What a candidate costs, as that many interactions would.
-        ground: What it starts from.
-        function: What it adds to that.
-        links: Places of the links that it is about [m].
-        elsewhere: Path loss of all links, kept where it is about others [L], [dB].
+        parameters: The parameters of a candidate.
+        materials: The scene's initial materials.
+        interactions: Cost of a candidate, as an equivalent number of interactions.
+        mean: The mean function.
+        function: The function added to the mean.
+        links: Indices of the m emulated links [m].
+        initial_loss: Initial path loss of all links, kept for links that are not emulated [L], [dB].
         calls: Candidates evaluated so far.
     """
 
     parameters: Parameters
     materials: dict[str, Material]
     interactions: int
-    ground: Ground
+    mean: MeanFunction
     function: SampledFunction
     links: NDArray[np.int64]
-    elsewhere: NDArray[np.float64]
+    initial_loss: NDArray[np.float64]
     calls: int = 0
     large: bool = False
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `Engine.path_loss`."""
-        base, inputs = self.ground.base(self._unit(candidates))
-        return self._placed(base + self.function.values(inputs))
+        base, inputs = self.mean.base(self._unit(candidates))
+        return self._for_all_links(base + self.function.values(inputs))
 
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See `Differentiable.path_loss_and_jacobian`."""
-        base, slope, inputs, change = self.ground.base_and_slope(self._unit(candidates))
+        base, slope, inputs, change = self.mean.base_and_slope(self._unit(candidates))
         box, scale = self._box, self.parameters.search_slope(candidates)
         slope = (slope + self.function.slopes(inputs, change)) / (box.width * scale[:, None, :])
-        whole = np.zeros((len(candidates), len(self.elsewhere), box.dimension))
-        whole[:, self.links] = slope
-        return self._placed(base + self.function.values(inputs)), whole
+        all_slopes = np.zeros((len(candidates), len(self.initial_loss), box.dimension))
+        all_slopes[:, self.links] = slope
+        return self._for_all_links(base + self.function.values(inputs)), all_slopes
 
     @property
     def _box(self) -> Box:
@@ -184,129 +183,131 @@ class StandIn:
         self.calls += len(candidates)
         return self._box.to_unit(self.parameters.to_search(candidates))
 
-    def _placed(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
-        whole = np.tile(self.elsewhere, (len(loss), 1))
-        whole[:, self.links] = loss
-        return whole
+    def _for_all_links(self, loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        all_links = np.tile(self.initial_loss, (len(loss), 1))
+        all_links[:, self.links] = loss
+        return all_links
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Functions that take an engine's place.
+    """Emulators of an engine.
 
     Attributes:
-        mean: The mean of all that are possible.
-        drawn: Some of them.
-        apart_db: Root mean square of what these differ by from it, over the whole range of the parameters [dB].
-        error_db: Root mean square of the errors with which the better half of the calls are foretold, each from all
-            others [dB].
-        calls: Calls that they pass through.
-        replayed: The corrected replay that they start from; None where there is none, or it misleads.
+        mean: The posterior mean of the process.
+        drawn: Functions drawn from the process.
+        apart_db: Root mean square difference of these from the mean, over the whole range of the parameters [dB].
+        error_db: Root mean square leave-one-out error of the better half of the calls [dB].
+        calls: Number of calls that the process interpolates.
+        replayed: The corrected replay in the mean function; None if there is none, or if it misleads.
     """
 
-    mean: StandIn
-    drawn: tuple[StandIn, ...]
+    mean: EmulatedEngine
+    drawn: tuple[EmulatedEngine, ...]
     apart_db: float
     error_db: float
     calls: int
     replayed: ReplayedModel | None
 
 
-def ensemble(problem: Problem, trail: Trail, model: ReplayedModel | None = None) -> Ensemble | None:
-    """Functions that agree with all that an engine answered.
+def emulate(problem: Problem, trail: Trail, model: ReplayedModel | None = None) -> Ensemble | None:
+    """Emulate an engine from its calls.
 
     Args:
         problem: The problem.
         trail: Its finished search.
-        model: The replay of the study's own scene, if there is one.
+        model: The replay of the study's scene, if available.
 
     Returns:
-        The functions; None where the calls are too few to tell anything.
+        The emulators; None if there are too few calls.
     """
     objective, parameters, method = problem.objective, problem.parameters, problem.setup.study.method
     box, links = Box(*parameters.search_bounds), np.flatnonzero(objective.weight > 0)
-    asked = _asked(problem, trail, box, links)
+    calls = _calls(problem, trail, box, links)
     random, noisy = np.random.default_rng([method.seed, 8]), bool(method.options.get("noisy", False))
     replayed = None if model is None else _replayed(model, LossRows(objective, links))
     corrected = None
-    if replayed is not None and len(asked.unit) > 1:
-        corrected = _corrected(replayed, box, asked, random, noisy)
-        if len(asked.unit) >= JUDGED and error_ratio(corrected) > MISLED:
+    if replayed is not None and len(calls.unit) > 1:
+        corrected = _corrected(replayed, box, calls, random, noisy)
+        if len(calls.unit) >= JUDGED and error_ratio(corrected) > MISLED:
             corrected = None
     if corrected is not None:
-        ground: Ground = corrected
+        mean: MeanFunction = corrected
         process = corrected.discrepancy
-    elif len(asked.unit) >= box.dimension + 2:
-        ground, replayed = Planes(asked.loss.mean(axis=0)), None
-        base, inputs = ground.base(asked.unit)
-        scale = float(np.sqrt(np.mean((asked.loss - base) ** 2)))
-        process = discrepancy.fit(inputs, asked.loss - base, max(scale, 1e-6), noisy=noisy)
+    elif len(calls.unit) >= box.dimension + 2:
+        mean, replayed = ConstantMean(calls.loss.mean(axis=0)), None
+        base, inputs = mean.base(calls.unit)
+        scale = float(np.sqrt(np.mean((calls.loss - base) ** 2)))
+        process = discrepancy.fit(inputs, calls.loss - base, max(scale, 1e-6), noisy=noisy)
     else:
         return None
-    better = np.argsort(asked.value, kind="stable")[: max(2, len(asked.value) // 2)]
+    better = np.argsort(calls.value, kind="stable")[: max(2, len(calls.value) // 2)]
+    # If leave-one-out errors exceed what the process expects, the drawn functions vary by as much more.
     stretch = max(
-        1.0, standardized_error(process, better), standardized_error(process, np.arange(len(asked.value)))
+        1.0, standardized_error(process, better), standardized_error(process, np.arange(len(calls.value)))
     )
-    cost = asked.loss.size + (0 if replayed is None else _interactions(replayed.engine))
-
+    cost = calls.loss.size + (0 if replayed is None else _interactions(replayed.engine))
     functions = [
         sample_function(process, random, 0.0),
         *(sample_function(process, random, stretch) for _ in range(FUNCTIONS)),
     ]
-    mean, *others = (
-        StandIn(parameters, problem.engine.materials, cost, ground, each, links, problem.before)
-        for each in functions
+    mean_engine, *drawn = (
+        EmulatedEngine(parameters, problem.engine.materials, cost, mean, function, links, problem.before)
+        for function in functions
     )
-    _, inputs = ground.base(design("sobol", CLOUD, box.dimension, random))
-    middle, *apart = (function.values(inputs) for function in functions)
+    _, inputs = mean.base(design("sobol", CLOUD, box.dimension, random))
+    mean_values, *drawn_values = (function.values(inputs) for function in functions)
     return Ensemble(
-        mean,
-        tuple(others),
-        float(np.sqrt(np.mean((np.array(apart) - middle) ** 2))),
-        float(np.sqrt(np.mean(process.left_out_errors()[better] ** 2))),
-        len(asked.unit),
-        replayed,
+        mean_engine,
+        tuple(drawn),
+        apart_db=float(np.sqrt(np.mean((np.array(drawn_values) - mean_values) ** 2))),
+        error_db=float(np.sqrt(np.mean(process.left_out_errors()[better] ** 2))),
+        calls=len(calls.unit),
+        replayed=replayed,
     )
 
 
-def _asked(problem: Problem, trail: Trail, box: Box, links: NDArray[np.int64]) -> Asked:
-    """All calls that gave every link that counts a path loss; of many, those that tell the most."""
+def _calls(problem: Problem, trail: Trail, box: Box, links: NDArray[np.int64]) -> Calls:
+    """The calls with a path loss for every link with weight; of too many, the most informative."""
     objective, parameters = problem.objective, problem.parameters
     candidates = np.array([*trail.candidates, parameters.start])
     modelled = np.array([*trail.modelled, problem.before])
     loss = objective.capped(modelled)[:, links]
-    good = np.isfinite(loss).all(axis=1)
-    unit, both = merge_repeated(
-        box.to_unit(parameters.to_search(candidates[good])),
-        np.column_stack([loss[good], objective.value(modelled[good])]),
+    complete = np.isfinite(loss).all(axis=1)
+    unit, loss_and_value = merge_repeated(
+        box.to_unit(parameters.to_search(candidates[complete])),
+        np.column_stack([loss[complete], objective.value(modelled[complete])]),
     )
-    order = np.argsort(both[:, -1], kind="stable")
-    if len(order) > MOST:
-        kept: list[int] = []
-        for place in order.tolist():
-            if not kept or np.abs(unit[kept] - unit[place]).max(axis=1).min() > NEAR:
-                kept.append(place)
-        # The best half, and of the rest some from everywhere.
-        far = np.array(kept[MOST // 2 :], dtype=np.int64)
-        some = np.unique(np.linspace(0, len(far) - 1, MOST // 2).astype(np.int64)) if len(far) else far
-        order = np.concatenate([np.array(kept[: MOST // 2], dtype=np.int64), far[some]])
-    return Asked(unit[order], both[order, :-1], both[order, -1])
+    order = np.argsort(loss_and_value[:, -1], kind="stable")
+    if len(order) > MAX_CALLS:
+        distinct: list[int] = []
+        for index in order.tolist():
+            if not distinct or np.abs(unit[distinct] - unit[index]).max(axis=1).min() > NEAR:
+                distinct.append(index)
+        # The best calls, and an evenly spaced selection of the others.
+        half = MAX_CALLS // 2
+        best, others = np.array(distinct[:half], dtype=np.int64), np.array(distinct[half:], dtype=np.int64)
+        if len(others):
+            others = others[np.unique(np.linspace(0, len(others) - 1, half).astype(np.int64))]
+        order = np.concatenate([best, others])
+    return Calls(unit[order], loss_and_value[order, :-1], loss_and_value[order, -1])
 
 
 def _corrected(
-    model: ReplayedModel, box: Box, asked: Asked, random: np.random.Generator, noisy: bool
+    model: ReplayedModel, box: Box, calls: Calls, random: np.random.Generator, noisy: bool
 ) -> Corrected:
     """The replay, corrected by the calls."""
-    given = model.constants
-    trials = given.centre + given.spread * random.standard_normal((TRIALS, len(given.centre)))
-    trials = np.vstack([given.centre, np.clip(trials, given.lower, given.upper)])
+    constants = model.constants
+    trials = constants.draw(random.standard_normal((TRIALS, len(constants.centre))))
+    trials = np.vstack([constants.centre, trials])
     cloud = design("sobol", CLOUD, box.dimension, random)
-    return correct(model, box, asked.unit, asked.loss, cloud, trials, noisy=noisy)
+    return correct(model, box, calls.unit, calls.loss, cloud, trials, noisy=noisy)
 
 
 def _replayed(model: ReplayedModel, rows: LossRows) -> ReplayedModel | None:
-    found = ReplayedModel(model.engine, model.count, rows)
-    return found if found.known.any() else None
+    """The replay with path loss as residuals; None if it predicts no link."""
+    replayed = ReplayedModel(model.engine, model.count, rows)
+    return replayed if replayed.known.any() else None
 
 
 def _interactions(engine: StoredPaths) -> int:
@@ -314,5 +315,5 @@ def _interactions(engine: StoredPaths) -> int:
 
 
 def _steepness(unit: NDArray[np.float64]) -> float:
-    """Factor that gives responses a mean square of one together, over the cube."""
+    """Factor that scales the responses to a total mean square of one over the cube."""
     return float(np.sqrt(12.0 / unit.shape[1]))

@@ -1,12 +1,61 @@
-"""How far a calibration's answer can be trusted: intervals from the curvature of the sum of squares."""
+"""Linear theory: intervals and covariances from the curvature of the sum of squares at the optimum.
+
+Posterior sampling starts from these covariances. The intervals replace those of the posterior if it cannot be sampled.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from calibray.result.verdict import CONFIDENCE, Interval, Verdict
+from calibray.fitting.problem import Evaluation, Problem
+from calibray.fitting.search import Trail
+from calibray.result.verdict import CONFIDENCE, Interval, Reason, Verdict
+
+WIDE_PRECISION: Final = 9.0
+"""Inverse variance, in the unit cube, of a prior as wide as a third of the range. It keeps undetermined parameters
+within their range."""
+
+
+def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
+    """Intervals by linear theory in the search space, where a parameter over decades is logarithmic.
+
+    Args:
+        problem: The problem.
+        trail: Its finished search.
+        optimum: The evaluation of the optimum, with derivatives.
+
+    Returns:
+        The interval of every parameter, by name.
+    """
+    parameters = problem.parameters
+    # Compressed residuals are scaled to the sum of squares of the full ones.
+    scale = np.sqrt(optimum.num_rows / optimum.residuals.shape[1])
+    searched = intervals(
+        parameters.to_search(trail.best),
+        optimum.residuals[0] * scale,
+        optimum.slopes[0] * scale,
+        *parameters.search_bounds,
+        optimum.num_rows - problem.unknowns,
+    )
+    lower = parameters.from_search(np.array([interval.lower for interval in searched]))
+    upper = parameters.from_search(np.array([interval.upper for interval in searched]))
+    unit = parameters.search_slope(trail.best)
+    return {
+        name: Interval(
+            interval.standard_error * float(unit[k]), float(lower[k]), float(upper[k]), interval.verdict
+        )
+        for k, (name, interval) in enumerate(zip(parameters.names, searched, strict=True))
+    }
+
+
+def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
+    """Add to intervals by linear theory the reason why the posterior was not sampled."""
+    return {name: replace(interval, reason=reason) for name, interval in local.items()}
 
 
 def intervals(
@@ -15,41 +64,58 @@ def intervals(
     jacobian: NDArray[np.float64],
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
-    nuisances: int,
-    count: int | None = None,
+    freedom: int,
 ) -> list[Interval]:
-    """Confidence intervals of the parameters from the curvature of the sum of squares at the optimum.
+    """95 % confidence intervals from the curvature of the sum of squares at the optimum.
 
-    A parameter is called not identifiable when its 95 % interval is wider than half of its bounds. Linear theory:
-    other minima, and errors that neighbouring links share, can make the truth wider.
+    A parameter is not identifiable if its interval is wider than half of its bounds. Other minima and correlated errors
+    can make the true interval wider.
 
     Args:
         best: The optimum [d].
-        residuals: Residuals there, offsets eliminated [m], [dB].
+        residuals: Residuals at the optimum, nuisance eliminated [m], [dB].
         jacobian: Their derivatives [m, d].
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        nuisances: Number of offsets fitted beside the parameters.
-        count: Number of residuals that those given stand for, with the same sums of squares and products; their own
-            if None.
+        freedom: Number of full residuals minus unknowns.
 
     Returns:
         One interval per parameter.
     """
-    freedom = max((len(residuals) if count is None else count) - len(best) - nuisances, 1)
-    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # Student's t: standard errors either side
+    freedom = max(freedom, 1)
+    quantile = float(stdtrit(freedom, (1 + CONFIDENCE) / 2))  # of Student's t
     variance = float(residuals @ residuals) / freedom
-    values, vectors = np.linalg.eigh((scaled := jacobian * (upper - lower)).T @ scaled)
+    scaled = jacobian * (upper - lower)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
     values = np.maximum(values, values.max(initial=0.0) * 1e-12 + 1e-300)
     errors = np.sqrt(variance * ((vectors**2) @ (1 / values))) * (upper - lower)
-    found = []
+    result = []
     for value, error, low, high in zip(best, errors, lower, upper, strict=True):
-        ends = max(value - reach * error, low), min(value + reach * error, high)
+        ends = max(value - quantile * error, low), min(value + quantile * error, high)
         span = high - low
         verdict = Verdict.IDENTIFIED
-        if 2 * reach * error > span / 2:
+        if 2 * quantile * error > span / 2:
             verdict = Verdict.NOT_IDENTIFIABLE
         elif min(value - low, high - value) < 1e-6 * span:
             verdict = Verdict.AT_BOUND
-        found.append(Interval(float(error), float(ends[0]), float(ends[1]), verdict))
-    return found
+        result.append(Interval(float(error), float(ends[0]), float(ends[1]), verdict))
+    return result
+
+
+def covariances(problem: Problem, points: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+    """Covariance of the parameters at minima, at most as wide as a third of the range.
+
+    Args:
+        problem: The problem.
+        points: The minima, in the search space [k, d].
+        freedom: Number of residuals minus unknowns.
+
+    Returns:
+        The covariance at every minimum [k, d, d].
+    """
+    evaluation = problem.squares(points, derivatives=True)
+    lower, upper = problem.parameters.search_bounds
+    curvature = evaluation.curvature * np.outer(upper - lower, upper - lower)
+    variance = evaluation.value**2 * evaluation.num_rows / freedom
+    precision = curvature / variance[:, None, None] + WIDE_PRECISION * np.eye(len(lower))
+    return np.linalg.inv(precision) * np.outer(upper - lower, upper - lower)

@@ -1,4 +1,4 @@
-"""What only the finished calibration itself can tell of its links: leverage, depth, and what their power passes by."""
+"""Diagnostics of the links of a finished calibration: leverage, depth, and power by material and interaction."""
 
 from __future__ import annotations
 
@@ -13,70 +13,93 @@ from calibray.fields import path_gains
 from calibray.fitting.problem import Problem
 from calibray.materials import Material
 from calibray.paths import Kind, Paths
-from calibray.uncertainty.residuals import leverage
 
 DENSE: Final = 20_000_000
-"""Entries of a nuisance's design up to which links' leverage is worked out."""
+"""Entries of a nuisance's design up to which leverage is computed; the dense matrix then takes 160 MB."""
 
 DIRECT: Final = "line of sight"
-"""What a path meets that meets nothing."""
+"""Name of the power share of paths without interactions."""
 
 
 @dataclass(frozen=True)
-class Examined:
-    """What was found.
+class LinkDiagnostics:
+    """Diagnostics of the links of a finished calibration.
 
     Attributes:
-        columns: Columns of the table of links: `leverage`, NaN where a link does not count; `depth`, interactions of
-            the strongest path, NaN where none leads.
-        power_shares: Share of the links' power that is carried by paths with an interaction, by material and its kind:
-            the mean over links; what a path meets counts in full, so that shares add up to more than 1.
+        columns: Columns for the table of links: `leverage`, NaN for a link without weight; `depth`, the number of
+            interactions of the strongest path, NaN for a link without a path.
+        power_shares: Mean share over the links of the power carried by paths with an interaction, by material and kind
+            of interaction. A path counts in full for each of its interactions, so the sum of the shares exceeds 1.
     """
 
     columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     power_shares: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-def examined(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> Examined:
-    """Look at a finished calibration.
+def diagnose_links(problem: Problem, best: NDArray[np.float64], paths: Paths | None) -> LinkDiagnostics:
+    """Compute diagnostics of the links of a finished calibration.
 
     Args:
         problem: The problem.
         best: The calibrated values [d].
-        paths: The paths calibrated on, at the study's carrier; None where they are not at hand.
+        paths: The paths of the calibration, at the study's carrier; None if not available.
 
     Returns:
-        What was found; columns that cannot be known are left out.
+        The diagnostics; columns that the engine does not allow are left out.
     """
     columns: dict[str, NDArray[np.float64]] = {}
     if problem.differentiable:
         columns["leverage"] = _leverage(problem, best)
     if paths is None or not isinstance(problem.engine, Replay) or not paths.num_paths:
-        return Examined(columns)
+        return LinkDiagnostics(columns)
     materials = problem.parameters.materials(best, problem.engine.materials)
-    depth, shares = _passed(paths, materials)
-    return Examined({**columns, "depth": depth}, shares)
+    depth, shares = _depth_and_power(paths, materials)
+    return LinkDiagnostics({**columns, "depth": depth}, shares)
 
 
 def _leverage(problem: Problem, best: NDArray[np.float64]) -> NDArray[np.float64]:
     objective, count = problem.objective, problem.objective.num_counted
-    told = problem.evaluate(problem.parameters.to_search(best)[None], derivatives=True)
+    optimum = problem.evaluate(problem.parameters.to_search(best)[None], derivatives=True)
     counted = np.flatnonzero(objective.weight > 0)
     root = np.sqrt(objective.weight[counted] * count / objective.weight.sum())
     columns = len(objective.nuisance.columns)
-    found = np.full(len(objective.weight), np.nan)
+    result = np.full(len(objective.weight), np.nan)
     if count * columns <= DENSE:
         design = (
             objective.nuisance.design[counted].toarray() * root[:, None] if columns else np.zeros((count, 0))
         )
-        found[counted] = leverage(told.slopes[0, :count], design)
-    return found
+        result[counted] = leverage(optimum.slopes[0, :count], design)
+    return result
 
 
-def _passed(
+def leverage(jacobian: NDArray[np.float64], design: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Leverage of each link: how far its model follows its own measurement.
+
+    Args:
+        jacobian: Derivatives of the residuals by the parameters, nuisance eliminated [m, d].
+        design: Columns of the nuisance at the same links, scaled as the residuals [m, q].
+
+    Returns:
+        Diagonal of the projection onto both [m]: 0 for a link without influence, 1 for a link that alone determines an
+        unknown. The sum is the number of unknowns that the links determine.
+
+    Example:
+        >>> leverage(np.array([[1.0], [1.0], [0.0]]), np.zeros((3, 0))).round(2).tolist()
+        [0.5, 0.5, 0.0]
+    """
+    total = np.zeros(len(jacobian))
+    for columns in (jacobian, design):
+        size = np.linalg.norm(columns, axis=0)
+        used = columns[:, size > 0] / size[size > 0]
+        basis, values, _ = np.linalg.svd(used, full_matrices=False)
+        total += np.sum(basis[:, values > 1e-6] ** 2, axis=1)
+    return np.minimum(total, 1.0)
+
+
+def _depth_and_power(
     paths: Paths, materials: dict[str, Material]
 ) -> tuple[NDArray[np.float64], dict[str, dict[str, float]]]:
-    """Interactions of every link's strongest path [L], and shares of power by material and kind of interaction."""
+    """Number of interactions of every link's strongest path [L], and power by material and kind of interaction."""
     gain = path_gains(paths, materials).reshape(paths.num_paths, -1)
     power = np.sum(np.abs(gain) ** 2, axis=1)
     count, order = np.diff(paths.first), np.lexsort((power, paths.link))
@@ -86,14 +109,17 @@ def _passed(
     total = np.bincount(paths.link, power, paths.num_links)
     part = power / np.where(total > 0, total, np.inf)[paths.link]
     reached = max(int(np.count_nonzero(total)), 1)
-    owner = np.repeat(np.arange(paths.num_paths), count)
-    what = paths.material.astype(np.int64) * (max(Kind) + 1) + paths.kind
-    once = np.unique(np.stack([owner, what]), axis=1)
+    # One code per pair of material and kind; a path counts once for each pair that it meets.
+    path_of = np.repeat(np.arange(paths.num_paths), count)
+    code_of = paths.material.astype(np.int64) * (max(Kind) + 1) + paths.kind
+    path_index, codes = np.unique(np.stack([path_of, code_of]), axis=1)
     shares: dict[str, dict[str, float]] = {}
     names = list(paths.materials)
-    for code in np.unique(once[1]):
-        share = float(part[once[0, once[1] == code]].sum()) / reached
-        name = names[int(code) // (max(Kind) + 1)]
-        shares.setdefault(name, {})[Kind(int(code) % (max(Kind) + 1)).name.lower()] = share
+    for code in np.unique(codes):
+        material, kind = divmod(int(code), max(Kind) + 1)
+        share = float(part[path_index[codes == code]].sum()) / reached
+        shares.setdefault(names[material], {})[Kind(kind).name.lower()] = share
     direct = float(part[count == 0].sum()) / reached
-    return depth, {**shares, **({DIRECT: {"": direct}} if direct else {})}
+    if direct:
+        shares[DIRECT] = {"": direct}
+    return depth, shares

@@ -1,24 +1,24 @@
-"""How well parameters explain the measurements, whatever the noise: models of it, their unknowns integrated out.
+"""Noise models, and the marginal density of the measurements under each.
 
-Errors of links may be independent and Gaussian, shared by neighbours, heavy-tailed, or larger where materials matter
-more, for walls of one material differ from building to building; and an offset may have been forgotten. No one knows
-which beforehand, and choosing one by its fit forgets that another fits nearly as well. So every model gets a prior
-weight, and the density of the data under each stands beside the others'; what is reported averages over them.
+Errors may be independent and Gaussian, correlated between neighbours, heavy-tailed, or larger for links that depend
+more on materials, because walls of one material differ between buildings. An offset may be undeclared. The right model
+is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model therefore gets a prior
+weight, and results are averages over all models (Bayesian model averaging).
 
-The size of the noise has the prior 1/size and nuisances their own, flat unless stated. With Gaussian noise whose
-covariance is C times an unknown variance both integrals are closed (D. A. Harville, Biometrika 61, 1974): with whitened
-errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
+The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
+with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with
+whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'y,
 
     p = (2 pi)^(-f/2) Gamma(f/2) / 2 (S/2)^(-f/2) |C|^(-1/2) |A|^(-1/2) |R|,
 
-f being the number of links less that of columns with a flat prior. With heavy tails both are taken by Laplace's
-approximation (`tails.py`).
+where f is the number of links minus the number of columns with a flat prior. For heavy tails both integrals use
+Laplace's approximation (`heavy_tails.py`).
 
-Heterogeneity: where a material's constant differs from building to building by a factor exp(tau z), a link's path loss
-is another one on average, and varies about it. Both are taken from the corners of a two-level factorial design,
-theta_k exp(+-tau) (R. L. Plackett and J. P. Burman, Biometrika 33, 1946): the mean is right to the second order in tau,
-and so is the variance, which is added to the noise; and where reflections inside walls make path loss wave with the
-constant, they stay within the wave, as no derivative does.
+Heterogeneity: if the constant of a material differs between buildings by a factor exp(tau z), the mean path loss of a
+link shifts, and path loss varies about it. We compute both from the corners theta_k exp(+-tau) of a two-level factorial
+design (R. L. Plackett and J. P. Burman, Biometrika 33, 1946). Mean and variance are right to second order in tau; the
+variance is added to that of the noise. Path loss oscillates with the constants because of reflections inside walls; the
+corners stay within the oscillation, whereas derivatives would extrapolate it.
 """
 
 from __future__ import annotations
@@ -33,45 +33,45 @@ from scipy.linalg import hadamard
 from scipy.special import gammaln
 
 from calibray.uncertainty.censoring import log_evidence
-from calibray.uncertainty.correlation import Whitener, pairwise, whitener
 from calibray.uncertainty.heavy_tails import evidence, gross, products, regular, student
+from calibray.uncertainty.whitening import Whitener, pairwise, whitener
 
 OFFSET_DB: Final = 6.0
-"""Standard deviation of an offset that was forgotten, as of a cable or an antenna's gain [dB]."""
+"""Prior standard deviation of an undeclared offset, as from a cable or an antenna gain [dB]."""
 
-HELD: Final = 1e3
-"""One over the standard deviation of an offset that is none, where others have one [1/dB]."""
+NO_OFFSET: Final = 1e3
+"""Inverse prior standard deviation that keeps an offset at 0 [1/dB]."""
 
 SHARES: Final = (0.4, 0.7, 0.95)
-"""Shares of the variance that neighbours have in common, where they have."""
+"""Correlated shares of the variance that are tried."""
 
 RANGES: Final = 4
-"""Ranges of correlation, from the distance of neighbours to a third of the campaign."""
+"""Number of correlation ranges tried, from the distance of neighbours to a third of the campaign."""
 
 FREEDOMS: Final = (2.0, 4.0)
-"""Degrees of freedom of heavy-tailed noise."""
+"""Degrees of freedom of Student's t that are tried."""
 
 SPREADS: Final = (0.07, 0.15, 0.3)
-"""Spreads of a material between buildings."""
+"""Between-building spreads that are tried."""
 
 DEPARTURE: Final = 2.0
-"""Weight of each departure from independent Gaussian errors, beside theirs of one: measured errors rarely are."""
+"""Prior weight of each departure from independent Gaussian errors, relative to these: measured errors rarely are."""
 
 NEGLIGIBLE: Final = 1e-3
-"""Weight of a model below which it is left out."""
+"""Relative weight below which a model is dropped."""
 
-# Of errors with heavy tails, whichever they have.
+# Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, HEAVY, DIFFERING = "gaussian", "correlated", "student-t", "heterogeneous"
 
 
 def corners(parameters: int) -> NDArray[np.float64]:
-    """Corners whose averages tell each parameter's effect by itself.
+    """Corners of a two-level factorial design that separates the effects of all parameters.
 
     Args:
         parameters: Number of parameters d.
 
     Returns:
-        Signs [k, d], the columns orthogonal to each other and to a constant.
+        Signs [k, d], with columns orthogonal to each other and to a constant.
 
     Example:
         >>> corners(2).tolist()
@@ -81,12 +81,12 @@ def corners(parameters: int) -> NDArray[np.float64]:
     return np.asarray(hadamard(count)[:, 1 : parameters + 1], dtype=np.float64)
 
 
-class Differing(NamedTuple):
-    """What buildings that differ do to path loss, at one spread.
+class BuildingEffect(NamedTuple):
+    """Effect of differing buildings on path loss, at one spread.
 
     Attributes:
-        shift: Change of the mean [n, m], [dB], times the roots of the weights.
-        variance: Variance about it [n, m], [dB^2], times the weights.
+        shift: Change of the mean, times the square roots of the weights [n, m], [dB].
+        variance: Variance about the mean, times the weights [n, m], [dB^2].
     """
 
     shift: NDArray[np.float64]
@@ -99,13 +99,13 @@ class NoiseModel:
 
     Attributes:
         kind: "gaussian", "correlated", "student-t" or "heterogeneous".
-        weight: Its weight before anything was measured.
-        offset: Whether a forgotten offset is part of it.
-        range_m: Range of correlation [m], if "correlated".
-        share: Share of the variance that neighbours have in common, if "correlated".
+        weight: Its prior weight.
+        offset: Whether it includes an undeclared offset.
+        range_m: Correlation range, if "correlated" [m].
+        share: Correlated share of the variance, if "correlated".
         freedom: Degrees of freedom, if "student-t".
-        gross: Whether errors are Gaussian but for some gross ones in place of Student's, if "student-t".
-        spread: Spread of a material between buildings, if "heterogeneous".
+        gross: Whether the errors are Gaussian with some gross errors instead of Student's t, if "student-t".
+        spread: Between-building spread, if "heterogeneous".
     """
 
     kind: str
@@ -125,46 +125,52 @@ def noise_models(
     range_m: float | None = None,
     spread: float | None = None,
     offset: bool = True,
-    unheard: bool = False,
+    censored: bool = False,
 ) -> tuple[NoiseModel, ...]:
-    """The models of noise that are tried, each departure from independent Gaussian errors weighed alike.
+    """The noise models to try; all departures from independent Gaussian errors have equal prior weight.
 
     Args:
-        position: Where the links' ends stand [m, 3 or 6], [m].
-        kind: "gaussian" or "student-t" if it is known; both are tried if None.
-        range_m: Range of correlation [m], 0 for none; several are tried if None.
-        spread: Spread of materials between buildings, 0 for none; several are tried if None.
-        offset: Whether an offset may have been forgotten.
-        unheard: Whether some links were not heard: how likely that is, is not told where some errors are gross.
+        position: Positions of the links' ends [m, 3 or 6], [m].
+        kind: "gaussian" or "student-t" if declared; both are tried if None.
+        range_m: Correlation range, 0 for none [m]; several are tried if None.
+        spread: Between-building spread, 0 for none; several are tried if None.
+        offset: Whether to try an undeclared offset.
+        censored: Whether some links are censored; gross errors are then left out, because their probability of
+            censoring is not implemented.
 
     Returns:
-        The models; their weights add up to one.
+        The models; their weights sum to one.
     """
-    found = []
+    kinds = []
     if kind != HEAVY and not range_m and not spread:
-        found.append([NoiseModel(GAUSSIAN, 1.0)])
+        kinds.append([NoiseModel(GAUSSIAN, 1.0)])
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges and not spread:
-        found.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
+        kinds.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
     if kind != GAUSSIAN and not range_m and not spread:
         tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
-        found.append(tails if kind == HEAVY or unheard else [*tails, NoiseModel(HEAVY, 1.0, gross=True)])
+        if kind != HEAVY and not censored:
+            tails.append(NoiseModel(HEAVY, 1.0, gross=True))
+        kinds.append(tails)
     if kind != HEAVY and spread != 0 and not range_m:
-        found.append(
-            [NoiseModel(DIFFERING, 1.0, spread=s) for s in (SPREADS if spread is None else (spread,))]
-        )
-    choices = {False: 1.0, True: DEPARTURE} if offset else {False: 1.0}
-    whole = sum(choices.values())
-    size = [1.0 if group[0].kind == GAUSSIAN else DEPARTURE for group in found]
+        tried = SPREADS if spread is None else (spread,)
+        kinds.append([NoiseModel(DIFFERING, 1.0, spread=s) for s in tried])
+    offset_weights = {False: 1.0, True: DEPARTURE} if offset else {False: 1.0}
+    kind_weights = [1.0 if models[0].kind == GAUSSIAN else DEPARTURE for models in kinds]
     return tuple(
-        replace(model, weight=part / sum(size) / len(group) * likely / whole, offset=extra)
-        for part, group in zip(size, found, strict=True)
-        for model in group
-        for extra, likely in choices.items()
+        replace(
+            model,
+            weight=weight / sum(kind_weights) / len(models) * offset_weight / sum(offset_weights.values()),
+            offset=with_offset,
+        )
+        for weight, models in zip(kind_weights, kinds, strict=True)
+        for model in models
+        for with_offset, offset_weight in offset_weights.items()
     )
 
 
 def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
+    """Correlation ranges to try; none if fewer than three links have a neighbour at another position."""
     distance = pairwise(position)
     np.fill_diagonal(distance, np.inf)
     near = distance.min(axis=1)
@@ -178,16 +184,16 @@ def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """Density of the measurements given the parameters, under several models of the noise.
+    """Marginal density of the measurements given path loss, under several noise models.
 
     Attributes:
-        design: Columns of the nuisance, rows scaled as the gaps are [m, q].
-        ridge: Size of the noise over the standard deviations of their priors [q]; 0 where flat.
-        column: The column of a forgotten offset, scaled likewise [m].
-        noise_db: Size of the noise that priors and the spread of materials are stated against [dB].
-        models: The models.
-        whiteners: What makes the errors of a correlated model independent, by its range and share.
-        unheard: Which links were not heard, so that their gaps are lower limits [m]; no model is "correlated" then.
+        design: Columns of the nuisance, times the square roots of the weights [m, q].
+        ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
+        column: The column of an undeclared offset, scaled likewise [m].
+        noise_db: Approximate noise level, which scales priors and the building effect [dB].
+        models: The noise models.
+        whiteners: Whitener of each correlated model, by range and share.
+        censored: Mask of the censored links, whose gaps are lower limits [m]; no model is "correlated" then.
     """
 
     design: NDArray[np.float64]
@@ -196,7 +202,7 @@ class Marginal:
     noise_db: float
     models: tuple[NoiseModel, ...]
     whiteners: dict[tuple[float, float], Whitener]
-    unheard: NDArray[np.bool_]
+    censored: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -207,80 +213,85 @@ class Marginal:
         position: NDArray[np.float64],
         noise_db: float,
         models: Sequence[NoiseModel],
-        unheard: NDArray[np.bool_] | None = None,
+        censored: NDArray[np.bool_] | None = None,
     ) -> Marginal:
-        """Set up the models over some links.
+        """Set up the density over m links.
 
         Args:
-            design: Columns of the nuisance at the links, not scaled [m, q].
-            ridge: Size of the noise over the standard deviations of their priors [q]; 0 where flat.
-            scale: Roots of the links' weights, their mean square one [m].
-            position: Where the links' ends stand [m, 3 or 6], [m].
-            noise_db: Size of the noise, about [dB].
-            models: The models.
-            unheard: Which links were not heard [m]; none if None.
-
-        Returns:
-            The density.
+            design: Columns of the nuisance, not scaled [m, q].
+            ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
+            scale: Square roots of the links' weights, with mean square one [m].
+            position: Positions of the links' ends [m, 3 or 6], [m].
+            noise_db: Approximate noise level [dB].
+            models: The noise models.
+            censored: Mask of the censored links [m]; none if None.
         """
-        unheard = np.zeros(len(scale), dtype=bool) if unheard is None else unheard
-        places = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
-        made = {place: whitener(position, scale, *place) for place in sorted(places)}
-        return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), made, unheard)
+        censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
+        correlations = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
+        whiteners = {
+            (range_m, share): whitener(position, scale, range_m, share)
+            for range_m, share in sorted(correlations)
+        }
+        return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
     @property
     def spread(self) -> float:
-        """Spread of materials that a model asks for, the middle one of several; 0 where none does."""
+        """Spread at which the building effect is computed: the middle one of the models; 0 without such models."""
         spreads = sorted({model.spread for model in self.models if model.kind == DIFFERING})
         return spreads[len(spreads) // 2] if spreads else 0.0
 
-    def densities(self, gap: NDArray[np.float64], differing: Differing | None = None) -> NDArray[np.float64]:
-        """Logarithm of each model's weight times the density of the measurements.
+    def densities(
+        self, gap: NDArray[np.float64], effect: BuildingEffect | None = None
+    ) -> NDArray[np.float64]:
+        """Log density of the measurements plus the log weight, for each model.
 
         Args:
-            gap: Measured minus modelled path loss, without the nuisance, times the roots of the weights [n, m], [dB].
-            differing: What materials that differ by `spread` do to path loss; needed where that is not 0.
+            gap: Measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
+                [dB].
+            effect: Effect of buildings that differ by `spread`; required if that is not 0.
 
         Returns:
-            The logarithms [n, models]; -inf where a gap is not finite.
+            The log densities [n, models]; -inf if a gap is not finite.
 
         Raises:
-            ValueError: A model asks what differing materials do, and it is not given.
+            ValueError: A heterogeneous model lacks the building effect.
         """
-        found = np.full((len(gap), len(self.models)), -np.inf)
-        good = np.asarray((np.isfinite(gap) | (self.unheard & (gap < 0))).all(axis=1))
-        if not good.any():
-            return found
-        gap, white = gap[good], {}
+        log_density = np.full((len(gap), len(self.models)), -np.inf)
+        finite = np.asarray((np.isfinite(gap) | (self.censored & (gap < 0))).all(axis=1))
+        if not finite.any():
+            return log_density
+        gap, white = gap[finite], {}
+        if effect is not None:
+            effect = BuildingEffect(effect.shift[finite], effect.variance[finite])
         for index, model in enumerate(self.models):
             design, ridge = self._with_offset(model.offset)
-            if self.unheard.any():
-                value = self._censored(gap, model, design, ridge, differing, good)
+            if self.censored.any():
+                value = self._censored_density(gap, model, effect)
             elif model.kind == HEAVY:
                 tail = gross() if model.gross else student(model.freedom)
                 value = evidence(gap, design, ridge / self.noise_db, tail)
             elif model.kind == DIFFERING:
-                shift, weight = self._spread_out(model, differing, good)
+                shift, weight = self._shift_and_weight(model, effect)
                 value = _weighted(gap - shift, design, ridge, weight)
             elif model.kind == CORRELATED:
-                place = (model.range_m, model.share)
-                filter_ = self.whiteners[place]
-                if place not in white:
-                    white[place] = filter_.apply(gap.T).T
-                value = _plain(white[place], filter_.apply(design), ridge) - 0.5 * filter_.log_determinant
+                key = (model.range_m, model.share)
+                filter_ = self.whiteners[key]
+                if key not in white:
+                    white[key] = filter_.apply(gap.T).T
+                value = _plain(white[key], filter_.apply(design), ridge) - 0.5 * filter_.log_determinant
             else:
                 value = _plain(gap, design, ridge)
-            found[good, index] = value + np.log(model.weight)
-        return found
+            log_density[finite, index] = value + np.log(model.weight)
+        return log_density
 
     def form(self, model: NoiseModel) -> tuple[NDArray[np.float64], float, float]:
-        """The quadratic form that the density is a power of, under Gaussian noise, whose links may share errors.
+        """The density under Gaussian noise as a power of a quadratic form.
 
         Args:
             model: The model, "gaussian" or "correlated".
 
         Returns:
-            The matrix Q [m, m], and c and h: the logarithm of the density of gaps g is c - h log g'Q g.
+            The matrix Q [m, m], c and h: the log density of gaps g is c - h log g'Q g.
         """
         design, ridge = self._with_offset(model.offset)
         white, shift = np.eye(len(design)), 0.0
@@ -296,73 +307,65 @@ class Marginal:
         return square, _constant(freedom, ridge) - shift, 0.5 * freedom
 
     def heavy(self, gap: NDArray[np.float64], models: Sequence[NoiseModel]) -> NDArray[np.float64]:
-        """Logarithm of the density under heavy tails, of all gaps together.
+        """Log density under heavy tails, all gaps at once.
 
         Args:
-            gap: As `densities` takes them, all finite [n, m].
-            models: The model of each, "student-t"; all with gross errors or none [n].
+            gap: The gaps as for `densities`, all finite [n, m].
+            models: The "student-t" model of each gap, either all or none with gross errors [n].
 
         Returns:
-            The logarithms [n], without the models' weights.
+            The log densities without the models' weights [n].
         """
         offset = np.array([model.offset for model in models])
         design, ridge = self._with_offset(bool(offset.any()))
-        each = np.tile(ridge / self.noise_db, (len(gap), 1))
+        by_gap = np.tile(ridge / self.noise_db, (len(gap), 1))
         if offset.any():
-            each[~offset, -1] = HELD
+            by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
-        return evidence(gap, design, each, gross() if models[0].gross else student(freedom))
+        return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))
 
-    def reduced(self, densities: NDArray[np.float64]) -> Marginal:
-        """The same without the models that cannot matter.
+    def reduced(self, log_densities: NDArray[np.float64]) -> Marginal:
+        """Drop the models that are negligible at all points.
 
         Args:
-            densities: What `densities` gave for points that explain the data [n, models].
-
-        Returns:
-            The density under the others.
+            log_densities: The results of `densities` for points of high density [n, models].
         """
-        best = densities.max(axis=0)
-        kept = best - best.max() > np.log(NEGLIGIBLE)
-        return replace(
-            self, models=tuple(model for model, keep in zip(self.models, kept, strict=True) if keep)
-        )
+        best = log_densities.max(axis=0)
+        kept = np.flatnonzero(best - best.max() > np.log(NEGLIGIBLE))
+        return replace(self, models=tuple(self.models[k] for k in kept))
 
-    def _censored(
-        self,
-        gap: NDArray[np.float64],
-        model: NoiseModel,
-        design: NDArray[np.float64],
-        ridge: NDArray[np.float64],
-        differing: Differing | None,
-        good: NDArray[np.bool_],
+    def _censored_density(
+        self, gap: NDArray[np.float64], model: NoiseModel, effect: BuildingEffect | None
     ) -> NDArray[np.float64]:
-        """Log density where some links were not heard [n]."""
+        """Log density with censored links [n]."""
+        design, ridge = self._with_offset(model.offset)
         if model.kind != DIFFERING:
-            return log_evidence(gap, self.unheard, design, ridge / self.noise_db, model.freedom)
-        shift, weight = self._spread_out(model, differing, good)
-        there = np.isfinite(shift) & np.isfinite(weight)  # Not where a corner loses a link's only path.
-        gap, weight = gap - np.where(there, shift, 0.0), np.where(there, weight, 1.0)
-        return log_evidence(gap, self.unheard, design, ridge / self.noise_db, weight=weight)
+            return log_evidence(gap, self.censored, design, ridge / self.noise_db, model.freedom)
+        shift, weight = self._shift_and_weight(model, effect)
+        finite = np.isfinite(shift) & np.isfinite(weight)  # False if a corner loses the only path of a link
+        gap, weight = gap - np.where(finite, shift, 0.0), np.where(finite, weight, 1.0)
+        return log_evidence(gap, self.censored, design, ridge / self.noise_db, weight=weight)
 
-    def _spread_out(
-        self, model: NoiseModel, differing: Differing | None, good: NDArray[np.bool_]
+    def _shift_and_weight(
+        self, model: NoiseModel, effect: BuildingEffect | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Shift of the mean [n, m] and weights [n, m] where materials differ."""
-        if differing is None:
-            raise ValueError("a heterogeneous model needs what differing materials do")
-        # Both grow with the square of the spread, to the second order.
+        """Shift of the mean and weights of the links for differing buildings [n, m]."""
+        if effect is None:
+            raise ValueError("a heterogeneous noise model needs the building effect")
+        # To second order, shift and variance are proportional to the square of the spread.
         part = (model.spread / self.spread) ** 2
-        weight = 1.0 / (1.0 + part / self.noise_db**2 * differing.variance[good])
-        return part * differing.shift[good], weight
+        weight = 1.0 / (1.0 + part / self.noise_db**2 * effect.variance)
+        return part * effect.shift, weight
 
-    def _with_offset(self, extra: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        if not extra:
+    def _with_offset(self, offset: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Design and ridge, with an undeclared offset as the last column if asked for."""
+        if not offset:
             return self.design, self.ridge
         return np.column_stack([self.design, self.column]), np.append(self.ridge, self.noise_db / OFFSET_DB)
 
 
 def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
+    """Logarithm of (2 pi)^(-f/2) Gamma(f/2) / 2 x 2^(f/2) x |R|."""
     half = 0.5 * freedom
     return float(gammaln(half) - half * np.log(np.pi) - np.log(2.0) + np.log(ridge[ridge > 0]).sum())
 
@@ -370,7 +373,7 @@ def _constant(freedom: int, ridge: NDArray[np.float64]) -> float:
 def _plain(
     gap: NDArray[np.float64], design: NDArray[np.float64], ridge: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Log density of whitened Gaussian errors, nuisance and size integrated out [n]."""
+    """Log density p of whitened Gaussian errors, see the module [n]; |C| is left to the caller."""
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(gap**2, axis=1), 0.0
     if design.shape[1]:
@@ -386,7 +389,7 @@ def _weighted(
     ridge: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """The same with weights of the links that differ from point to point [n, m]."""
+    """Like `_plain`, with weights of the links that differ between points [n, m]."""
     freedom = gap.shape[1] - int((ridge == 0).sum())
     square, log_root = np.sum(weight * gap**2, axis=1), 0.0
     if design.shape[1]:

@@ -1,8 +1,8 @@
-"""Densities of measurements, each under a model of the noise of its own, of few links that are asked for many times.
+"""Fast densities of many gaps with one noise model each, for a moderate number of links.
 
-Under Gaussian noise, whether links share errors or not, what is left of gaps once size and nuisances are integrated out
-is a quadratic form of them (`marginal.py`), whose matrix is made once. Under heavy tails, gaps with an offset and
-without go together.
+Under Gaussian noise, correlated or not, the density with noise level and nuisance integrated out is a power of a
+quadratic form of the gaps (`noise_models.py`), whose matrix is computed once. Under heavy tails, gaps with and without
+an offset are evaluated together.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 
 from calibray.uncertainty.noise_models import CORRELATED, GAUSSIAN, HEAVY, Marginal
 
-LINKS: Final = 300
-"""Links beyond which the matrices of all models would take up too much."""
+MAX_LINKS: Final = 300
+"""Links up to which the matrices are stored; those of 26 Gaussian models then take 19 MB."""
 
 
 @dataclass(frozen=True, eq=False)
-class Forms:
-    """What a marginal density takes for gaps each of which has one of its models.
+class QuadraticForms:
+    """A marginal density prepared for gaps that have one noise model each.
 
     Attributes:
         marginal: The density.
-        group: What is asked for together: each Gaussian model by its place, -1 for Student's tails, -2 for gross errors
-            [models].
-        square: Matrix [m, m], constant and power of each Gaussian model's form, None of others; nothing where links are
-            too many, or where they need what only the density has.
+        group: Models that are evaluated together: the index of each Gaussian model, -1 for Student's t, -2 for gross
+            errors [models].
+        square: Matrix [m, m], constant and exponent of each Gaussian model's form, None for other models. Empty if
+            there are too many links, censored links or other kinds of models.
     """
 
     marginal: Marginal
@@ -36,45 +36,42 @@ class Forms:
     square: tuple[tuple[NDArray[np.float64], float, float] | None, ...]
 
     @classmethod
-    def of(cls, marginal: Marginal) -> Forms:
-        """Make them.
-
-        Args:
-            marginal: The density.
-        """
+    def of(cls, marginal: Marginal) -> QuadraticForms:
+        """Compute the forms of a density."""
         models = marginal.models
-        group = [(-2 if each.gross else -1) if each.kind == HEAVY else k for k, each in enumerate(models)]
-        known = {model.kind for model in models} <= {GAUSSIAN, CORRELATED, HEAVY}
-        if len(marginal.column) > LINKS or marginal.unheard.any() or not known:
+        group = [(-2 if model.gross else -1) if model.kind == HEAVY else k for k, model in enumerate(models)]
+        supported = {model.kind for model in models} <= {GAUSSIAN, CORRELATED, HEAVY}
+        if len(marginal.column) > MAX_LINKS or marginal.censored.any() or not supported:
             return cls(marginal, np.array(group), ())
         square = (None if model.kind == HEAVY else marginal.form(model) for model in models)
         return cls(marginal, np.array(group), tuple(square))
 
     def densities(self, gap: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of the model's weight times the density of the measurements.
+        """Log density of the measurements, plus the log weight of the model.
 
         Args:
-            gap: Measured minus modelled path loss, without the nuisance, times the roots of the weights [n, m], [dB].
-            model: The model of each, by its place [n].
+            gap: Measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
+                [dB].
+            model: Index of the model of each gap [n].
 
         Returns:
-            The logarithms [n]; -inf where a gap is not finite.
+            The log densities [n]; -inf if a gap is not finite.
         """
-        models, found = self.marginal.models, np.full(len(gap), -np.inf)
+        models, log_density = self.marginal.models, np.full(len(gap), -np.inf)
         if not self.square:
             for index in np.unique(model).tolist():
-                mine = model == index
-                found[mine] = replace(self.marginal, models=(models[index],)).densities(gap[mine])[:, 0]
-            return found
-        good = np.isfinite(gap).all(axis=1)
+                rows = model == index
+                log_density[rows] = replace(self.marginal, models=(models[index],)).densities(gap[rows])[:, 0]
+            return log_density
+        finite = np.isfinite(gap).all(axis=1)
         group = self.group[model]
-        for index in np.unique(group[good]).tolist():
-            mine = good & (group == index)
+        for index in np.unique(group[finite]).tolist():
+            rows = finite & (group == index)
             form = self.square[index] if index >= 0 else None
             if form is None:
-                found[mine] = self.marginal.heavy(gap[mine], [models[k] for k in model[mine].tolist()])
+                log_density[rows] = self.marginal.heavy(gap[rows], [models[k] for k in model[rows].tolist()])
             else:
-                square, constant, half = form
-                value = np.sum((gap[mine] @ square) * gap[mine], axis=1)
-                found[mine] = constant - half * np.log(np.maximum(value, 1e-300))
-        return found + np.log([each.weight for each in models])[model]
+                square, constant, exponent = form
+                value = np.sum((gap[rows] @ square) * gap[rows], axis=1)
+                log_density[rows] = constant - exponent * np.log(np.maximum(value, 1e-300))
+        return log_density + np.log([each.weight for each in models])[model]

@@ -1,31 +1,42 @@
-"""Remarks that follow from a calibration's draws."""
+"""Checks of a finished calibration that lead to remarks: noise, missed optimum, intervals, undeclared offset."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtri
 
+from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import Trail
+from calibray.fitting.search import BASINS, Trail, least_squares, relevant_minima
 from calibray.result.remark import Remark, RemarkKind, Value
-from calibray.result.verdict import Interval
+from calibray.result.verdict import CONFIDENCE, Interval
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.importance_sampling import Draws
+from calibray.uncertainty.likelihood import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 
 LIKELY: Final = 0.5
 """Posterior weight above which a departure from independent Gaussian noise is reported."""
 
 SLACK: Final = 0.02
-"""Share of a parameter's range by which a value may lie outside an interval before it is reported."""
+"""Distance of a value from its interval, as a share of the range, above which it is reported."""
 
 MISSED_DB: Final = 0.01
-"""RMSE by which draws must undercut the method's best candidate before it is said to have missed the optimum [dB]."""
+"""Improvement of the objective by a draw above which the method is reported to have missed the optimum [dB]."""
 
 BEST_DRAWS: Final = 16
-"""Draws of highest density that are checked for it."""
+"""Draws of highest density that are checked for a missed optimum."""
+
+STARTS: Final = 16
+"""Local searches with a free offset, in addition to those from the minima without it."""
+
+OFFSET_DB: Final = 0.1
+"""Smallest undeclared offset that is reported [dB]."""
 
 DEPARTURES: Final = {
     CORRELATED: RemarkKind.CORRELATED_NOISE,
@@ -54,7 +65,7 @@ def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
 
 
 def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[Remark, ...]:
-    """Whether draws have a lower objective than the best candidate of the method.
+    """Check whether a draw has a lower objective than the best candidate of the method.
 
     Args:
         problem: The problem.
@@ -79,14 +90,14 @@ def outside_interval(
     log_odds: float,
     noise: Mapping[str, float],
 ) -> tuple[Remark, ...]:
-    """Whether values of least RMSE lie outside their own intervals.
+    """Check whether calibrated values lie outside their intervals.
 
     Args:
         problem: The problem.
-        optimum: The values of least RMSE by parameter.
+        optimum: The calibrated values by parameter.
         intervals: The intervals.
         most_probable: The values of the draw of highest density by parameter.
-        log_odds: Logarithm of the density of that draw over that of the values of least RMSE.
+        log_odds: Log density of that draw minus that of the calibrated values.
         noise: Posterior weights of the noise models.
 
     Returns:
@@ -110,3 +121,59 @@ def outside_interval(
         "blocks": holdout is not None and holdout.where is None,
     }
     return (Remark(RemarkKind.OUTSIDE_INTERVAL, values),)
+
+
+@dataclass(frozen=True, eq=False)
+class UndeclaredOffset:
+    """An offset for all links, fitted in addition to the study's model.
+
+    Attributes:
+        minima: Relevant minima with the offset, the lowest first [k, d].
+        offset_db: The best offset [dB]; None if the study declares one, or if the fit does not change.
+        error_db: Its standard error [dB].
+        remarks: A warning if it is significant.
+    """
+
+    minima: NDArray[np.float64]
+    offset_db: float | None = None
+    error_db: float | None = None
+    remarks: tuple[Remark, ...] = ()
+
+
+def fit_undeclared_offset(
+    problem: Problem, minima: NDArray[np.float64], square: float, freedom: int
+) -> UndeclaredOffset:
+    """Fit an offset for all links if the study declares none, and test its significance.
+
+    Args:
+        problem: The problem.
+        minima: Its minima, the lowest first [k, d].
+        square: Mean square of the residuals at the lowest [dB^2].
+        freedom: Number of residuals minus unknowns.
+
+    Returns:
+        The offset.
+    """
+    objective = problem.objective
+    if has_offset(problem) or freedom < 2:
+        return UndeclaredOffset(np.zeros((0, len(problem.parameters))))
+    terms = (*objective.nuisance.terms, make_term(problem.setup.links, "free offset"))
+    trial = replace(problem, objective=replace(objective, nuisance=Nuisance(len(objective.weight), terms)))
+    fit = least_squares(trial, STARTS, minima[:BASINS])
+    value = trial.squares(fit.minima).value
+    relevant = relevant_minima(fit.minima, value**2, freedom - 1)
+    best = int(np.argmin(value))
+    best_loss = trial.modelled(fit.minima[best : best + 1])
+    offset, remaining = float(trial.objective.coefficients(best_loss)[0, -1]), float(value[best] ** 2)
+    # F statistic of one further column: the square of the offset over its standard error.
+    ratio = (square - remaining) / remaining * (freedom - 1) if remaining > 0 else np.inf
+    if not ratio > 0 or not np.isfinite(ratio):
+        return UndeclaredOffset(relevant)
+    error = abs(offset) / float(np.sqrt(ratio))
+    remarks: tuple[Remark, ...] = ()
+    if ratio > fdtri(1, freedom - 1, CONFIDENCE) and abs(offset) >= OFFSET_DB:
+        rmse = {"rmse_db": float(np.sqrt(remaining)), "rmse_without_db": float(np.sqrt(square))}
+        remarks = (
+            Remark(RemarkKind.UNDECLARED_OFFSET, {"offset_db": offset, "error_db": float(error), **rmse}),
+        )
+    return UndeclaredOffset(relevant, offset, error, remarks)

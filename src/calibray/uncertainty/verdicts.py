@@ -1,66 +1,62 @@
-"""What the data tell of a parameter, from draws of the posterior: an interval, a verdict, and the reason in words."""
+"""Verdicts from draws of the posterior: credible interval, verdict and reason of every parameter."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.result.verdict import Reason, ReasonKind
+from calibray.result.verdict import Interval, Reason, ReasonKind
 from calibray.result.verdict import Verdict as VerdictName
 from calibray.uncertainty.credible_sets import credible_sets
 from calibray.uncertainty.importance_sampling import Draws
 
 JUDGED: Final = 0.9
-"""Share of the posterior that verdicts go by: the last few per cent lie far out, where a rare model of the noise
-explains the data as well, and say little of what is known."""
+"""Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far out, under a
+noise model of small weight."""
 
 IDENTIFIED: Final = 0.25
-"""Widest set, of the range, of what is called identified."""
+"""Largest width of the credible set of an identified parameter, as a share of the range."""
 
 WEAKLY: Final = 0.5
-"""Widest set, of the range, of what is called weakly identified; a wider one tells nothing."""
+"""Largest width for a weakly identified parameter; a wider one is not identifiable."""
 
-SILENT_DB: Final = 1.0
-"""Change of path loss below which no link is said to depend on a parameter [dB]."""
+NO_EFFECT_DB: Final = 1.0
+"""Change of path loss over the range below which no link depends on the parameter [dB]."""
 
-CHANCE: Final = 0.1
-"""Distance from a bound, of the range, within which the end of a set is chance where no link depends on a parameter."""
+END: Final = 0.1
+"""Distance of an interval's end from the bound, as a share of the range, that is chance if no link depends on the
+parameter."""
 
-TRADED: Final = 0.5
-"""Rank correlation from which on another parameter is said to make up for one."""
+TRADE_OFF: Final = 0.5
+"""Rank correlation above which another parameter compensates."""
 
-LARGE: Final = 3.0
-"""Change of path loss, by the size of errors, from which on single links would tell a parameter by themselves."""
+LARGE_EFFECT: Final = 3.0
+"""Change of path loss, in standard deviations of the errors, above which single links would determine the parameter."""
 
 LINE: Final = 25
-"""Values over the range of a parameter that its effect is taken from."""
+"""Values over the range of a parameter at which its effect is computed."""
 
 
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Points [n, d] to the path loss of the links that count [n, m], [dB]."""
+"""Maps points [n, d] to the path loss of the m links used [n, m], [dB]."""
 
 Shown = Callable[[int, float], float]
-"""A parameter's place and its value to the value that words are to give, where the search has a scale of its own."""
-
-
-def as_it_is(_: int, value: float) -> float:
-    """The value itself."""
-    return value
+"""Maps the index of a parameter and a search coordinate to the parameter's value."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the data tell of one parameter.
+    """What the data say about one parameter.
 
     Attributes:
-        pieces: Lower and upper end of every piece of the credible set, ascending; within the bounds.
-        best: Value at the point of the highest density.
+        pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
+        best: Value at the draw of highest density.
         name: The verdict.
-        reason: Why.
+        reason: Its reason.
     """
 
     pieces: tuple[tuple[float, float], ...]
@@ -88,85 +84,92 @@ def verdicts(
     noise_db: float,
     *,
     level: float = 0.95,
-    shown: Shown = as_it_is,
+    shown: Shown = lambda _, value: value,
     seen: Draws | None = None,
 ) -> list[Verdict]:
-    """What the data tell of every parameter.
+    """Judge every parameter by its posterior.
 
     Args:
-        draws: The posterior.
-        modelled: What depends on the parameters.
+        draws: The posterior, of the means over all buildings if these differ.
+        modelled: Computes path loss.
         names: Names of the parameters.
         lower: Lower bounds [d].
         upper: Upper bounds [d].
-        noise_db: Size of the links' errors [dB].
-        level: Share of the posterior that intervals hold.
-        shown: What reasons give for a value.
-        seen: The posterior of what the links lean on, where that may differ from what is asked for.
+        noise_db: Standard deviation of the links' errors [dB].
+        level: Share of the posterior that intervals cover.
+        shown: Converts search coordinates to the values that reasons state.
+        seen: The posterior for the measured buildings; the same as `draws` if None.
 
     Returns:
-        One verdict for every parameter.
+        One verdict per parameter.
     """
     best = draws.point[np.argmax(draws.density)]
-    found = []
+    seen = draws if seen is None else seen
+    result = []
     for index in range(len(names)):
-        pieces, told = credible_sets(
-            draws.point[:, index], draws.weight, float(lower[index]), float(upper[index]), (JUDGED, level)
+        low_bound, high_bound = float(lower[index]), float(upper[index])
+        pieces, reported = credible_sets(
+            draws.point[:, index], draws.weight, low_bound, high_bound, (JUDGED, level)
         )
-        low, high = pieces[0][0], pieces[-1][1]
-        share = sum(end - start for start, end in pieces) / (upper[index] - lower[index])
-        ends = _touched(pieces, lower[index], upper[index])
-        lean, basis = pieces, draws
-        if seen is not None and seen is not draws:
-            basis = seen
-            (lean,) = credible_sets(
-                seen.point[:, index], seen.weight, float(lower[index]), float(upper[index]), (JUDGED,)
+        seen_pieces = pieces
+        if seen is not draws:
+            (seen_pieces,) = credible_sets(
+                seen.point[:, index], seen.weight, low_bound, high_bound, (JUDGED,)
             )
-        own = sum(end - start for start, end in lean) / (upper[index] - lower[index])
-        ends = ends or _touched(lean, lower[index], upper[index])
-        if share > WEAKLY >= own and len(lean) == 1 and not ends:
+        share = _width(pieces) / (upper[index] - lower[index])
+        seen_share = _width(seen_pieces) / (upper[index] - lower[index])
+        ends = _bounds_reached(pieces, low_bound, high_bound)
+        ends = ends or _bounds_reached(seen_pieces, low_bound, high_bound)
+        if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not ends:
             name = VerdictName.WEAKLY_IDENTIFIED
-            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(own)})
-        elif share > WEAKLY and own > WEAKLY:
+            reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share)})
+        elif share > WEAKLY and seen_share > WEAKLY:
             name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, lower, upper)
-            if change < SILENT_DB:
+            if change < NO_EFFECT_DB:
                 reason = Reason(ReasonKind.NO_EFFECT, {"change_db": change})
-                told = (_evened(told, float(lower[index]), float(upper[index])),)
+                reported = (_without_chance(reported, low_bound, high_bound),)
             else:
-                reason = _blindness(index, draws, names, change, noise_db)
-        elif max(len(pieces), len(lean)) > 1:
-            several = (lean, basis) if len(lean) > 1 else (pieces, draws)
-            name, reason = VerdictName.AMBIGUOUS, _separate(index, *several, shown)
+                reason = _confounding(index, draws, names, change, noise_db)
+        elif len(seen_pieces) > 1:
+            name, reason = VerdictName.AMBIGUOUS, _modes(index, seen_pieces, seen, shown)
+        elif len(pieces) > 1:
+            name, reason = VerdictName.AMBIGUOUS, _modes(index, pieces, draws, shown)
         elif ends:
-            other_end = shown(index, high if ends == ["lower"] else low)
+            other_end = shown(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = VerdictName.AT_BOUND
         else:
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
-            others = _apart(index, pieces, told, draws, shown)
+            others = _outlying_pieces(index, pieces, reported, draws, shown)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
-        found.append(Verdict(told, float(best[index]), name, reason))
-    return found
+        result.append(Verdict(reported, float(best[index]), name, reason))
+    return result
 
 
-def _touched(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> list[str]:
-    """The bounds that a credible set reaches."""
-    slack, found = 1e-6 * (upper - lower), []
+def _width(pieces: tuple[tuple[float, float], ...]) -> float:
+    return sum(end - start for start, end in pieces)
+
+
+def _bounds_reached(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> list[str]:
+    """Names of the bounds that a credible set reaches."""
+    slack, reached = 1e-6 * (upper - lower), []
     if pieces[0][0] <= lower + slack:
-        found.append("lower")
+        reached.append("lower")
     if pieces[-1][1] >= upper - slack:
-        found.append("upper")
-    return found
+        reached.append("upper")
+    return reached
 
 
-def _evened(pieces: tuple[tuple[float, float], ...], lower: float, upper: float) -> tuple[float, float]:
-    """One range of what no link tells: what lies between pieces is chance, and so is little at the ends."""
-    low, high, slack = pieces[0][0], pieces[-1][1], CHANCE * (upper - lower)
+def _without_chance(
+    pieces: tuple[tuple[float, float], ...], lower: float, upper: float
+) -> tuple[float, float]:
+    """One range for a parameter without effect: gaps between pieces and short distances to a bound are chance."""
+    low, high, slack = pieces[0][0], pieces[-1][1], END * (upper - lower)
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
 
-def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> Reason:
-    """The modes that explain the links, with their weights."""
+def _modes(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> Reason:
+    """The modes of the posterior with their weights."""
     modes, value = [], draws.point[:, index]
     for low, high in pieces:
         inside = (value >= low) & (value <= high)
@@ -175,16 +178,16 @@ def _separate(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws,
     return Reason(ReasonKind.SEPARATE_RANGES, ranges=tuple(modes))
 
 
-def _apart(
+def _outlying_pieces(
     index: int,
     pieces: tuple[tuple[float, float], ...],
-    told: tuple[tuple[float, float], ...],
+    reported: tuple[tuple[float, float], ...],
     draws: Draws,
     shown: Shown,
 ) -> tuple[tuple[float, float, float], ...]:
     """Pieces of the reported interval outside the judged set, with their weights; mostly none."""
     others, value = [], draws.point[:, index]
-    for low, high in told:
+    for low, high in reported:
         if not any(start <= high and low <= end for start, end in pieces):
             weight = draws.weight[(value >= low) & (value <= high)].sum()
             others.append((float(shown(index, low)), float(shown(index, high)), float(weight)))
@@ -198,26 +201,50 @@ def _effect(
     lower: NDArray[np.float64],
     upper: NDArray[np.float64],
 ) -> float:
-    """Largest change of a link's path loss over the range of a parameter, all others kept [dB]."""
+    """Largest change of a link's path loss over the range of a parameter, the others fixed [dB]."""
     line = np.tile(best, (LINE, 1))
     line[:, index] = np.linspace(lower[index], upper[index], LINE)
     loss = modelled(line)
     return float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
 
 
-def _blindness(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
-    """Why most of the range fits though links depend on it: another parameter makes up for it, or errors are large."""
+def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, noise_db: float) -> Reason:
+    """Why most of the range fits although links depend on the parameter: a trade-off, or large errors."""
     rank = np.argsort(np.argsort(draws.resampled(400), axis=0), axis=0)
     varied = np.ptp(rank, axis=0) > 0
-    traded = np.zeros(len(names))
+    correlation = np.zeros(len(names))
     if varied[index]:
-        traded[varied] = np.abs(
-            np.corrcoef(rank[:, varied].T).reshape(varied.sum(), -1)[varied[:index].sum()]
-        )
-    traded[index] = 0.0
-    if traded.max() > TRADED:
-        other = names[int(np.argmax(traded))]
-        return Reason(ReasonKind.TRADE_OFF, {"parameter": other, "correlation": float(traded.max())})
-    if change > LARGE * noise_db:
+        matrix = np.corrcoef(rank[:, varied].T).reshape(varied.sum(), -1)
+        correlation[varied] = np.abs(matrix[varied[:index].sum()])
+    correlation[index] = 0.0
+    if correlation.max() > TRADE_OFF:
+        other = names[int(np.argmax(correlation))]
+        return Reason(ReasonKind.TRADE_OFF, {"parameter": other, "correlation": float(correlation.max())})
+    if change > LARGE_EFFECT * noise_db:
         return Reason(ReasonKind.CONFOUNDED, {"change_db": change})
     return Reason(ReasonKind.NOISE, {"change_db": change, "noise_db": noise_db})
+
+
+def widened(drawn: Interval, local: Interval, to_unit: Callable[[float], float]) -> Interval:
+    """Combine an interval from too few draws with one by linear theory, to be wide rather than narrow.
+
+    Args:
+        drawn: The interval from draws of a flattened posterior.
+        local: The interval from the curvature at the optimum.
+        to_unit: Maps a value to its position between the bounds, 0 to 1.
+
+    Returns:
+        The hull of both intervals; the verdict follows from its width.
+
+    Example:
+        >>> few = Interval(0.1, 2.0, 3.0, VerdictName.IDENTIFIED, ((2.0, 3.0),))
+        >>> wide = widened(few, Interval(0.1, 4.0, 9.0, VerdictName.IDENTIFIED), lambda value: value / 10)
+        >>> wide.lower, wide.upper, str(wide.verdict)
+        (2.0, 9.0, 'not identifiable')
+    """
+    lower, upper = min(drawn.lower, local.lower), max(drawn.upper, local.upper)
+    share, verdict, reason = to_unit(upper) - to_unit(lower), drawn.verdict, drawn.reason
+    if verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED) and share > IDENTIFIED:
+        verdict = VerdictName.WEAKLY_IDENTIFIED if share <= WEAKLY else VerdictName.NOT_IDENTIFIABLE
+        reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": float(share)})
+    return replace(drawn, lower=lower, upper=upper, pieces=((lower, upper),), verdict=verdict, reason=reason)

@@ -13,7 +13,7 @@ from calibray.errors import EngineError, InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisance, make_term
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements
-from calibray.uncertainty.noise import fit_correlation
+from calibray.uncertainty.residual_correlation import fit_correlation
 
 MOST_KRIGED: Final = 1000
 """Most links to krige from: fitting the correlation factors their covariance some hundred times."""

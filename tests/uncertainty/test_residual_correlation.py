@@ -8,7 +8,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from calibray.errors import EngineError, InputError
-from calibray.uncertainty.noise import Correlation, Noise, fit_correlation
+from calibray.uncertainty.residual_correlation import Correlation, fit_correlation
 
 
 @pytest.fixture(autouse=True)
@@ -16,42 +16,6 @@ def _one_thread():
     """Small factors are slower on several threads where others compute too."""
     with threadpool_limits(1, user_api="blas"):
         yield
-
-
-@pytest.mark.parametrize("freedom", [np.inf, 4.0, 1.0])
-def test_the_log_likelihood_is_that_of_the_density(freedom):
-    rng = np.random.default_rng(0)
-    errors, scale, deviation = rng.normal(0, 4, (3, 25)), np.array([1.0, 3.0, 9.0]), rng.uniform(0.5, 2, 25)
-    density = stats.norm(0, scale[:, None] * deviation)
-    if np.isfinite(freedom):
-        density = stats.t(freedom, 0, scale[:, None] * deviation)
-    found = Noise(freedom).log_likelihood(errors, scale, deviation)
-    assert found == pytest.approx(density.logpdf(errors).sum(axis=1), rel=1e-12)
-
-
-@pytest.mark.parametrize("freedom", [np.inf, 4.0, 1.0])
-def test_the_scale_is_that_of_largest_likelihood(freedom):
-    rng = np.random.default_rng(1)
-    noise, deviation = Noise(freedom), rng.uniform(0.5, 2, 40)
-    errors = rng.standard_t(4, (5, 40)) * 3.0 * deviation
-    best = noise.scale(errors, deviation)
-    top = noise.log_likelihood(errors, best, deviation)
-    for factor in (0.999, 1.001):
-        assert (noise.log_likelihood(errors, best * factor, deviation) < top).all()
-    assert noise.scale(10 * errors, deviation) == pytest.approx(10 * best)
-    assert noise.scale(np.zeros((1, 5))).tolist() == [0.0]
-
-
-def test_the_scale_of_planted_errors_is_recovered_and_outliers_move_a_gaussian_only():
-    rng = np.random.default_rng(2)
-    errors = 3.0 * rng.standard_t(4, (1, 20_000))
-    assert Noise(4.0).scale(errors)[0] == pytest.approx(3.0, rel=0.02)
-    spoilt = rng.normal(0, 3, (1, 2000))
-    spoilt[0, :200] += 20
-    assert Noise(4.0).scale(spoilt)[0] < 4.0
-    assert Noise().scale(spoilt)[0] > 6.0
-    with pytest.raises(InputError, match="freedom = 0, must be greater"):
-        Noise(0.0)
 
 
 def street(count: int, seed: int = 0) -> np.ndarray:
@@ -117,24 +81,11 @@ def test_columns_that_were_fitted_do_not_pass_for_less_noise():
     assert plain < 2.7
 
 
-def test_whitened_errors_are_independent_and_of_unit_variance():
-    position, rng = street(80), np.random.default_rng(7)
-    known = Correlation(60.0, 4.0, 2.0, 0.0, 0.0)
-    deviation = rng.uniform(0.5, 2.0, 80)
-    matrix = known.covariance(position, deviation)
-    samples = np.linalg.cholesky(matrix) @ rng.normal(size=(80, 4000))
-    white = known.whitened(position, samples, deviation)
-    assert np.cov(white) == pytest.approx(np.eye(80), abs=0.1)
-    assert np.cov(samples) != pytest.approx(np.eye(80), abs=0.1)
-    cube = known.whitened(position, samples[:, :6].reshape(80, 2, 3), deviation)
-    assert cube.reshape(80, 6) == pytest.approx(white[:, :6])
-
-
 def test_errors_that_cannot_tell_are_refused():
     position = street(5)
-    with pytest.raises(InputError, match="5 links beside 3 fitted columns"):
+    with pytest.raises(InputError, match="5 links and 3 fitted columns"):
         fit_correlation(np.ones(5), position, design=np.ones((5, 3)))
-    with pytest.raises(InputError, match="all receivers stand at one place"):
+    with pytest.raises(InputError, match="all receivers have the same position"):
         fit_correlation(np.ones(5), np.zeros((5, 3)))
     with pytest.raises(EngineError, match="all errors are zero"):
         fit_correlation(np.zeros(5), position)

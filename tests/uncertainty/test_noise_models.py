@@ -10,15 +10,15 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from calibray.uncertainty import heavy_tails as tails
-from calibray.uncertainty.correlation import whitener
 from calibray.uncertainty.noise_models import (
     OFFSET_DB,
-    Differing,
+    BuildingEffect,
     Marginal,
     NoiseModel,
     corners,
     noise_models,
 )
+from calibray.uncertainty.whitening import whitener
 
 RANDOM = np.random.default_rng(1)
 COUNT = 6
@@ -62,7 +62,7 @@ def test_gaussian_densities_are_the_integrals(model, covariance):
         return -0.5 * square / size[..., 0] ** 2 - normal
 
     found = marginal((model,), np.ones((COUNT, 1))).densities(
-        GAP[None], Differing(SHIFT[None], VARIANCE[None])
+        GAP[None], BuildingEffect(SHIFT[None], VARIANCE[None])
     )
     assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
 
@@ -121,8 +121,8 @@ def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
     gap = 3.0 * random.standard_normal((64, 60)) + 20.0 * (random.random((64, 60)) < 0.1)
     design, ridge = random.standard_normal((60, columns)), np.full(columns, 0.2)
     found = tails.evidence(gap, design, ridge, tail)
-    monkeypatch.setattr(tails, "STEPS", 400)
-    monkeypatch.setattr(tails, "CLOSE", 1e-9)
+    monkeypatch.setattr(tails, "MAX_STEPS", 400)
+    monkeypatch.setattr(tails, "TOLERANCE", 1e-9)
     assert found == pytest.approx(tails.evidence(gap, design, ridge, tail), abs=0.02)
 
 
@@ -146,10 +146,10 @@ def test_gross_errors_speak_for_themselves():
     gap = 3 * random.standard_normal(60) + 20.0 * (np.arange(60) % 10 == 0)
     models = noise_models(position, offset=False)
     found = marginal(models, position=position, noise_db=3.0).densities(
-        gap[None], Differing(np.zeros((1, 60)), np.ones((1, 60)))
+        gap[None], BuildingEffect(np.zeros((1, 60)), np.ones((1, 60)))
     )[0]
     assert models[int(np.argmax(found))].gross
-    assert not any(model.gross for model in noise_models(position, unheard=True))
+    assert not any(model.gross for model in noise_models(position, censored=True))
     assert not any(model.gross for model in noise_models(position, kind="student-t"))
 
 
@@ -182,7 +182,7 @@ def test_planted_errors_speak_for_their_kind(kind):
     assert sum(model.weight for model in models) == pytest.approx(1.0)
     assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
     density = marginal(models, position=position, noise_db=2.0)
-    differing = Differing(np.zeros((1, 150)), variance[None])
+    differing = BuildingEffect(np.zeros((1, 150)), variance[None])
     assert density.spread == 0.15
 
     def weights(gap):

@@ -5,8 +5,15 @@ import pytest
 from scipy.stats import norm
 
 from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
-from calibray.uncertainty import hierarchy as module
-from calibray.uncertainty.hierarchy import EFFECTIVE, LEAST, MOST, SPREAD, Hierarchy, besides, hierarchical
+from calibray.uncertainty import between_buildings as module
+from calibray.uncertainty.between_buildings import (
+    EFFECTIVE,
+    MEAN_SPREAD,
+    SPREAD_BOUNDS,
+    Hierarchy,
+    remaining_models,
+    sample_means,
+)
 from calibray.uncertainty.importance_sampling import Draws
 from calibray.uncertainty.noise_models import Marginal, NoiseModel
 
@@ -57,7 +64,7 @@ def _silent(point, logarithms):
 def test_means_of_which_nothing_is_told_are_even(scale, spread):
     parameters = _parameters(scale)
     silent = _hierarchy(parameters, _silent, 4, buildings=2, spread=spread)
-    found = hierarchical(silent, _even(parameters), 2 * COUNT, SWEEPS, seed=2)
+    found = sample_means(silent, _even(parameters), 2 * COUNT, SWEEPS, seed=2)
     lower, upper = parameters.search_bounds
     unit = ((found.point - lower) / (upper - lower))[:, 0]
     assert np.quantile(unit, [0.1, 0.25, 0.5, 0.75, 0.9]) == pytest.approx(
@@ -68,7 +75,7 @@ def test_means_of_which_nothing_is_told_are_even(scale, spread):
 
 def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
     parameters = _parameters()
-    found = hierarchical(
+    found = sample_means(
         _hierarchy(parameters, _silent, 4, centred=False), _even(parameters), COUNT, SWEEPS, seed=2
     )
     assert np.quantile(found.point, [0.25, 0.75]) == pytest.approx([4.125, 9.375], abs=0.4)
@@ -80,7 +87,7 @@ def test_a_stated_prior_is_kept_where_nothing_is_told():
     density = -0.5 * prior.residuals(flat.point)[:, 0] ** 2
     weight = np.exp(density)
     alike = Draws(flat.point, density, weight / weight.sum())
-    found = hierarchical(_hierarchy(parameters, _silent, 4, priors=prior), alike, COUNT, SWEEPS, seed=3)
+    found = sample_means(_hierarchy(parameters, _silent, 4, priors=prior), alike, COUNT, SWEEPS, seed=3)
     # Flat in x and normal in log x: the mean of log x is larger by the variance.
     assert np.log(found.point).mean() == pytest.approx(np.log(4.0) + 0.01, abs=0.01)
     assert np.log(found.point).std() == pytest.approx(0.1, rel=0.1)
@@ -140,10 +147,10 @@ def test_means_are_those_of_the_closed_form(known, planted):
     parameters, measured = _parameters("log"), _planted(planted)
     gaps = _straight(parameters, measured)
     alike = _alike(parameters, gaps)
-    spreads = [known] if known else np.linspace(LEAST, MOST, 400)
-    weights = np.exp(-np.array(spreads) / SPREAD)
+    spreads = [known] if known else np.linspace(*SPREAD_BOUNDS, 400)
+    weights = np.exp(-np.array(spreads) / MEAN_SPREAD)
     mean, deviation = _moments(*_closed(measured, spreads, weights))
-    found = hierarchical(
+    found = sample_means(
         _hierarchy(parameters, gaps, len(measured), BUILDINGS, spread=known), alike, COUNT, SWEEPS, seed=5
     )
     assert found.point.mean() == pytest.approx(mean, abs=0.2 * deviation)
@@ -162,7 +169,7 @@ def test_links_that_only_one_building_explains_do_not_tell_the_mean():
         return gaps(point, logarithms)[:, first]
 
     alike = _alike(parameters, of_one)
-    one = hierarchical(
+    one = sample_means(
         _hierarchy(parameters, of_one, EACH, BUILDINGS, spread=0.15), alike, COUNT, SWEEPS, seed=6
     )
     assert one.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
@@ -190,7 +197,7 @@ def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
     alike = Draws(flat.point, density, weight / weight.sum())
     both = Hierarchy(parameters, np.zeros(2, dtype=int), np.arange(2), np.array([True, False]), gaps,
                      _marginal(40), NO_PRIOR, 0.004)  # fmt: skip
-    found = hierarchical(both, alike, COUNT, SWEEPS, seed=12)
+    found = sample_means(both, alike, COUNT, SWEEPS, seed=12)
     for sign in (1.0, -1.0):
         mean, deviation = _moments(alike.point @ [1.0, sign], alike.weight)
         told = found.point @ [1.0, sign]
@@ -200,7 +207,7 @@ def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
 
 def test_weights_alone_lead_to_the_posterior(monkeypatch):
     """Draws that do not move, of one building: the mean is as the building's constant, but for the spread."""
-    monkeypatch.setattr(module, "POWER", 1.0)
+    monkeypatch.setattr(module, "WEIGHT_POWER", 1.0)
     parameters, measured = _parameters("log"), _planted(0.15)
     gaps = _straight(parameters, measured)
 
@@ -208,7 +215,7 @@ def test_weights_alone_lead_to_the_posterior(monkeypatch):
         return gaps(point, np.repeat(logarithms[:, :1], BUILDINGS, axis=1))[:, :EACH]
 
     alike = _alike(parameters, of_one)
-    found = hierarchical(_hierarchy(parameters, of_one, EACH, 1, spread=0.03), alike, 20_000, 0, seed=9)
+    found = sample_means(_hierarchy(parameters, of_one, EACH, 1, spread=0.03), alike, 20_000, 0, seed=9)
     mean, deviation = _moments(alike.point[:, 0], alike.weight)
     told = found.point
     assert told.mean() == pytest.approx(mean, abs=0.005)
@@ -217,17 +224,17 @@ def test_weights_alone_lead_to_the_posterior(monkeypatch):
 
 def test_each_step_leaves_a_share_of_the_draws_effective():
     told = 30.0 * np.random.default_rng(10).standard_normal(1000)
-    power = module._next(told, 0.1)
+    power = module._next_power(told, 0.1)
     weight = np.exp((power - 0.1) * told)
     assert 0.1 < power < 0.2
     assert np.sum(weight) ** 2 / np.sum(weight**2) == pytest.approx(EFFECTIVE * len(told), rel=0.01)
-    assert module._next(0.01 * told, 0.1) == 1.0
+    assert module._next_power(0.01 * told, 0.1) == 1.0
 
 
 def test_draws_are_the_same_for_a_seed():
     parameters = _parameters()
     one, two, other = (
-        hierarchical(_hierarchy(parameters, _silent, 4), _even(parameters), 64, SWEEPS, seed=seed).point
+        sample_means(_hierarchy(parameters, _silent, 4), _even(parameters), 64, SWEEPS, seed=seed).point
         for seed in (7, 7, 8)
     )
     np.testing.assert_array_equal(one, two)
@@ -241,11 +248,11 @@ def test_independent_errors_are_tried_besides_buildings():
         for offset in (False, True)
     )
     correlated = NoiseModel("correlated", 0.2, range_m=30.0, share=0.4)
-    found = besides((correlated, tried[2]), tried)
+    found = remaining_models((correlated, tried[2]), tried)
     assert [(model.kind, model.offset) for model in found] == [
         ("correlated", False),
         ("gaussian", False),
         ("gaussian", True),
     ]
     # A study that states how much buildings differ leaves no other model.
-    assert [model.kind for model in besides(tried[2:], tried[2:])] == ["gaussian", "gaussian"]
+    assert [model.kind for model in remaining_models(tried[2:], tried[2:])] == ["gaussian", "gaussian"]

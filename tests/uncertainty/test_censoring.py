@@ -18,14 +18,14 @@ STUDENT = NoiseModel(HEAVY, 1.0, freedom=4.0)
 def test_the_integral_is_that_by_quadrature():
     random = np.random.default_rng(1)
     gap = 1.5 + 3.0 * random.standard_normal((1, 25))
-    unheard = gap[0] > 2.5
-    gap = np.where(unheard, 2.5, gap)
+    censored = gap[0] > 2.5
+    gap = np.where(censored, 2.5, gap)
     design, ridge = np.ones((25, 1)), np.array([1 / 10.0])
     offsets, logs = np.meshgrid(np.linspace(-15, 25, 201), np.linspace(-1.5, 4.0, 141), indexing="ij")
     scale, prior = np.exp(logs), np.exp(-0.5 * (ridge * offsets) ** 2) * ridge / np.sqrt(2 * np.pi)
     for freedom in (np.inf, 4.0):
         log_density = np.zeros_like(offsets)
-        for value, missing in zip(gap[0], unheard, strict=True):
+        for value, missing in zip(gap[0], censored, strict=True):
             error = (value - offsets) / scale
             if missing:
                 log_density += log_survival(error, freedom)
@@ -38,16 +38,16 @@ def test_the_integral_is_that_by_quadrature():
                 log_density += np.log(np.maximum(lost / (2 * step), 1e-200)) - logs
         area = (40 / 200) * (5.5 / 140)
         exact = np.log(np.sum(np.exp(log_density) * prior) * area)
-        assert log_evidence(gap, unheard, design, ridge, freedom)[0] == pytest.approx(exact, abs=0.1)
+        assert log_evidence(gap, censored, design, ridge, freedom)[0] == pytest.approx(exact, abs=0.1)
 
 
 @pytest.mark.parametrize("freedom", [np.inf, 2.0, 4.0])
 def test_derivatives_are_those_of_finite_differences(freedom):
     random = np.random.default_rng(2)
-    unheard = np.arange(30) % 3 == 0
+    censored = np.arange(30) % 3 == 0
     left, columns = 3 * random.standard_normal((4, 30)), random.standard_normal((4, 30, 2))
     point = np.column_stack([random.standard_normal((4, 2)), random.uniform(0.5, 1.5, 4)])
-    given = left, unheard, columns, np.array([0.3, 0.0]), freedom
+    given = left, censored, columns, np.array([0.3, 0.0]), freedom
     _, slope, curvature = joint(point, *given)
     for k in range(3):
         step = 1e-5 * np.eye(3)[k]
@@ -80,11 +80,11 @@ def test_half_the_links_unheard_bias_nothing(model):
             else random.standard_normal(len(WAY))
         )
         loss = OFFSET_DB + SLOPE * WAY + SPREAD_DB * noise
-        unheard = loss >= LIMIT_DB
-        assert 0.35 < unheard.mean() < 0.65
-        measured, every = np.where(unheard, LIMIT_DB, loss), np.zeros(len(WAY), dtype=bool)
-        told["censored"].append(likeliest(measured, WAY, unheard, model))
-        told["left out"].append(likeliest(loss[~unheard], WAY[~unheard], every[~unheard], model))
+        censored = loss >= LIMIT_DB
+        assert 0.35 < censored.mean() < 0.65
+        measured, every = np.where(censored, LIMIT_DB, loss), np.zeros(len(WAY), dtype=bool)
+        told["censored"].append(likeliest(measured, WAY, censored, model))
+        told["left out"].append(likeliest(loss[~censored], WAY[~censored], every[~censored], model))
         told["at the floor"].append(likeliest(measured, WAY, every, model))
     error = {name: np.std(values, ddof=1) / np.sqrt(25) for name, values in told.items()}
     assert abs(np.mean(told["censored"]) - SLOPE) < 3 * error["censored"]
@@ -92,11 +92,11 @@ def test_half_the_links_unheard_bias_nothing(model):
     assert np.mean(told["at the floor"]) < SLOPE - 5 * error["at the floor"]
 
 
-def likeliest(measured: np.ndarray, way: np.ndarray, unheard: np.ndarray, model: NoiseModel) -> float:
+def likeliest(measured: np.ndarray, way: np.ndarray, censored: np.ndarray, model: NoiseModel) -> float:
     """The slope of the largest density, offset and scale integrated out."""
     one = np.ones(len(way))
     marginal = Marginal.of(
-        one[:, None], np.zeros(1), one, np.zeros((len(way), 3)), SPREAD_DB, [model], unheard
+        one[:, None], np.zeros(1), one, np.zeros((len(way), 3)), SPREAD_DB, [model], censored
     )
     found = marginal.densities(measured - SLOPES[:, None] * way)[:, 0]
     return float(SLOPES[np.argmax(found)])
@@ -106,9 +106,9 @@ def test_a_link_that_the_model_does_not_hear_either_agrees_with_it():
     gap = np.array(
         [[1.0, -2.0, 0.5, 3.0, -np.inf], [1.0, -2.0, 0.5, 3.0, -500.0], [1.0, -2.0, 0.5, -np.inf, -3.0]]
     )
-    unheard = np.array([False, False, False, False, True])
+    censored = np.array([False, False, False, False, True])
     models = noise_models(np.zeros((5, 3)), range_m=0.0, spread=0.0)
-    marginal = Marginal.of(np.ones((5, 1)), np.zeros(1), np.ones(5), np.zeros((5, 3)), 2.0, models, unheard)
+    marginal = Marginal.of(np.ones((5, 1)), np.zeros(1), np.ones(5), np.zeros((5, 3)), 2.0, models, censored)
     found = marginal.densities(gap)
     assert found[0] == pytest.approx(found[1], abs=1e-4)
     assert (found[2] == -np.inf).all()

@@ -14,10 +14,9 @@ from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
-from calibray.uncertainty import buildings as calibration_buildings
-from calibray.uncertainty import hierarchy
+from calibray.uncertainty import between_buildings, indirect_inference
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.buildings import buildings
+from calibray.uncertainty.buildings import split_by_building
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])
@@ -64,28 +63,28 @@ def problem() -> Problem:
 
 def test_buildings_alike_are_the_material_and_others_have_their_own(problem):
     """A factor on all buildings of a material is one on the material; the ground is none of them."""
-    apart = buildings(problem)
+    apart = split_by_building(problem)
     assert apart is not None
     means = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
-    alike = apart.factors(np.zeros(2))
+    alike = apart.draw_factors(np.zeros(2))
     assert (alike == 1).all()
     assert apart.path_loss(means, alike) == pytest.approx(problem.engine.path_loss(means), abs=1e-9)
-    factor = np.where(apart.owner == 1, 1.1, 1.0)[None].repeat(2, axis=0)
+    factor = np.where(apart.parameter_of == 1, 1.1, 1.0)[None].repeat(2, axis=0)
     found = problem.engine.path_loss(means * [1.0, 1.1, 1.0])
     assert apart.path_loss(means, factor) == pytest.approx(found, abs=1e-9)
     # Concrete is the ground here, which is one and does not differ from itself.
-    assert set(apart.building[apart.owner == 0]) == {-1}
-    assert (apart.building[apart.owner > 0] >= 0).all()
+    assert set(apart.building_of[apart.parameter_of == 0]) == {-1}
+    assert (apart.building_of[apart.parameter_of > 0] >= 0).all()
     slope = apart.slopes(means)
     _, whole = problem.engine.path_loss_and_jacobian(means)
     for index in range(3):
-        together = slope[:, :, apart.owner == index].sum(axis=2)
+        together = slope[:, :, apart.parameter_of == index].sum(axis=2)
         assert together == pytest.approx(whole[:, :, index] * means[:, None, index], abs=5e-3)
         assert np.abs(together).max() > 1.0
-    drawn = np.log(apart.factors(np.full(4000, 0.15)))
-    assert drawn.std(axis=0) == pytest.approx(np.where(apart.building >= 0, 0.15, 0.0), rel=0.05)
+    drawn = np.log(apart.draw_factors(np.full(4000, 0.15)))
+    assert drawn.std(axis=0) == pytest.approx(np.where(apart.building_of >= 0, 0.15, 0.0), rel=0.05)
     assert (
-        np.abs(np.corrcoef(drawn[:, apart.building >= 0].T) - np.eye((apart.building >= 0).sum())).max()
+        np.abs(np.corrcoef(drawn[:, apart.building_of >= 0].T) - np.eye((apart.building_of >= 0).sum())).max()
         < 0.06
     )
 
@@ -122,9 +121,9 @@ def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_
     here = replace(problem, objective=replace(problem.objective, measured=measured))
     trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
     drawn = certainty(here, trail)
-    monkeypatch.setattr(calibration_buildings, "SWEPT", 0)
+    monkeypatch.setattr(between_buildings, "SWEPT_INTERACTIONS", 0)
     seldom = certainty(here, trail)
-    monkeypatch.setattr(calibration_buildings, "FEW", 0)
+    monkeypatch.setattr(between_buildings, "MAX_INTERACTIONS", 0)
     behind = certainty(here, trail)
     assert seldom.means is not None
     assert drawn.means is not None
@@ -132,12 +131,12 @@ def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_
     assert drawn.posterior is not drawn.means
     np.testing.assert_array_equal(drawn.posterior.point, behind.posterior.point)
     count = len(drawn.means.weight)
-    assert count == calibration_buildings.POPULATION * hierarchy.KEPT
-    assert len(seldom.means.weight) == calibration_buildings.POPULATION * calibration_buildings.SWEEPS[0]
-    assert len(behind.means.weight) <= calibration_buildings.DRAWN[1]
+    assert count == between_buildings.POPULATION * between_buildings.KEPT_SWEEPS
+    assert len(seldom.means.weight) == between_buildings.POPULATION * between_buildings.SWEEPS[0]
+    assert len(behind.means.weight) <= indirect_inference.DRAWS[1]
     assert len(np.unique(drawn.means.point, axis=0)) > 0.2 * count
     # The last of every line of draws stands for how well it explains the links.
-    last = np.arange(count) >= count - calibration_buildings.POPULATION
+    last = np.arange(count) >= count - between_buildings.POPULATION
     np.testing.assert_array_equal(np.isfinite(drawn.means.density), last)
     # Two ways to the same answer, roughly: marble is on one building, and told by the same links.
     spread = [np.log(each.point[:, 1]).std() for each in (drawn.means, behind.means)]

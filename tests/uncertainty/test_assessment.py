@@ -23,9 +23,9 @@ from calibray.result.held_out import Model
 from calibray.result.wording import NOT_JUDGED, reason_text
 from calibray.study import Setup, Study
 from calibray.tables.text import render
-from calibray.uncertainty.assessment import PLACE, certainty
+from calibray.uncertainty.assessment import POINTS_PER_START, certainty
 from calibray.uncertainty.importance_sampling import sample
-from calibray.uncertainty.likelihood import Explaining
+from calibray.uncertainty.likelihood import PosteriorDensity
 from calibray.validation import variants
 from calibray.validation.validate import validate_problem
 
@@ -89,7 +89,7 @@ def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp
 
     monkeypatch.setattr("calibray.uncertainty.assessment.sample", spy)
     certainty(problem, replace(trail, minima=many))
-    assert seen["places"] == seen["batch"] // PLACE > BASINS
+    assert seen["places"] == seen["batch"] // POINTS_PER_START > BASINS
 
 
 def test_draws_explain_the_links_about_as_well(result):
@@ -323,7 +323,7 @@ def test_points_that_explain_nothing_are_not_asked_what_differing_buildings_chan
     lower, upper = problem.parameters.search_bounds
     best = problem.parameters.to_search(np.array([planted.TRUTH[name] for name in problem.parameters.names]))
     square = float(problem.squares(best[None]).value[0] ** 2)
-    whole = Explaining.of(problem, best, square, problem.freedom)
+    whole = PosteriorDensity.of(problem, best, square, problem.freedom)
     screened = replace(whole.without_negligible(whole(best[None])), marginal=whole.marginal)
     near = best + 0.001 * (upper - lower) * np.random.default_rng(2).standard_normal((20, 3))
     points = np.concatenate(

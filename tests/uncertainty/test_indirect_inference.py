@@ -10,7 +10,13 @@ from scipy.optimize import least_squares
 
 from calibray.result.wording import reason_text
 from calibray.uncertainty.importance_sampling import Draws
-from calibray.uncertainty.indirect_inference import Leaning, following, means_behind, overstated, spreads
+from calibray.uncertainty.indirect_inference import (
+    LinearModel,
+    draw_spreads,
+    estimate_response,
+    implied_means,
+    overconfidence,
+)
 from calibray.uncertainty.noise_models import DIFFERING, NoiseModel, noise_models
 from calibray.uncertainty.verdicts import verdicts
 
@@ -33,8 +39,8 @@ def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray
     def change(x, portion):
         return effect * (x - HALF + portion * own[:, LINK_BUILDING])
 
-    return means_behind(
-        Leaning(np.full((len(own), 1), HALF), slope, design, precision), change, np.zeros((len(own), 1))
+    return implied_means(
+        LinearModel(np.full((len(own), 1), HALF), slope, design, precision), change, np.zeros((len(own), 1))
     )[:, 0]
 
 
@@ -65,17 +71,17 @@ def test_straight_lines_are_followed_so_far():
     design = np.column_stack([effect, np.ones(len(effect))])
     estimate = np.linalg.lstsq(design, (effect * own[:, LINK_BUILDING]).T, rcond=None)[0][0]
     slope = ((LINK_BUILDING[:, None] == place) * effect[:, None])[None]
-    found = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.zeros(2))
+    found = estimate_response(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.zeros(2))
     assert own @ found[0] == pytest.approx(estimate)
     assert found.sum() == pytest.approx(1.0)
-    held = following(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.array([1e9, 0.0]))
+    held = estimate_response(slope, np.zeros(4, int), np.ones((len(effect), 1)), np.array([1e9, 0.0]))
     assert np.abs(held).max() < 1e-3
 
 
 def test_what_cannot_be_followed_is_taken_straight():
     """A step of path loss at the estimate: no place near it gives the estimate once buildings differ."""
-    leaning = Leaning(np.full((1, 1), HALF), np.ones((1, 3, 1)), np.zeros((3, 0)), np.zeros((1, 1)))
-    found = means_behind(leaning, lambda x, portion: np.full((1, 3), 4.0), np.full((1, 1), 0.6))
+    leaning = LinearModel(np.full((1, 1), HALF), np.ones((1, 3, 1)), np.zeros((3, 0)), np.zeros((1, 1)))
+    found = implied_means(leaning, lambda x, portion: np.full((1, 3), 4.0), np.full((1, 1), 0.6))
     assert found.tolist() == [[0.6]]
 
 
@@ -115,8 +121,8 @@ def test_waves_that_buildings_smear_do_not_look_like_loss():
     def change(x, portion):
         return response(x[:, :1], x[:, 1:] + portion * others) - response(*estimate.T[..., None])
 
-    leaning = Leaning(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6))
-    found = means_behind(leaning, change, np.full((200, 2), 0.9))
+    leaning = LinearModel(estimate, slope, np.zeros((60, 0)), np.full((200, 2), 1e-6))
+    found = implied_means(leaning, change, np.full((200, 2), 0.9))
     assert (found == 0.9).mean() < 0.2  # that cannot be followed
     assert np.median(found[:, 0]) == pytest.approx(0.3, abs=0.05)
 
@@ -137,18 +143,18 @@ def test_a_density_is_too_sure_which_place_it_is():
         0.5 * (np.sum(followed(gap) ** 2, axis=1) - np.sum(followed(gap - other) ** 2, axis=1))
         for gap in (own + noise, noise)
     )
-    leaning = Leaning(
+    leaning = LinearModel(
         np.full((len(own), 1), HALF), np.broadcast_to(effect[:, None], (len(own), len(effect), 1)),
         np.ones((len(effect), 1)), np.zeros((len(own), 2)),
     )  # fmt: skip
     others = np.broadcast_to(other, (len(own), 1, len(effect)))
-    found = overstated(leaning, own, others)
+    found = overconfidence(leaning, own, others)
     # The square of a normal number is 1 on the mean and 0.45 in the middle.
     assert 1.0 + (found - 1.0) / 0.455 == pytest.approx(ratio.var() / plain.var(), rel=0.1)
     assert found > 3.0
-    assert overstated(leaning, own, 1e-3 * others) == 1.0  # no place of its own
+    assert overconfidence(leaning, own, 1e-3 * others) == 1.0  # no place of its own
     shared = np.broadcast_to(columns @ [0.3, -2.0], own.shape)
-    assert overstated(leaning, shared, others) == pytest.approx(1.0)
+    assert overconfidence(leaning, shared, others) == pytest.approx(1.0)
 
 
 def test_a_density_divided_is_that_of_more_noise():
@@ -173,27 +179,27 @@ def weights(models: tuple[NoiseModel, ...], **kinds: float) -> np.ndarray:
 
 
 def test_spreads_are_as_likely_as_the_data_say(models):
-    apart = spreads(models, weights(models, gaussian=0.2, heterogeneous=0.8), models)
+    apart = draw_spreads(models, weights(models, gaussian=0.2, heterogeneous=0.8), models)
     # Four times as likely now and twice before: the data speak for it by two to one, and so was thought before.
     assert np.mean(apart > 0) == pytest.approx(0.8 + 0.2 * 4 / 5, abs=0.015)
     assert np.mean(apart == 0.3) == pytest.approx(0.8 / 3 + 0.2 * 4 / 5 * 0.137, abs=0.03)
-    alike = spreads(models, weights(models, gaussian=1.0), models)
+    alike = draw_spreads(models, weights(models, gaussian=1.0), models)
     assert np.mean(alike > 0) < 0.01
     # Heavy tails explain all: nothing was learnt of buildings, and they differ as likely as was thought before.
-    heavy = spreads(models, weights(models, **{"student-t": 1.0}), models)
+    heavy = draw_spreads(models, weights(models, **{"student-t": 1.0}), models)
     assert np.mean(heavy > 0) == pytest.approx(2 / 3, abs=0.03)
 
 
 def test_a_study_of_like_buildings_moves_nothing(models):
     alike = tuple(model for model in models if model.kind != DIFFERING)
     share = weights(alike, gaussian=1.0)
-    assert (spreads(alike, share, alike) == 0).all()
+    assert (draw_spreads(alike, share, alike) == 0).all()
 
 
 def test_models_left_out_count_as_unlikely(models):
     """Those that explain little are not evaluated; what is left tells of the others."""
     left = tuple(replace(model) for model in models if model.kind == "gaussian")
-    assert np.mean(spreads(left, np.ones((2000, len(left))) / len(left), models) > 0) < 0.01
+    assert np.mean(draw_spreads(left, np.ones((2000, len(left))) / len(left), models) > 0) < 0.01
 
 
 def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():

@@ -7,20 +7,20 @@ import pytest
 
 from calibray.uncertainty import quadratic_forms as module
 from calibray.uncertainty.noise_models import Marginal, noise_models
-from calibray.uncertainty.quadratic_forms import Forms
+from calibray.uncertainty.quadratic_forms import QuadraticForms
 
 LINKS, COUNT = 30, 120
 
 
-def _marginal(columns, unheard=None):
+def _marginal(columns, censored=None):
     random = np.random.default_rng(1)
     position = random.uniform(0, 300, (LINKS, 3))
     models = [
         model
-        for model in noise_models(position, unheard=unheard is not None)
+        for model in noise_models(position, censored=censored is not None)
         if model.kind != "heterogeneous"
     ]
-    if unheard is not None:
+    if censored is not None:
         models = [model for model in models if model.kind != "correlated"]
     return Marginal.of(
         random.standard_normal((LINKS, columns)),
@@ -29,7 +29,7 @@ def _marginal(columns, unheard=None):
         position,
         3.0,
         models,
-        unheard,
+        censored,
     )
 
 
@@ -41,12 +41,12 @@ def _asked(marginal, seed=2):
 
 
 @pytest.mark.parametrize("columns", [0, 2])
-@pytest.mark.parametrize("most", [module.LINKS, LINKS - 1])
+@pytest.mark.parametrize("most", [module.MAX_LINKS, LINKS - 1])
 def test_each_is_as_under_all_models(columns, most, monkeypatch):
-    monkeypatch.setattr(module, "LINKS", most)
+    monkeypatch.setattr(module, "MAX_LINKS", most)
     marginal = _marginal(columns)
     gap, model = _asked(marginal)
-    forms = Forms.of(marginal)
+    forms = QuadraticForms.of(marginal)
     assert bool(forms.square) == (most >= LINKS)
     found, wanted = forms.densities(gap, model), marginal.densities(gap)[np.arange(COUNT), model]
     assert np.isneginf(found[3])
@@ -55,11 +55,11 @@ def test_each_is_as_under_all_models(columns, most, monkeypatch):
 
 
 def test_links_that_were_not_heard_are_left_to_the_density():
-    unheard = np.arange(LINKS) % 5 == 0
-    marginal = _marginal(1, unheard)
+    censored = np.arange(LINKS) % 5 == 0
+    marginal = _marginal(1, censored)
     gap, model = _asked(marginal)
     wanted = marginal.densities(gap)[np.arange(COUNT), model]
-    found = Forms.of(marginal).densities(gap, model)
+    found = QuadraticForms.of(marginal).densities(gap, model)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(wanted))
     assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3), abs=1e-4)
 
@@ -69,5 +69,5 @@ def test_one_kind_alone_is_enough():
     heavy = replace(marginal, models=tuple(model for model in marginal.models if model.kind == "student-t"))
     gap, model = _asked(heavy)
     wanted = heavy.densities(gap)[np.arange(COUNT), model]
-    found = Forms.of(heavy).densities(gap, model)
+    found = QuadraticForms.of(heavy).densities(gap, model)
     assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3), abs=1e-3)

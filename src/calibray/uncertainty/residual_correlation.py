@@ -1,0 +1,197 @@
+"""Spatial correlation of the residuals: restricted-likelihood fit, test and variogram.
+
+A link's error has a correlated and an uncorrelated part. Receivers near each other share the correlated part, for
+example because clutter that the scene lacks shades them all. Its covariance falls off exponentially with distance.
+Range and size maximise the restricted likelihood (H. D. Patterson and R. Thompson, Biometrika 58, 1971), so that fitted
+parameters do not bias the noise low. The fit is exact with one Cholesky factor per trial, for up to some thousand
+links.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist, pdist
+
+from calibray.errors import EngineError, InputError
+from calibray.support.blas_threads import single_blas_thread
+
+SHARES: Final = (0.001, 0.999)
+"""Bounds of the correlated share of the variance; at 1 the covariance of near links is singular."""
+
+FEWEST_LINKS: Final = 10
+"""Links below which no correlation is reported; fewer cannot show one."""
+
+MOST_LINKS: Final = 500
+"""Links used for correlation and variogram; of more, an evenly spaced subset."""
+
+SIGNIFICANT: Final = 3.0
+"""Gain in log likelihood above which correlation is reported: about the 95 % quantile for two further parameters."""
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Gaussian errors with a spatially correlated part.
+
+    Attributes:
+        range_m: Distance at which the correlated part has fallen to 1/e [m].
+        shared_db: Standard deviation of the correlated part [dB].
+        own_db: Standard deviation of the uncorrelated part, for a link of deviation 1 [dB].
+        log_likelihood: Restricted log likelihood of the fitted errors.
+        independent: Restricted log likelihood of the best fit without a correlated part.
+    """
+
+    range_m: float
+    shared_db: float
+    own_db: float
+    log_likelihood: float
+    independent: float
+
+    def covariance(
+        self, position: NDArray[np.float64], deviation: NDArray[np.float64] | float = 1.0
+    ) -> NDArray[np.float64]:
+        """Covariance of the links' errors.
+
+        Args:
+            position: Positions of the links [m, k], [m].
+            deviation: Known relative standard deviations of the uncorrelated part [m].
+
+        Returns:
+            The covariance [m, m], [dB^2].
+        """
+        own = np.broadcast_to(self.own_db * np.asarray(deviation), len(position))
+        return self.shared_db**2 * np.exp(-cdist(position, position) / self.range_m) + np.diag(own**2)
+
+
+def fit_correlation(
+    errors: NDArray[np.float64],
+    position: NDArray[np.float64],
+    *,
+    deviation: NDArray[np.float64] | float = 1.0,
+    design: NDArray[np.float64] | None = None,
+) -> Correlation:
+    """Fit range and size of the correlated part by restricted maximum likelihood.
+
+    Args:
+        errors: Errors at the best fit [m], [dB].
+        position: Positions of the receivers, or of both ends [m, k], [m].
+        deviation: Known relative standard deviations of the uncorrelated part [m].
+        design: Columns that were fitted to the same links, of full rank [m, q]: nuisances, and derivatives by the
+            parameters.
+
+    Returns:
+        The correlation.
+
+    Raises:
+        InputError: There are fewer than three links more than columns, or all receivers have one position.
+        EngineError: The errors are all zero.
+    """
+    count = len(errors)
+    columns = np.zeros((count, 0)) if design is None else design
+    if count - columns.shape[1] < 3:
+        raise InputError(
+            f"noise: {count} links and {columns.shape[1]} fitted columns; the correlation of errors needs at least "
+            f"{columns.shape[1] + 3} links"
+        )
+    distance, pairs = cdist(position, position), pdist(position)
+    if not pairs.any():
+        raise InputError("noise: all receivers have the same position; set range_m = 0")
+    if not errors.any():
+        raise EngineError("noise: all errors are zero, which no noise explains; check the measured values")
+    uncorrelated = np.diag(np.broadcast_to(deviation, count) ** 2.0)
+    log_ranges = np.log([pairs[pairs > 0].min() / 3, 3 * pairs.max()])
+
+    def trial(share: float, log_range: float) -> tuple[float, float]:
+        """Restricted log likelihood, and the total variance."""
+        matrix = share * np.exp(-distance / np.exp(log_range)) + (1 - share) * uncorrelated
+        return _restricted(matrix, errors, columns)
+
+    def cost(point: NDArray[np.float64]) -> float:
+        return -trial(*point)[0]
+
+    start_ranges = np.quantile(log_ranges, (0.4, 0.6, 0.8))
+    starts = [np.array([share, log_range]) for share in (0.3, 0.8) for log_range in start_ranges]
+    # BLAS threads cost more than they save on matrices of this size.
+    with single_blas_thread():
+        bounds, first = (SHARES, tuple(log_ranges)), min(starts, key=cost)
+        optimum = minimize(cost, first, method="Nelder-Mead", bounds=bounds, options={"xatol": 1e-3})
+        share, log_range = optimum.x
+        likelihood, variance = trial(share, log_range)
+        independent = _restricted(uncorrelated, errors, columns)[0]
+    return Correlation(
+        range_m=float(np.exp(log_range)),
+        shared_db=float(np.sqrt(share * variance)),
+        own_db=float(np.sqrt((1 - share) * variance)),
+        log_likelihood=likelihood,
+        independent=independent,
+    )
+
+
+def _restricted(
+    matrix: NDArray[np.float64], errors: NDArray[np.float64], columns: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Restricted log likelihood of errors with covariance matrix x variance, and the best variance."""
+    factor = cho_factor(matrix, lower=True)
+    freedom = len(errors) - columns.shape[1]
+    solved = cho_solve(factor, np.column_stack([errors, columns]))
+    gram = columns.T @ solved[:, 1:]
+    side = columns.T @ solved[:, 0]
+    square = errors @ solved[:, 0] - (side @ np.linalg.solve(gram, side) if len(gram) else 0.0)
+    variance = square / freedom
+    determinant = 2.0 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(gram)[1]
+    return float(-0.5 * (freedom * (np.log(2 * np.pi * variance) + 1.0) + determinant)), float(variance)
+
+
+def shared_errors(errors: NDArray[np.float64], position: NDArray[np.float64]) -> Correlation | None:
+    """Fit the correlation of the errors, if it is significant.
+
+    Args:
+        errors: Errors at the best fit [m], [dB].
+        position: Positions of the receivers, or of both ends [m, k], [m].
+
+    Returns:
+        The correlation; None if it is not significant.
+    """
+    if len(errors) < FEWEST_LINKS:
+        return None
+    chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)
+    try:
+        correlation = fit_correlation(errors[chosen], position[chosen])
+    except (InputError, EngineError):  # all links at one position, or no errors
+        return None
+    significant = correlation.log_likelihood - correlation.independent > SIGNIFICANT
+    return correlation if significant else None
+
+
+def variogram(
+    errors: NDArray[np.float64], position: NDArray[np.float64], bins: int = 8
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Empirical variogram: half the mean squared difference of errors over the distance between links.
+
+    A rising variogram indicates correlated errors, a level one independent errors.
+
+    Args:
+        errors: Errors [m], [dB].
+        position: Positions of the receivers, or of both ends [m, k], [m].
+        bins: Number of distance classes with about equal numbers of pairs.
+
+    Returns:
+        Mean distance [k], [m], semivariance [k], [dB^2], and number of pairs [k] of every class.
+    """
+    chosen = np.linspace(0, len(errors) - 1, min(len(errors), MOST_LINKS)).round().astype(int)
+    distance, half = pdist(position[chosen]), 0.5 * pdist(errors[chosen, None], "sqeuclidean")
+    if len(distance):  # pairs beyond half the extent are few, and all at its ends
+        near = distance <= max(np.median(distance), distance.max() / 2)
+        distance, half = distance[near], half[near]
+    order = np.argsort(distance, kind="stable")
+    parts = [part for part in np.array_split(order, bins) if len(part)]
+    return (
+        np.array([distance[part].mean() for part in parts]),
+        np.array([half[part].mean() for part in parts]),
+        np.array([len(part) for part in parts], dtype=np.int64),
+    )
