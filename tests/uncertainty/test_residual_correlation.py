@@ -8,7 +8,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from calibray.errors import EngineError, InputError
-from calibray.uncertainty.residual_correlation import Correlation, fit_correlation
+from calibray.uncertainty.residual_correlation import Correlation, fit_correlation, shared_errors, variogram
 
 
 @pytest.fixture(autouse=True)
@@ -89,3 +89,50 @@ def test_errors_that_cannot_tell_are_refused():
         fit_correlation(np.ones(5), np.zeros((5, 3)))
     with pytest.raises(EngineError, match="all errors are zero"):
         fit_correlation(np.zeros(5), position)
+
+
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def position() -> np.ndarray:
+    return np.column_stack([np.random.default_rng(2).uniform(0, 400, (COUNT, 2)), np.zeros(COUNT)])
+
+
+def alike(position: np.ndarray, seed: int, range_m: float = 80.0) -> np.ndarray:
+    """Errors of 3 dB that neighbours share."""
+    apart = np.linalg.norm(position[:, None] - position[None], axis=2)
+    root = np.linalg.cholesky(np.exp(-apart / range_m) + 1e-9 * np.eye(len(position)))
+    return 3.0 * root @ np.random.default_rng(seed).standard_normal(len(position))
+
+
+def test_a_variogram_rises_where_neighbours_share_errors_and_is_level_where_not(position):
+    for shared, ratio in ((True, 0.6), (False, None)):
+        rise = []
+        for seed in range(20):
+            white = 3.0 * np.random.default_rng([1, seed]).standard_normal(COUNT)
+            errors = alike(position, seed) if shared else white
+            distance, half, pairs = variogram(errors, position)
+            assert (np.diff(distance) > 0).all()
+            assert pairs.sum() <= COUNT * (COUNT - 1) / 2
+            rise.append(half[0] / half[-3:].mean())
+        if ratio is not None:
+            assert np.median(rise) < ratio
+        else:
+            assert np.median(rise) == pytest.approx(1.0, abs=0.15)
+
+
+def test_shared_errors_are_found_and_none_in_white_ones(position):
+    found = [shared_errors(alike(position, seed), position) is not None for seed in range(8)]
+    white = [
+        shared_errors(3.0 * np.random.default_rng([3, seed]).standard_normal(COUNT), position) is not None
+        for seed in range(8)
+    ]
+    assert sum(found) >= 7
+    assert sum(white) <= 1
+
+
+def test_few_links_and_one_place_show_nothing():
+    errors = np.random.default_rng(0).standard_normal(12)
+    assert shared_errors(errors[:9], np.arange(27.0).reshape(9, 3)) is None
+    assert shared_errors(errors, np.zeros((12, 3))) is None
