@@ -2,7 +2,8 @@
 
 Clutter that the scene lacks affects neighbouring links alike, so that the residual near a measured link is partly
 known. The correlated part has an exponential covariance whose range and size maximize the restricted likelihood
-(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links the field is zero and explains nothing.
+(`uncertainty.residual_correlation.fit_correlation`). Far from all measured links the field is zero and explains
+nothing.
 """
 
 from __future__ import annotations
