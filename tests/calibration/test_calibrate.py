@@ -19,7 +19,7 @@ from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
-from calibray.reporting.result_tables import offsets
+from calibray.reporting.result_tables import nuisances
 from calibray.study import Setup
 from calibray.tables.text import render
 
@@ -306,7 +306,7 @@ def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(
     result = calibrate(study, engine=planted.engine(blocked=True))
     assert sorted(result.nuisance.offsets_db) == ["east", "west"]
     assert result.nuisance.groups_without_path == ("cellar",)
-    assert re.search(r"^cellar +no link with a path$", render(offsets(result)), re.MULTILINE)
+    assert re.search(r"^cellar +no link with a path$", render(nuisances(result)), re.MULTILINE)
     assert result.content()["nuisance"]["groups_without_path"] == ["cellar"]
 
     held = planted.study(

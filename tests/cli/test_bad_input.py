@@ -3,48 +3,10 @@
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from calibray.cli.app import app
-
-SCENE = """<scene version="2.1.0">
-  <bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="brick"/></bsdf>
-  <shape type="ply" id="mesh-house"><string name="filename" value="house.ply"/><ref id="mat-walls" name="bsdf"/></shape>
-</scene>
-"""
-MESH = """ply
-format ascii 1.0
-element vertex 3
-property float x
-property float y
-property float z
-element face 1
-property list uchar int vertex_indices
-end_header
--50 5 0
-50 5 0
-0 5 40
-3 0 1 2
-"""
-LINKS = "x,y,loss,half\n10,0,70.0,a\n20,0,76.0,b\n30,1,80.0,b\n"
-STUDY = """version = 1
-[scene]
-file = "scene.xml"
-frequency = 3.5e9
-[links]
-file = "links.csv"
-tx = [0.0, 0.0, 2.0]
-rx = ["x", "y", 1.5]
-value = "loss"
-[trace]
-max_depth = 1
-samples = 1000
-[parameters]
-"walls.relative_permittivity" = { bounds = [1.5, 12.0] }
-"""
+from commands import STUDY, run, write_wall_study
 
 CASES = {
     "no scene": ("study.toml", ('"scene.xml"', '"absent.xml"'), ["absent.xml", "no such file"]),
@@ -124,25 +86,10 @@ CASES = {
 }
 
 
-def write(folder: Path) -> Path:
-    for name, text in {
-        "study.toml": STUDY,
-        "scene.xml": SCENE,
-        "house.ply": MESH,
-        "links.csv": LINKS,
-    }.items():
-        (folder / name).write_text(text)
-    return folder / "study.toml"
-
-
-def run(*arguments: object):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
-    return write(tmp_path)
+    return write_wall_study(tmp_path)
 
 
 def test_the_unspoilt_study_runs(study):

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from calibray import doctor as diagnosis
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
-from calibray.reporting.doctor_table import table
 from calibray.tables.text import render
 
 HEAVY = (
@@ -120,4 +119,4 @@ def test_doctor_prints_its_table_and_ends_with_its_verdict(monkeypatch, passed, 
     monkeypatch.setattr(diagnosis, "examine", lambda: found)
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stderr) == (status, "")
-    assert result.stdout == render(table(found)) + "\n"
+    assert result.stdout == render(found.table()) + "\n"

@@ -9,13 +9,13 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from test_cli_run import write_study
 
 import programs
 from calibray.calibration.result import Result
 from calibray.engines import Ledger
 from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.tracing.llvm import PATH_VARIABLE
+from commands import write_study
 
 
 @pytest.fixture

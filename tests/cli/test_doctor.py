@@ -10,7 +10,6 @@ import pytest
 
 from calibray import doctor as diagnosis
 from calibray.doctor import Check, Diagnosis
-from calibray.reporting.doctor_table import table
 from calibray.tables.text import render
 from calibray.tracing import llvm
 
@@ -34,7 +33,7 @@ def here():
 
 
 def test_this_machine_works(here):
-    assert here.usable, render(table(here))
+    assert here.usable, render(here.table())
     assert [check.name for check in here.checks[-3:]] == ["Dr.Jit", "Sionna RT", "JAX"]
     assert here.checks[-2].detail == "7 paths in a closed box"
 
@@ -71,7 +70,7 @@ def test_an_absent_package_has_its_install_command(monkeypatch):
             "ModuleNotFoundError: No module named 'no_such'; Name",
         ),
         ("import sys; sys.exit('6 paths in a closed box, not 7')", "6 paths in a closed box, not 7"),
-        ("import os; os._exit(3)", "ended with 3"),
+        ("import os; os._exit(3)", "exit status 3"),
     ],
 )
 def test_a_check_that_dies_is_a_failed_check(code, detail):
@@ -102,7 +101,7 @@ def test_a_library_accepted_on_trust_is_marked(monkeypatch):
 
 
 def test_the_table_tells_all_and_what_to_do():
-    shown = render(table(SOUND))
+    shown = render(SOUND.table())
     assert "pip install 'calibray[parquet]'" in shown
     assert f"{OLD.path}, {OLD.problem}" in shown
     assert "To do" not in shown
@@ -113,5 +112,5 @@ def test_the_table_tells_all_and_what_to_do():
 def test_one_failed_check_makes_the_machine_unusable():
     broken = replace(SOUND, checks=(SOUND.checks[0], Check("JAX", False, "no module", "install JAX")))
     assert not broken.usable
-    assert "To do" in render(table(broken))
-    assert render(table(broken)).count("install JAX") == 1
+    assert "To do" in render(broken.table())
+    assert render(broken.table()).count("install JAX") == 1

@@ -1,4 +1,4 @@
-"""The report: every section is there, nothing is loaded, names are text, and it says what the data say."""
+"""The report page: sections, embedded data, escaped names, and sentences that agree with the data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import calibray as cb
@@ -21,10 +20,10 @@ from calibray.paths import Kind
 from calibray.reporting import page as reports
 from calibray.reporting.link_map import plan, ramp
 from calibray.reporting.link_survey import survey
-from calibray.reporting.rays import INTERACTIONS, PER_LINK, strongest
-from calibray.reporting.scene_mesh import Grid
-from calibray.reporting.value_list import values
-from calibray.reporting.wording import summary
+from calibray.reporting.result_tables import values
+from calibray.reporting.summary import summary
+from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
+from calibray.result.held_out import Judgement
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.building_outlines import _loops
 from calibray.uncertainty.linear_theory import Interval
@@ -38,7 +37,7 @@ HOSTILE = "</script><script>hostile()</script>\u2028<img src=x onerror=hostile()
 
 
 class Page(HTMLParser):
-    """What a browser would find: ids, tags, what is referred to, scripts, and the text that people read."""
+    """Ids, tags, references, scripts and text of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -142,7 +141,7 @@ def test_data_of_the_page_are_those_of_the_result(found, result):
     assert after == pytest.approx(table.after_db.tolist(), abs=0.0051)
     assert sum(links["held"]) == table.held_out.sum() > 0
     words = " ".join(found.words.split())
-    assert f"RMSE is {result.holdout_rmse_db:.2f} dB" in words
+    assert f"RMSE {result.holdout_rmse_db:.2f} dB" in words
     for name, value in result.parameters.items():
         assert name in words
         assert f"{value:.4g}" in words
@@ -174,8 +173,8 @@ def test_the_strongest_paths_hold_the_power_of_the_link(result):
     assert -10 * np.log10(power[reached]) + offset[reached] == pytest.approx(
         result.links.after_db[reached], abs=1e-3
     )
-    assert shown.meets["concrete"] > 0
-    assert shown.meets["glass"] == 0
+    assert shown.links_by_material["concrete"] > 0
+    assert shown.links_by_material["glass"] == 0
 
 
 def test_of_many_paths_the_strongest_are_shown(result):
@@ -236,57 +235,50 @@ def test_figures_are_written_as_svg_and_png(written):
 # Sentences
 
 
-def said(result: Result, heading: str) -> str:
-    parts = summary(result)
-    start = next(place for place, part in enumerate(parts) if part.heading == heading)
-    end = next((place for place in range(start + 1, len(parts)) if parts[place].heading), len(parts))
-    return " ".join(part.text for part in parts[start:end])
+def answer(result: Result, heading: str) -> str:
+    """The sentences of the summary that answer a question."""
+    sentences = summary(result)
+    start = next(k for k, sentence in enumerate(sentences) if sentence.heading == heading)
+    end = next((k for k in range(start + 1, len(sentences)) if sentences[k].heading), len(sentences))
+    return " ".join(sentence.text for sentence in sentences[start:end])
 
 
-HELP = "Did it help where nothing was fitted?"
+HELP = "Did calibration help on held-out links?"
 
 
-def judged(result: Result, after: float, before: float, links: int) -> Result:
-    """The result with held-out links whose errors are planted, of random sign."""
-    random = np.random.default_rng(2)
-    measured = np.full(links, 90.0)
-    sign = random.choice([-1, 1], links) * random.uniform(0.8, 1.2, links)
-    table = pd.DataFrame({
-        "row": np.arange(links), "measured_db": measured, "before_db": measured + before * sign,
-        "after_db": measured + after * random.permutation(sign), "log_distance_db": measured + 9 * sign,
-        "has_path": True, "held_out": True,
-    })  # fmt: skip
-    return changed(
-        result, links=table, holdout_rmse_db=after, initial_holdout_rmse_db=before,
-        log_distance_holdout_rmse_db=9.0, nuisance_only_holdout_rmse_db=None,
-    )  # fmt: skip
+def judged(result: Result, rmse_db: float, baseline_db: float) -> Result:
+    """The result with another judgement, of 60 held-out links in 15 clusters, with an error of 0.5 dB."""
+    judgement = Judgement(60, rmse_db, "a log-distance model", baseline_db, 0.5, 15)
+    return changed(result, judgement=judgement)
 
 
-def test_the_summary_says_whether_it_helped(result):
-    assert "So it helped" in said(judged(result, 2.0, 4.0, 60), HELP)
-    assert "did not beat it" in said(judged(result, 4.0, 3.9, 60), HELP)
-    assert "more than chance" in said(judged(result, 3.9, 4.0, 6), HELP)
-    assert "So it helped" not in said(judged(result, 3.9, 4.0, 6), HELP)
-    rival = changed(judged(result, 2.0, 4.0, 60), log_distance_holdout_rmse_db=1.5)
-    assert "a log-distance model with 1.50 dB. Calibration did not beat it" in said(rival, HELP)
-    none = changed(result, holdout_rmse_db=None, initial_holdout_rmse_db=None)
-    assert "Not known: no links were held out" in said(none, HELP)
+def test_the_summary_says_whether_calibration_helped(result):
+    assert answer(judged(result, 2.0, 4.0), HELP).startswith(
+        "Calibration helped on held-out links: RMSE 2.00 dB"
+    )
+    assert "did not help" in answer(judged(result, 4.0, 3.9), HELP)
+    assert "did not clearly help" in answer(judged(result, 3.9, 4.0), HELP)
+    assert "2.00 dB less than a log-distance model, the best baseline" in answer(
+        judged(result, 2.0, 4.0), HELP
+    )
+    assert answer(changed(result, judgement=None), HELP).startswith("No links were held out")
 
 
-def test_the_summary_says_what_the_data_cannot_tell(result):
+def test_the_summary_says_which_parameters_are_identified(result):
     verdicts = dict(zip(result.parameters, ("identified", "at bound", "not identifiable"), strict=True))
     known = changed(
         result, intervals={name: Interval(0.1, 2.0, 3.0, verdict) for name, verdict in verdicts.items()}
     )
-    sure, _, unsure = verdicts
-    text = said(known, "How sure are the values?")
-    assert f"The links tell 1 of 3: {sure}" in text
-    assert f"{unsure}: not told by these links" in text
-    material = unsure.rpartition(".")[0]
-    for meets, words in ((0, "no path of any link meets it"), (1, "meet it")):
-        parts = summary(known, {material: meets})
-        assert any(part.text.startswith(material) and words in part.text for part in parts)
-    assert "gives no derivatives" in said(changed(result, intervals={}), "How sure are the values?")
+    identified, _, unidentified = verdicts
+    text = answer(known, "How certain are the values?")
+    assert f"The links identify 1 of 3 parameters: {identified}" in text
+    assert f"{unidentified}: not identifiable" in text
+    material = unidentified.rpartition(".")[0]
+    for count, words in ((0, "no path of any link interacts with it"), (1, "paths that interact with it")):
+        sentences = summary(known, {material: count})
+        assert any(part.text.startswith(material) and words in part.text for part in sentences)
+    without_intervals = changed(result, intervals={})
+    assert "gives no derivatives" in answer(without_intervals, "How certain are the values?")
 
 
 def test_bars_stand_where_the_values_are(result):
@@ -301,7 +293,7 @@ def test_bars_stand_where_the_values_are(result):
         intervals={name: Interval(1.0, 10**0.5, 1000.0, "identified")},
     )  # fmt: skip
     entry = values(logarithmic)[0]
-    assert entry.places == pytest.approx({"before": 0.5, "after": 0.75})
+    assert entry.positions == pytest.approx({"before": 0.5, "after": 0.75})
     assert entry.pieces[0] == pytest.approx((0.25, 1.0))
 
 
@@ -396,7 +388,7 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     )
     done = CliRunner().invoke(app, ["run", str(file), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
-    assert "Warning: no report" in done.stderr
+    assert "Warning: the report was not written" in done.stderr
     assert "calibray report" in done.stderr
     assert Result.load(tmp_path / "out").parameters == Result.load(written).parameters
     assert not (tmp_path / "out" / "report.html").exists()
