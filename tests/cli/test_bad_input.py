@@ -1,4 +1,4 @@
-"""Bad input: exit code 2, one message that names the place and the remedy, no traceback, nothing written."""
+"""Bad input: exit status 2, one message with file, value and remedy, no traceback, no files."""
 
 import subprocess
 import sys
@@ -92,7 +92,7 @@ def study(tmp_path, monkeypatch):
     return write_wall_study(tmp_path)
 
 
-def test_the_unspoilt_study_runs(study):
+def test_the_study_runs_without_faults(study):
     assert tomllib.loads(STUDY)["version"] == 1
     outcome = run("run", study, "--out", study.parent / "out")
     assert outcome.exit_code == 0, outcome.output
@@ -100,7 +100,7 @@ def test_the_unspoilt_study_runs(study):
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case[2] is not None])
-def test_every_fault_is_one_message_that_names_place_and_remedy(study, name):
+def test_every_fault_is_one_message_with_file_and_remedy(study, name):
     file, (old, new), words = CASES[name]
     path = study.with_name(file)
     assert old in path.read_text()
@@ -115,7 +115,7 @@ def test_every_fault_is_one_message_that_names_place_and_remedy(study, name):
     assert sorted(study.parent.rglob("*")) == before
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(study):
+def test_an_invalid_output_folder_is_refused_first(study):
     outcome = run("run", study, "--out", study.parent / "links.csv" / "out")
     assert outcome.exit_code == 2
     assert "output folder" in outcome.stderr
@@ -125,13 +125,13 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(study):
     "arguments", [("run", "{study}", "--out", "{out}", "--engine", "rerun"), ("predict", "{out}", "{study}")]
 )
 def test_bad_arguments(study, arguments):
-    places = {"study": study, "out": study.parent / "out"}
-    outcome = run(*(argument.format(**places) for argument in arguments))
+    paths = {"study": study, "out": study.parent / "out"}
+    outcome = run(*(argument.format(**paths) for argument in arguments))
     assert outcome.exit_code == 2
     assert outcome.stderr.startswith("Error: ")
 
 
-def test_the_installed_program_exits_with_2_and_no_traceback(study):
+def test_the_process_exits_with_2_and_no_traceback(study):
     study.write_text(STUDY.replace("version = 1", "version = 2"))
     program = [sys.executable, "-c", "from calibray.cli import main; main()"]
     finished = subprocess.run(
@@ -142,6 +142,6 @@ def test_the_installed_program_exits_with_2_and_no_traceback(study):
     )
     assert finished.returncode == 2
     assert finished.stdout == ""
-    # A busy machine tells first that it is still starting.
+    # On a busy machine, a line of progress precedes the message.
     assert finished.stderr.splitlines()[-1].startswith("Error: ")
     assert "Traceback" not in finished.stderr

@@ -1,4 +1,4 @@
-"""`calibray run`, `trace` and `predict`: what stands on stdout, on stderr and in the files."""
+"""`calibray run`, `trace` and `predict`: stdout, stderr and files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LOST_ROW = planted.INSIDE + 2  # the header is row 1
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_cache():
-    """Nothing is taken from, or left in, the user's cache of traces."""
+    """The user's cache of traces is not used."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", "")
         yield
@@ -38,7 +38,7 @@ def _no_cache():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a study file whose links have one offset per half, one of them without a path."""
+    """A folder with a study file; its links have an offset per half, and one has no path."""
     folder = tmp_path_factory.mktemp("study")
     table = planted.campaign(blocked=True).replace(np.inf, 75.0)
     study = planted.study(
@@ -60,7 +60,7 @@ def ran(folder):
     return outcome
 
 
-def test_run_writes_its_files_and_says_so_on_stderr(folder, ran):
+def test_run_writes_its_files_and_lists_them_on_stderr(folder, ran):
     assert sorted(path.name for path in (folder / "out").iterdir()) == sorted(
         [*FILES, "report.html", SIGNATURES]
     )
@@ -70,9 +70,9 @@ def test_run_writes_its_files_and_says_so_on_stderr(folder, ran):
     assert Result.load(folder / "out").parameters == pytest.approx(planted.TRUTH, abs=1e-3)
 
 
-def test_run_prints_what_it_found(folder, ran):
+def test_run_prints_the_result(folder, ran):
     result, lines = Result.load(folder / "out"), ran.stdout.splitlines()
-    # Of the lines of a parameter the first: a later one says why.
+    # The first line of a parameter; a later one has the reason.
     cells = {line.split("  ")[0]: line.split() for line in reversed(lines) if line}
     assert lines[0] == "study.toml: method auto, engine replay, seed 3"
     assert cells["calibration links"][-1] == "9"
@@ -99,7 +99,7 @@ def test_output_is_plain_text(ran):
 
 
 def test_run_with_an_external_program_needs_no_ray_tracer_here(tmp_path, monkeypatch):
-    """The program is all that is asked; every call is in the ledger, and started again the run asks nothing."""
+    """Only the program is called; every call is in the ledger, and a second run calls nothing."""
     write_study(
         tmp_path,
         programs.content(tmp_path) | {"method": {"name": "auto", "model": "none", "options": {"budget": 18}}},
@@ -154,7 +154,7 @@ def test_trace_stores_a_path_program(folder):
     assert outcome.stderr == f"Written to {folder / 'paths.h5'}\n"
 
 
-def test_trace_check_needs_no_file_and_tells_that_nothing_changes(folder):
+def test_trace_check_needs_no_file_and_reports_no_change(folder):
     before = sorted(folder.rglob("*"))
     outcome = run("trace", folder / "study.toml", "--check")
     assert (outcome.exit_code, outcome.stderr) == (0, "")
@@ -220,7 +220,7 @@ def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
 )
 def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, arguments, message):
     planted.links().to_csv(tmp_path / "bare.csv", index=False)
-    places = {
+    paths = {
         "study": folder / "study.toml",
         "file": folder / "links.csv",
         "folder": folder,
@@ -229,14 +229,14 @@ def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, 
         "bare": tmp_path / "bare.csv",
     }
     before = sorted(folder.rglob("*"))
-    outcome = run(*(argument.format(**places) for argument in arguments))
+    outcome = run(*(argument.format(**paths) for argument in arguments))
     assert (outcome.exit_code, outcome.stdout) == (2, "")
     assert outcome.stderr.startswith("Error: ")
     assert message in outcome.stderr
     assert sorted(folder.rglob("*")) == before
 
 
-def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
+def test_antennas_inside_buildings_are_listed_unless_most_are_inside(folder, ran):
     result = Result.load(folder / "out")
     row, none = np.arange(2, 14), np.zeros(12, dtype=bool)
     few, most = np.arange(12) < 2, np.arange(12) < 11
@@ -252,7 +252,7 @@ def test_antennas_inside_buildings_are_told_unless_all_are_indoors(folder, ran):
     ]
 
 
-def test_tables_fit_what_there_is(folder, ran):
+def test_tables_leave_out_what_is_absent(folder, ran):
     result = Result.load(folder / "out")
     bare = changed(result, coefficients={}, nuisance_only_rmse_db=None, holdout_rmse_db=None, intervals={})
     text = render(*result_tables.tables(bare))
@@ -261,7 +261,7 @@ def test_tables_fit_what_there_is(folder, ran):
     assert "unknown" in text
 
 
-def test_progress_is_a_bar_where_somebody_watches():
+def test_progress_is_a_bar_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=80)
     with progress_bars(console) as progress:
         progress("tracing", 0, 12)
@@ -272,7 +272,7 @@ def test_progress_is_a_bar_where_somebody_watches():
     assert "0/?" not in drawn
 
 
-def test_progress_is_lines_elsewhere_even_while_nothing_is_reported():
+def test_progress_is_lines_elsewhere_even_during_silent_work():
     console = Console(file=io.StringIO(), force_terminal=False, width=20)
     with progress_bars(console, every=0.02) as progress:
         while "starting" not in console.file.getvalue():
@@ -281,8 +281,8 @@ def test_progress_is_lines_elsewhere_even_while_nothing_is_reported():
         progress("tracing", 5, 12)
         while "tracing 5/12" not in console.file.getvalue():
             time.sleep(0.01)
-        told = len(console.file.getvalue().splitlines())
-        while len(console.file.getvalue().splitlines()) < told + 3:
+        count = len(console.file.getvalue().splitlines())
+        while len(console.file.getvalue().splitlines()) < count + 3:
             time.sleep(0.01)
     lines = console.file.getvalue().splitlines()
     assert "\x1b" not in console.file.getvalue()

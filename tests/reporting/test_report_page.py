@@ -47,17 +47,19 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        given = dict(attrs)
-        if "id" in given:
-            self.ids.append(given["id"])
+        attributes = dict(attrs)
+        if "id" in attributes:
+            self.ids.append(attributes["id"])
         self.references += [
-            given[name] for name in ("href", "src", "xlink:href", "action", "data", "srcset") if name in given
+            attributes[name]
+            for name in ("href", "src", "xlink:href", "action", "data", "srcset")
+            if name in attributes
         ]
-        self.references += re.findall(r"url\(([^)]*)\)", given.get("style") or "")
+        self.references += re.findall(r"url\(([^)]*)\)", attributes.get("style") or "")
         if tag in ("script", "style"):
             self._inside.append(tag)
             self.scripts.append("")
-        assert not any(name.startswith("on") for name in given), (tag, attrs)
+        assert not any(name.startswith("on") for name in attributes), (tag, attrs)
 
     def handle_endtag(self, tag):
         if tag in ("script", "style"):
@@ -76,7 +78,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory) -> Result:
-    """A calibration with an offset per half, a hold-out, and a link without a path; the groups have hostile names."""
+    """A calibration with an offset per half, held-out links, a link without a path, and a hostile group name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", "")
         table = planted.campaign(noise_db=0.3, blocked=True)
@@ -102,53 +104,53 @@ def written(result, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(written) -> Page:
+def html(written) -> Page:
     return Page((written / "report.html").read_text(encoding="utf-8"))
 
 
-def test_every_section_is_there(found):
-    assert set(found.ids) >= SECTIONS
-    assert len(found.ids) == len(set(found.ids))
+def test_every_section_is_there(html):
+    assert set(html.ids) >= SECTIONS
+    assert len(html.ids) == len(set(html.ids))
     assert {"figure-convergence", "figure-cumulative-cost", "figure-path-loss", "figure-residual-over-distance",
-            "figure-residual-by-group"} <= set(found.ids)  # fmt: skip
+            "figure-residual-by-group"} <= set(html.ids)  # fmt: skip
 
 
-def test_nothing_is_loaded_from_anywhere(found, written):
-    inner = {f"#{name}" for name in found.ids}
-    for reference in found.references:
+def test_nothing_is_loaded_from_anywhere(html, written):
+    inner = {f"#{name}" for name in html.ids}
+    for reference in html.references:
         assert reference in inner or reference.startswith("data:"), reference
-    assert not {"iframe", "object", "embed", "form", "base", "img"} & set(found.tags)
+    assert not {"iframe", "object", "embed", "form", "base", "img"} & set(html.tags)
     text = (written / "report.html").read_text(encoding="utf-8")
     assert "://" not in text
     assert "default-src 'none'" in text
-    assert not re.search(r"url\((?!#|&#34;#|data:)", "".join(found.scripts[:1]))
+    assert not re.search(r"url\((?!#|&#34;#|data:)", "".join(html.scripts[:1]))
 
 
-def test_hostile_names_are_text(found, result):
-    assert HOSTILE in found.words
-    assert HOSTILE in found.data["groups"]
+def test_hostile_names_are_text(html, result):
+    assert HOSTILE in html.words
+    assert HOSTILE in html.data["groups"]
     # The page's own three: style, data and viewer.
-    assert len(found.scripts) == 3
-    assert "\u2028" not in found.scripts[1]
+    assert len(html.scripts) == 3
+    assert "\u2028" not in html.scripts[1]
 
 
-def test_data_of_the_page_are_those_of_the_result(found, result):
-    links = found.data["links"]
+def test_embedded_data_equal_the_result(html, result):
+    links = html.data["links"]
     table = result.links
     assert links["row"] == table.row.tolist()
     assert links["measured"] == pytest.approx(table.measured_db.tolist(), abs=0.0051)
     after = [np.inf if value is None else value for value in links["after"]]
     assert after == pytest.approx(table.after_db.tolist(), abs=0.0051)
     assert sum(links["held"]) == table.held_out.sum() > 0
-    words = " ".join(found.words.split())
+    words = " ".join(html.words.split())
     assert f"RMSE {result.holdout_rmse_db:.2f} dB" in words
     for name, value in result.parameters.items():
         assert name in words
         assert f"{value:.4g}" in words
 
 
-def test_interaction_points_make_paths_of_the_traced_length(result):
-    """The points that are drawn, with the link's ends, add up to each path's delay."""
+def test_drawn_paths_have_the_traced_length(result):
+    """The lengths between the drawn points add up to each path's delay."""
     paths = result.paths
     for path in range(paths.num_paths):
         link = paths.link[path]
@@ -158,14 +160,14 @@ def test_interaction_points_make_paths_of_the_traced_length(result):
         assert length == pytest.approx(paths.delay[path] * 299_792_458, rel=1e-5)
 
 
-def test_the_strongest_paths_hold_the_power_of_the_link(result):
+def test_the_strongest_paths_have_the_power_of_the_link(result):
     shown = strongest(result.paths, result)
     assert (np.diff(shown.paths.link) >= 0).all()
     for link in np.unique(shown.paths.link):
-        own = shown.gain_db[shown.paths.link == link]
-        assert (np.diff(own) <= 0).all()
-        assert len(own) <= PER_LINK
-    # No link of this scene has more paths than are kept, so their power is the link's.
+        gains = shown.gain_db[shown.paths.link == link]
+        assert (np.diff(gains) <= 0).all()
+        assert len(gains) <= PER_LINK
+    # No link of this scene has more paths than are shown, so their power is that of the link.
     assert shown.paths.num_paths == shown.traced
     power = np.bincount(shown.paths.link, 10 ** (shown.gain_db / 10), len(result.links))
     reached = power > 0
@@ -177,7 +179,7 @@ def test_the_strongest_paths_hold_the_power_of_the_link(result):
     assert shown.links_by_material["glass"] == 0
 
 
-def test_of_many_paths_the_strongest_are_shown(result):
+def test_only_the_strongest_of_many_paths_are_shown(result):
     many = synthetic.program([(Kind.SPECULAR,)] * 600, links=2)
     shown = strongest(many, changed(result, materials=many.materials))
     assert np.bincount(shown.paths.link).tolist() == [PER_LINK, PER_LINK]
@@ -188,7 +190,7 @@ def test_of_many_paths_the_strongest_are_shown(result):
     assert INTERACTIONS > 24
 
 
-def test_an_older_result_is_drawn_from_its_study(written, result, tmp_path):
+def test_positions_missing_in_the_result_come_from_the_study(written, result, tmp_path):
     old = Result.load(written)
     old = changed(old, links=old.links.drop(columns=["tx_x", "group"]))
     links = survey(old)
@@ -196,7 +198,7 @@ def test_an_older_result_is_drawn_from_its_study(written, result, tmp_path):
     assert links.group.tolist() == survey(result).group.tolist()
 
 
-def test_what_cannot_be_read_any_more_is_said(written, result, monkeypatch, tmp_path):
+def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, monkeypatch, tmp_path):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     gone = Result.load(written)
     content = gone.study.content()
@@ -212,7 +214,7 @@ def test_what_cannot_be_read_any_more_is_said(written, result, monkeypatch, tmp_
     assert page.data is None
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(result, tmp_path):
+def test_a_missing_folder_is_refused_before_the_report_is_made(result, tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         cb.report(result, tmp_path / "absent" / "report.html")
 
@@ -272,7 +274,7 @@ def test_the_summary_says_which_parameters_are_identified(result):
     identified, _, unidentified = verdicts
     text = answer(known, "How certain are the values?")
     assert f"The links identify 1 of 3 parameters: {identified}" in text
-    assert f"{unidentified}: not identifiable" in text
+    assert f"{unidentified} is not identifiable" in text
     material = unidentified.rpartition(".")[0]
     for count, words in ((0, "no path of any link interacts with it"), (1, "paths that interact with it")):
         sentences = summary(known, {material: count})
@@ -281,7 +283,7 @@ def test_the_summary_says_which_parameters_are_identified(result):
     assert "gives no derivatives" in answer(without_intervals, "How certain are the values?")
 
 
-def test_bars_stand_where_the_values_are(result):
+def test_bars_show_values_and_intervals_at_their_positions(result):
     entry = values(changed(result, intervals={}))[0]
     assert entry.pieces == ()
     content = result.study.content()
@@ -300,7 +302,7 @@ def test_bars_stand_where_the_values_are(result):
 # Map and scene
 
 
-def test_the_map_shows_footprints_where_they_are(tmp_path, result):
+def test_the_map_shows_footprints_at_their_positions(tmp_path, result):
     ground = [[(-200, -200, 0), (200, -200, 0), (200, 200, 0), (-200, 200, 0)]]
     quads = {"ground": ground, "house": block((0, 0, 0), (20, 10, 8)), "shed": block((30, 0, 0), (35, 5, 3))}
     scene = read_scene(write_scene(tmp_path, quads), 3.5e9)
@@ -314,16 +316,18 @@ def test_the_map_shows_footprints_where_they_are(tmp_path, result):
         for outline in shown.buildings.removeprefix("M").removesuffix("Z").split("ZM")
     ]
     corners = [[(0, 0), (20, 0), (20, 10), (0, 10)], [(30, 0), (35, 0), (35, 5), (30, 5)]]
-    expected = [{tuple(at) for at in shown.place(np.array(each)).round(1).tolist()} for each in corners]
+    expected = [
+        {tuple(point) for point in shown.place(np.array(corner)).round(1).tolist()} for corner in corners
+    ]
     assert sorted(map(sorted, outlines)) == sorted(map(sorted, expected))
 
 
-def test_outlines_run_around_faces_that_share_edges():
+def test_faces_that_share_edges_have_one_outline():
     assert [sorted(loop) for loop in _loops([[0, 1, 2], [0, 2, 3]])] == [[0, 1, 2, 3]]
     assert sorted(map(len, _loops([[0, 1, 2], [3, 4, 5]]))) == [3, 3]
 
 
-def test_objects_that_cannot_be_drawn_are_named(tmp_path):
+def test_objects_that_cannot_be_read_are_listed(tmp_path):
     file = write_scene(
         tmp_path, {"house": block((0, 0, 0), (20, 10, 8)), "broken": block((0, 0, 0), (1, 1, 1))}
     )
@@ -334,19 +338,19 @@ def test_objects_that_cannot_be_drawn_are_named(tmp_path):
     assert len(triangles.face) == 12
 
 
-def test_colours_part_more_from_less():
+def test_colours_distinguish_positive_and_negative_residuals():
     colors = ramp(np.array([-9.0, 0.0, 9.0, np.nan]), 5.0)
     assert colors == ["#1f5fa8", "#a9b4bd", "#b34a00", "none"]
 
 
-def test_the_grid_keeps_positions():
+def test_the_grid_rounds_positions_to_its_step():
     points = np.random.default_rng(1).uniform(-800, 1200, (500, 3))
     grid = Grid.over(points)
     assert grid.low + grid.step * grid.steps(points) == pytest.approx(points, abs=0.51 * grid.step)
     assert grid.step < 0.04
 
 
-def test_measured_power_keeps_its_sign_in_the_links(tmp_path, monkeypatch):
+def test_links_contain_received_power_with_its_sign(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     table = planted.campaign(noise_db=0.3)
     power = table.assign(power_dbm=30.0 - table.path_loss_db).drop(columns="path_loss_db")
@@ -364,7 +368,7 @@ def test_measured_power_keeps_its_sign_in_the_links(tmp_path, monkeypatch):
     )
 
 
-def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
+def test_a_failing_report_does_not_lose_the_result(written, monkeypatch, tmp_path):
     from typer.testing import CliRunner
 
     from calibray.cli.app import app
@@ -374,12 +378,12 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     monkeypatch.setattr(reports, "page", None)
 
-    def found(*_, out, **__):
+    def calibrate(*_, out, **__):
         result = Result.load(written)
         result.save(out)
         return result
 
-    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", found)
+    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", calibrate)
     file = tmp_path / "study.toml"
     file.write_text(
         'version = 1\nscene = { file = "sionna:simple_street_canyon", frequency = 3.5e9 }\n'

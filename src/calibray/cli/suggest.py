@@ -39,8 +39,8 @@ def suggest(
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
-        from calibray.prediction.suggestion import suggestion_tables
         from calibray.prediction.suggestion import suggest as suggest_links
+        from calibray.prediction.suggestion import suggestion_tables
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
@@ -50,6 +50,10 @@ def suggest(
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
         suggestion = suggest_links(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
-    typer.echo(json.dumps(suggestion.to_dict("records"), indent=2) if as_json else render(*suggestion_tables(suggestion)))
+    typer.echo(
+        json.dumps(suggestion.to_dict("records"), indent=2)
+        if as_json
+        else render(*suggestion_tables(suggestion))
+    )
     if out is not None:
         write_table(out, suggestion)

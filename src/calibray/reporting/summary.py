@@ -24,7 +24,7 @@ LISTED_VALUES: Final = 6
 """Identified values that are listed one by one."""
 
 MEANINGS: Final = {
-    Verdict.WEAKLY_IDENTIFIED: "weakly identified: the interval covers much of the range",
+    Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
     Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links",
     Verdict.AT_BOUND: "at a bound: the best value may lie beyond it, or the model lacks something",
     Verdict.NOT_IDENTIFIABLE: "not identifiable: any value within the interval fits the links about as well",
@@ -137,7 +137,8 @@ def _certainty(result: Record) -> Iterator[Sentence]:
         yield Sentence(heading, "No parameter is identified.", "caution")
     for verdict, meaning in MEANINGS.items():
         if names := _by_verdict(result, verdict):
-            yield Sentence("", f"{_list(names)}: {meaning}.", "caution")
+            verb = "is" if len(names) == 1 else "are"
+            yield Sentence("", f"{_list(names)} {verb} {meaning}.", "caution")
 
 
 def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iterator[Sentence]:
