@@ -379,8 +379,8 @@ def test_the_order_of_the_paths_does_not_matter():
     assert sound(*shuffled) == pytest.approx(sound(power, delay, diffuse), rel=1e-12)
 
 
-@pytest.mark.parametrize(("power", "fault"), [([], "no path"), ([1e-17], "above the noise")])
-def test_a_receiver_that_hears_nothing_is_refused(power, fault):
+@pytest.mark.parametrize(("power", "fault"), [([], "no path"), ([1e-17], "the noise of")])
+def test_a_receiver_below_the_noise_is_refused(power, fault):
     with pytest.raises(InputError, match=fault):
         sound(power, [1e-6] * len(power), np.full(len(power), False))
 
