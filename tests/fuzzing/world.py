@@ -222,9 +222,11 @@ def sign(file: Path) -> None:
 
 def _calibrated(base: Path) -> dict[str, Any]:
     study = base / "study.toml"
-    rmse = json.loads(calibray("run", study, "-o", base / "out", "--json"))["rmse_db"]
+    rmse = json.loads(calibray("run", study, "-o", base / "out", "--json"))["fit"]["rmse_db"]
     calibray("trace", study, "-o", base / "paths.h5")
-    paid = json.loads(calibray("run", study, "-o", base / "paid", "--json", "--engine", "command"))["rmse_db"]
+    paid = json.loads(calibray("run", study, "-o", base / "paid", "--json", "--engine", "command"))["fit"][
+        "rmse_db"
+    ]
     return {
         "rmse": rmse,
         "ledger": paid,
@@ -248,7 +250,7 @@ def rmse(*arguments: object) -> dict[str, Any]:
     """The errors that `calibray run --json` prints."""
     found = json.loads(calibray("run", *arguments, "--json"))
     Result.load(arguments[arguments.index("-o") + 1])
-    return {key: value for key, value in found.items() if key.endswith("rmse_db")}
+    return {key: value for key, value in found["fit"].items() if key.endswith("rmse_db")}
 
 
 def opened(study: Path) -> list[float]:

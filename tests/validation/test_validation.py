@@ -58,6 +58,14 @@ def test_errors_that_neighbours_share_make_the_difference_less_certain():
     assert shared_db > 1.2 * independent_db
 
 
+def test_one_held_out_link_has_no_bootstrap_error():
+    """A result with such a judgement is stored and read again, so the error must be a finite number or None."""
+    judgement = compare(np.array([1.0]), {"law": np.array([2.0])}, positions(1))
+    assert judgement.error_db is None
+    assert not judgement.helped
+    assert "one cluster" in judgement_text(judgement)
+
+
 def test_many_links_are_resampled_in_a_limited_number_of_clusters():
     model, law = np.random.default_rng(6).normal(size=(2, 6000))
     judgement = compare(model, {"law": 1.1 * law}, positions(6000))

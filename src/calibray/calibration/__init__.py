@@ -1,1 +1,1 @@
-"""Calibration: from a study to its result."""
+"""Calibration: the story from a study to its result."""

@@ -68,7 +68,7 @@ class Judgement:
         rmse_db: RMSE of the calibrated model [dB].
         baseline: Name of the best baseline.
         baseline_rmse_db: Its RMSE [dB].
-        error_db: Bootstrap standard error of the difference [dB].
+        error_db: Bootstrap standard error of the difference [dB]; None if the links form one cluster.
         clusters: Number of clusters of neighbouring links that were resampled.
     """
 
@@ -76,7 +76,7 @@ class Judgement:
     rmse_db: float
     baseline: str
     baseline_rmse_db: float
-    error_db: float
+    error_db: float | None
     clusters: int
 
     @property
@@ -87,4 +87,6 @@ class Judgement:
     @property
     def helped(self) -> bool:
         """Whether the gain exceeds its standard error significantly (Student's t, one degree less than clusters)."""
+        if self.error_db is None:
+            return False
         return self.gain_db > float(stdtrit(max(self.clusters - 1, 1), (1 + CONFIDENCE) / 2)) * self.error_db

@@ -203,7 +203,10 @@ def judgement_text(judgement: Judgement) -> str:
         A sentence.
     """
     error = f"RMSE {judgement.rmse_db:.2f} dB on {judgement.links} held-out links"
-    baseline = f"than {judgement.baseline}, the best baseline (bootstrap error {judgement.error_db:.2f} dB)"
+    certainty = "no bootstrap error: one cluster of links"
+    if judgement.error_db is not None:
+        certainty = f"bootstrap error {judgement.error_db:.2f} dB"
+    baseline = f"than {judgement.baseline}, the best baseline ({certainty})"
     if judgement.gain_db <= 0:
         return f"Calibration did not help on held-out links: {error}, {-judgement.gain_db:.2f} dB more {baseline}."
     verb = "helped" if judgement.helped else "did not clearly help"

@@ -80,7 +80,7 @@ def compare(
     finite = np.isfinite(table).all(axis=0)
     square, count = table[:, finite] ** 2, int(finite.sum())
     if not count:
-        return Judgement(0, np.nan, next(iter(baselines)), np.nan, np.nan, 0)
+        return Judgement(0, np.nan, next(iter(baselines)), np.nan, None, 0)
     rmse = np.sqrt(square.mean(axis=1))
     best = 1 + int(np.argmin(rmse[1:]))
     # Two links or more make at least two clusters: one cluster gives no standard error.
@@ -91,8 +91,9 @@ def compare(
     resampled = np.random.default_rng(seed).integers(len(size), size=(RESAMPLES, len(size)))
     model_rmse, baseline_rmse = np.sqrt(total[:, resampled].sum(axis=2) / size[resampled].sum(axis=1))
     # Resampling k clusters underestimates the variance over new clusters by (k - 1) / k.
-    correction = np.sqrt(len(size) / (len(size) - 1)) if len(size) > 1 else np.inf
-    error = float(np.std(baseline_rmse - model_rmse) * correction) if len(size) > 1 else np.inf
+    error = None
+    if len(size) > 1:
+        error = float(np.std(baseline_rmse - model_rmse) * np.sqrt(len(size) / (len(size) - 1)))
     name = list(baselines)[best - 1]
     return Judgement(count, float(rmse[0]), str(name), float(rmse[best]), error, len(size))
 

@@ -163,7 +163,8 @@ class Validation(HeldOutErrors):
             if name in self.errors:
                 current = {chosen: self.errors[chosen][mask]}
                 comparison = compare(self.errors[name][mask], current, self.position[mask])
-                chosen = name if comparison.gain_db > comparison.error_db else chosen
+                if comparison.error_db is not None and comparison.gain_db > comparison.error_db:
+                    chosen = name
         return chosen
 
     def _blocks(self) -> list[NDArray[np.bool_]]:

@@ -1,4 +1,4 @@
-"""Make the result of a finished run: accuracy next to baselines, intervals, and a row for every link."""
+"""From a finished search to its result: accuracy next to its baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from calibray.validation.held_out_statistics import compare
 from calibray.validation.validation import Validation
 
 FEWEST_HELD_OUT: Final = 8
-"""Held-out links from which a standard deviation of residuals is computed; with fewer, that of the fit is used."""
+"""Held-out links from which a standard deviation of residuals is computed; with fewer, the fit's is used."""
 
-FAINT: Final = "predicted too near the noise floor, left out"
-"""Cause, in the counts of rows, for links that the model predicts near the noise floor."""
+FAINT: Final = "expected too near the noise floor, left out"
+"""How links are counted that the model expects near the noise floor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,47 +64,39 @@ class Timing:
     """Time that parts of a calibration took [s].
 
     Attributes:
-        search: Search by the method, without tracing.
-        trace: Tracing and loading before the search.
+        search: The method.
+        trace: Tracing and loading before.
     """
 
     search: float
     trace: float
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A finished search.
-
-    Attributes:
-        problem: The problem, on the last trace.
-        trail: The search.
-        retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
-        cheap: The cheap model, if the method had one.
-        enclosed: Antennas inside closed bodies; None where this was not checked.
-        timing: Time of its parts.
-    """
-
-    problem: Problem
-    trail: Trail
-    retrace_gap_db: NDArray[np.float64] | None
-    cheap: CheapReplay
-    enclosed: EnclosedAntennas | None
-    timing: Timing
-
-
-def make_result(run: Run, certainty: Certainty, validation: Validation | None) -> Result:
-    """Make the result of a finished run.
+def outcome(
+    problem: Problem,
+    trail: Trail,
+    gap: NDArray[np.float64] | None,
+    certainty: Certainty,
+    validation: Validation | None,
+    enclosed: EnclosedAntennas | None,
+    timing: Timing,
+    cheap: CheapReplay,
+) -> Result:
+    """Assemble the result.
 
     Args:
-        run: The finished search.
-        certainty: Intervals, verdicts and draws.
-        validation: Held-out errors, if blocks were held out in turn.
+        problem: The problem, on the last trace.
+        trail: Its search.
+        gap: Change of every link's path loss on tracing again [links], [dB]; None where nothing was checked.
+        certainty: How far the values can be trusted.
+        validation: Held-out errors, where blocks were held out in turn.
+        enclosed: Antennas inside closed bodies; None where this was not checked.
+        timing: Time that was spent.
+        cheap: The cheap model that the method had, if any.
 
     Returns:
         The result.
     """
-    problem, trail, gap_db, cheap = run.problem, run.trail, run.retrace_gap_db, run.cheap
     setup, objective, parameters = problem.setup, problem.objective, problem.parameters
     study, links = setup.study, setup.links
     calibrated, counted = trail.best_modelled, objective.weight > 0
@@ -116,7 +108,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         with_nuisance,
         log_distance(links, objective, study.scene.frequency),
     )
-    paths = _replayed_paths(problem)
+    paths = _traced(problem)
     diagnostics = diagnose_links(problem, trail.best, paths)
     table = pd.DataFrame(
         {
@@ -127,7 +119,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             "log_distance_db": models.log_distance,
             "has_path": np.isfinite(problem.before) & np.isfinite(calibrated),
             "held_out": setup.held_out,
-            "retrace_gap_db": np.nan if gap_db is None else gap_db,
+            "retrace_gap_db": np.nan if gap is None else gap,
             **({} if problem.faint is None else {"faint": problem.faint}),
             **({} if links.censored is None else {"censored": links.censored}),
             **_positions(links),
@@ -153,7 +145,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             initial_rmse_db=_rmse(problem, models.initial, counted),
             nuisance_only_rmse_db=_rmse(problem, nuisance_only, counted) if fitted else None,
             log_distance_rmse_db=_rmse(problem, models.log_distance, counted),
-            retrace_gap_db=largest_gap(gap_db, counted),
+            retrace_gap_db=largest_gap(gap, counted),
             laws=parameters.law_coefficients(trail.best),
             power_shares=diagnostics.power_shares,
         ),
@@ -167,7 +159,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *certainty.remarks,
-                *_not_judged(study, accuracy),
+                *_unjudged(study, accuracy),
             ),
         ),
         nuisance=_nuisance(problem, coefficients[0]),
@@ -175,14 +167,14 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         cost=Cost(
             rt_calls=trail.rt_calls,
             ledger_hits=trail.ledger_hits,
-            seconds=run.timing.search,
-            trace_seconds=run.timing.trace,
+            seconds=timing.search,
+            trace_seconds=timing.trace,
             uncertainty_replays=certainty.calls,
             uncertainty_seconds=certainty.seconds,
             cheap_replays=0 if cheap.model is None else cheap.model.calls,
             cheap_seconds=0.0 if cheap.model is None else cheap.model.seconds,
         ),
-        provenance=Provenance(setup.files, links.prepared | _faint_rows(problem), run.enclosed),
+        provenance=Provenance(setup.files, links.prepared | _faint(problem), enclosed),
         links=table,
         history=trail.history(),
         held_out=validation,
@@ -215,11 +207,13 @@ def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accura
         }
         others = {name: (model - objective.measured)[judged] for name, model in baselines.items()}
         judgement = compare(errors, others, links.rx[judged])
-    residual_db, basis = None, "too few links"
+        # No link has a residual in all models.
+        judgement = judgement if judgement.links else None
+    size, basis = None, "too few links"
     if len(errors) >= FEWEST_HELD_OUT:
-        residual_db, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
+        size, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
     elif problem.freedom >= 1:
-        residual_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
+        size = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
         basis = f"{objective.num_counted} calibration links"
 
     def rmse(model: NDArray[np.float64]) -> float | None:
@@ -231,7 +225,7 @@ def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accura
         nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
         log_distance_holdout_rmse_db=rmse(models.log_distance),
         judgement=judgement,
-        residual_db=residual_db,
+        residual_db=size,
         residual_basis=basis,
     )
 
@@ -250,34 +244,33 @@ def _on_blocks(validation: Validation, initial_db: float | None, fitted: bool) -
     )
 
 
-def _not_judged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark if no link was held out, although replay could hold blocks out at little cost."""
-    if accuracy.judgement is None and study.engine.name == "replay":
-        return (Remark(RemarkKind.NOT_JUDGED),)
-    return ()
+def _unjudged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
+    """A remark where no link judges the calibration, though replay could hold blocks out at little cost."""
+    unjudged = accuracy.judgement is None and study.engine.name == "replay"
+    return (Remark(RemarkKind.NOT_JUDGED),) if unjudged else ()
 
 
-def _faint_rows(problem: Problem) -> dict[str, int]:
-    """Number of links above the noise floor that are left out because the model predicts them near it."""
+def _faint(problem: Problem) -> dict[str, int]:
+    """Number of links above the noise floor that are left out, since the model expects them near it."""
     faint, censored = problem.faint, problem.setup.links.censored
     count = 0 if faint is None else int((faint if censored is None else faint & ~censored).sum())
     return {FAINT: count} if count else {}
 
 
 def _residual_field(problem: Problem, table: pd.DataFrame) -> ResidualField | None:
-    """The correlated part of the prediction model's residuals; None where they are uncorrelated."""
+    """The correlated part of the prediction model's residuals; None where they show none."""
     links, noise = problem.setup.links, problem.setup.study.noise
     if links.frequency is not None or noise.range_m == 0 or noise.kind == HEAVY:
         return None
-    rows, residuals = calibration_residuals(table)
-    correlation = shared_errors(residuals, np.hstack([links.tx, links.rx])[rows])
+    reached, errors = calibration_residuals(table)
+    correlation = shared_errors(errors, np.hstack([links.tx, links.rx])[reached])
     if correlation is None:
         return None
     return ResidualField(correlation.range_m, correlation.shared_db, correlation.own_db)
 
 
 def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
-    """Coefficients by term and group, and the groups whose offset no calibration link determines."""
+    """Coefficients by term and group; groups of the offset without a path are named."""
     objective = problem.objective
     by_term: dict[str, dict[str, float]] = {}
     without_path: list[str] = []
@@ -286,16 +279,16 @@ def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
         last = first + len(term.labels)
         determined = objective.determined[first:last]
         values = zip(term.labels, coefficients[first:last].tolist(), determined, strict=True)
-        by_term[term.name] = {label: value for label, value, is_determined in values if is_determined}
+        by_term[term.name] = {label: value for label, value, known in values if known}
         if term.name == OFFSET:
-            without_path += [label for label in term.labels if label not in by_term[term.name]]
+            without_path += [label for label, known in zip(term.labels, determined, strict=True) if not known]
         first = last
     centres = {term.name: term.centre for term in objective.nuisance.terms if term.centre}
     return Nuisance(by_term, centres, tuple(without_path))
 
 
 def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
-    """Positions of both ends of the links [m], their group and carrier [Hz], as columns."""
+    """Positions of the links' ends, their group and carrier, as columns."""
     ends = {
         f"{end}_{axis}": position[:, k]
         for end, position in (("tx", links.tx), ("rx", links.rx))
@@ -307,21 +300,21 @@ def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
 
 
 def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Columns in the measured quantity, path gain or received power; none where path loss was measured."""
+    """Path gain or received power, with the sign of the measurement; nothing where path loss was measured."""
     quantity, column = study.links.quantity, study.links.value
     if quantity == "path_loss" or column not in links.frame:
         return {}
-    # The reference is 0 dB for path gain, and the transmitted power for received power.
+    # Path gain is 0 dB minus path loss, received power the transmitted power minus path loss.
     reference = links.frame[column].to_numpy(float) + links.path_loss_db
     unit = "dbm" if quantity == "received_power" else "db"
     return {
-        f"{name}_{quantity}_{unit}": reference - table[f"{name}_db"].to_numpy()
-        for name in ("measured", "before", "after")
+        f"{when}_{quantity}_{unit}": reference - table[f"{when}_db"].to_numpy()
+        for when in ("measured", "before", "after")
     }
 
 
-def _replayed_paths(problem: Problem) -> Paths | None:
-    """The replayed paths, if they are in memory and uncompressed."""
+def _traced(problem: Problem) -> Paths | None:
+    """The paths that were replayed, where they are in memory uncompressed."""
     section = problem.setup.study.engine
-    uncompressed = isinstance(section, ReplaySection) and section.compress_db is None
-    return problem.engine.paths if uncompressed and isinstance(problem.engine, Replay) else None
+    whole = isinstance(section, ReplaySection) and section.compress_db is None
+    return problem.engine.paths if whole and isinstance(problem.engine, Replay) else None
