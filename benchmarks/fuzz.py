@@ -49,6 +49,7 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
     os.dup2(2, 1)  # what libraries print is no answer
     found = World.open(place)
     found.warm()
+    tempfile.tempdir = str(place)
     watch = Watch(str(place))
     sys.addaudithook(watch)
     print("ready", file=answers, flush=True)

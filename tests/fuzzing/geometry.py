@@ -8,12 +8,13 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 
 import numpy as np
 import trimesh
 
 from calibray.fields import path_loss
-from calibray.scenes import read_mesh
+from calibray.scenes import Mesh, read_mesh
 from calibray.study import Study
 from calibray.tracing.gain_table import read_gain_table
 from fuzzing import world
@@ -168,6 +169,54 @@ def _edit(rng: Random, root: ElementTree.Element) -> str:
             # What no XML can hold is another attack's.
             child.set(key, re.sub("[\0-\x08]", "?", value)[:2000])
             return f"{child.tag}.{key} = {value[:40]!r}"
+
+
+MOVES = ((10, -20, 0), (10_000, 0, 0), (0, 700_000, 300), (690_000, 5_330_000, 500))
+"""Offsets of a moved study [m]."""
+
+
+def moved(rng: Random, found: World, folder: Path) -> Case:
+    """The whole study moved, its meshes stored with any type of PLY: the right path loss comes out."""
+    study = found.copy(folder)
+    offset = [part + rng.choice((0, 1, 37)) for part in rng.choice(MOVES)]
+    for name in ("house.ply", "shed.ply"):
+        file = folder / "meshes" / name
+        file.write_bytes(_typed_ply(read_mesh(file, "ply"), offset, rng))
+    roof = (
+        np.loadtxt((folder / "meshes" / "roof.obj").read_text().splitlines()[:4], usecols=(1, 2, 3)) + offset
+    )
+    rows = [f"v {x} {y} {z}" for x, y, z in roof.tolist()]
+    (folder / "meshes" / "roof.obj").write_text("\n".join([*rows, "f 1 2 3", "f 1 3 4", ""]))
+    scene_file = folder / "scene.xml"
+    x, y, z = offset
+    move = f'<scale x="80" y="80"/><translate x="{x}" y="{y}" z="{z}"/>'
+    scene_file.write_text(scene_file.read_text().replace('<scale x="80" y="80"/>', move))
+
+    def act() -> list[float]:
+        setup = Study.load(study).opened()
+        links = SimpleNamespace(tx=setup.links.tx + offset, rx=setup.links.rx + offset)
+        difference = np.asarray(path_loss(setup.tracer.trace(links))) - found.right["path_loss"]
+        return np.round(difference, 3).tolist()
+
+    return Case("moved", str(offset), act, expected=[0.0] * len(found.right["path_loss"]), own=OWN)
+
+
+def _typed_ply(mesh: Mesh, offset: list[int], rng: Random) -> bytes:
+    """A moved mesh of whole coordinates as PLY, with a type that holds them."""
+    vertices = mesh.vertices + offset
+    largest = np.abs(vertices).max()
+    types = {"double": "f8", "int": "i4", "float": "f4", "short": "i2"}
+    fitting = [name for name, most in zip(types, (1e9, 2e9, 8000, 32767), strict=True) if largest <= most]
+    name, order = rng.choice(fitting), rng.choice("<>")
+    encoding = "binary_little_endian" if order == "<" else "binary_big_endian"
+    header = (
+        f"ply\nformat {encoding} 1.0\nelement vertex {len(vertices)}\n"
+        + "".join(f"property {name} {axis}\n" for axis in "xyz")
+        + f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", f"{order}i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    return header.encode() + vertices.astype(f"{order}{types[name]}").tobytes() + faces.tobytes()
 
 
 def mesh(rng: Random, found: World, folder: Path) -> Case:

@@ -16,6 +16,7 @@ SHARES = {
     inputs.table: 14,
     geometry.scene: 8,
     geometry.mesh: 8,
+    geometry.moved: 2,
     geometry.antenna: 7,
     stored.paths: 9,
     stored.cache: 3,

@@ -12,6 +12,8 @@ import calibray as cb
 from calibray.errors import InputError
 from calibray.scenes import Mesh, read_mesh, read_scene, read_triangles
 from calibray.scenes.meshes import ply_bytes
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
 from small_scenes import write_scene
 
 FLOOR = {"floor": [[(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.0, 0.0), (-9.0, 9.0, 0.0)]]}
@@ -27,6 +29,11 @@ end_header
 """
 CORNERS = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
 FACES = [[0, 1, 2], [0, 2, 3]]
+PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
 ENCODINGS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -36,6 +43,7 @@ def encode(
     faces: list[list[int]] = FACES,
     header: str = HEADER,
     stored: str = "f4",
+    index: str = "",
 ) -> bytes:
     """A PLY file, its faces with any number of corners."""
     head = header.format(encoding, len(corners), len(faces)).encode()
@@ -43,7 +51,11 @@ def encode(
         rows = [*corners.tolist(), *([len(face), *face] for face in faces)]
         return head + "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
     order = ENCODINGS[encoding]
-    packed = [bytes([len(face)]) + np.array(face, dtype=f"{order}i4").tobytes() for face in faces]
+    count, index = (index, index) if index else ("u1", "i4")
+    packed = [
+        np.array(len(face), f"{order}{count}").tobytes() + np.array(face, f"{order}{index}").tobytes()
+        for face in faces
+    ]
     return head + corners.astype(f"{order}{stored}").tobytes() + b"".join(packed)
 
 
@@ -118,14 +130,41 @@ def test_malformed_meshes_are_refused(
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(("stored", "code"), [("char", "i1"), ("int", "i4")])
-def test_integer_coordinates_are_refused(tmp_path: Path, encoding: str, stored: str, code: str) -> None:
-    """They are legal, but Sionna RT loses the reflections of such a mesh without a message."""
-    header = HEADER.replace("float", stored)
-    with pytest.raises(
-        InputError, match=r"stores x of its vertices as int\d+, which Sionna RT does not read"
-    ):
-        read(tmp_path, encode(encoding, CORNERS.astype(int), header=header, stored=code))
+def test_every_type_of_a_ply_file_is_read_and_reflects(tmp_path: Path, encoding: str) -> None:
+    """Sionna RT itself loses the reflections of a mesh with integer coordinates, which are legal."""
+    corners = np.array([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]])
+    files = {}
+    for vertex, code in PLY_TYPES.items():
+        header = HEADER.replace("float", vertex).replace(
+            "property", f"property {vertex} quality\nproperty", 1
+        )
+        with_quality = np.hstack([np.ones((4, 1), dtype=int), corners])
+        files[f"vertex-{vertex}"] = encode(encoding, with_quality, header=header, stored=code)
+    for index, code in PLY_TYPES.items():
+        if code[0] != "f":
+            header = HEADER.replace("uchar int", f"{index} {index}")
+            files[f"index-{index}"] = encode(encoding, corners, header=header, index=code)
+    tile = [[(0, 0, 0), (9, 0, 0), (9, 9, 0), (0, 9, 0)]]
+    scene = write_scene(tmp_path, {name: tile for name in files})
+    for name, content in files.items():
+        file = tmp_path / "meshes" / f"{name}.ply"
+        file.write_bytes(content)
+        np.testing.assert_array_equal(read_mesh(file, "ply").vertices, corners, name)
+    # The tracer compares bounds and area with what Mitsuba holds.
+    links = SimpleNamespace(tx=np.array([[1.0, 1, 3]]), rx=np.array([[5.0, 4, 2]]))
+    cb.trace(scene, links, frequency=2e9, max_depth=1, samples=1000)
+    # Alone in a scene, so that no other mesh reflects instead.
+    alone = write_scene(tmp_path / "alone", {"tile": tile})
+    (tmp_path / "alone" / "meshes" / "tile.ply").write_bytes(files["vertex-int"])
+    assert cb.trace(alone, links, frequency=2e9, max_depth=1, samples=1000).num_paths == 2
+
+
+def test_a_surface_that_mitsuba_holds_differently_is_refused(tmp_path: Path) -> None:
+    scene = read_scene(write_scene(tmp_path, FLOOR), 2e9)
+    larger = {"floor": [[(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (9.0, 9.1, 0.0), (-9.0, 9.1, 0.0)]]}
+    write_scene(tmp_path, larger)
+    with pytest.raises(InputError, match=r"holds another surface of material 'stone' .*325\.8 m.*324 m"):
+        Tracer(scene, 2e9, TraceSettings(), Antenna(), Antenna())
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -1,4 +1,4 @@
-"""The command line: one file per command, which parses arguments, calls the package and prints."""
+"""The command line: parse, call, print; one file a command."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import NoReturn
 __all__ = ["main"]
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
+"""Exit status after Ctrl-C, as shells have it: 128 and the number of the signal."""
 
 
 def main() -> None:
-    """Run the command line of this process and exit."""
+    """Run the command line of this process and end it."""
     try:
         from calibray.cli.app import app
 
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def _leave() -> NoReturn:
-    """Exit without Python's shutdown, in which interrupted compiled libraries can crash."""
+    """End at once: compiled libraries that were interrupted can crash while Python takes them down."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

@@ -1,7 +1,7 @@
-"""The commands, and how their failures are reported.
+"""The command line as a whole: its commands, and how their failures end.
 
-Data go to stdout, progress and messages to stderr. The exit status is 0 for success, 1 for a failure while running, 2
-for bad input and 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
+Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while running, 2 for
+bad input, 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
 """
 
 from __future__ import annotations
@@ -32,39 +32,40 @@ from calibray.errors import EngineError, InputError
 from calibray.support.interruption import ensure_interruption
 
 LONGEST: Final = 4096
-"""Most characters of an argument; paths on Linux are no longer."""
+"""The number of characters beyond which an argument is refused; Linux takes no longer path."""
 
 
 class Commands(TyperGroup):
-    """Commands that report expected failures by a message and an exit status, without a traceback."""
+    """A group of commands whose expected failures are one message and an exit status, not a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse overlong arguments, then parse.
+        """Part the command from what is its own.
 
         Args:
-            ctx: Context of the command.
+            ctx: What will be parsed.
             args: The command line.
 
         Returns:
-            The remaining arguments.
+            The arguments that are the command's.
         """
         for argument in args:
             if len(argument) > LONGEST:
-                ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
+                ctx.fail(f"an argument has {len(argument)} characters, must have at most {LONGEST}")
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
 
         Args:
-            ctx: Context of the command, with the parsed command line.
+            ctx: What was parsed from the command line.
 
         Returns:
-            The value that the command returns.
+            What the command returns.
 
         Raises:
-            typer.Exit: 2 on bad input; 1 when an engine failed or a file could not be read or written; 130 on Ctrl-C.
-            BrokenPipeError: The reader of stdout has closed it; Typer handles this.
+            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or
+                written, with 130 on Ctrl-C.
+            BrokenPipeError: Nobody reads on; what calls this knows how to end.
         """
         try:
             with ensure_interruption():
@@ -78,14 +79,13 @@ class Commands(TyperGroup):
         except BrokenPipeError:
             raise
         except OSError as error:
-            file = "" if error.filename is None else f"{error.filename}: "
+            place = "" if error.filename is None else f"{error.filename}: "
             typer.echo(
-                f"Error: {file}cannot be read or written ({error.strerror or error}); check permissions and disk space",
-                err=True,
+                f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True
             )
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            # The command itself reports what was kept. Report here an error that occurred during the interruption.
+            # What the command has to say of what was kept it said itself; what went wrong on the way is not to be lost.
             if isinstance(error.__cause__, (InputError, EngineError)):
                 typer.echo(f"Error: {error.__cause__}", err=True)
             typer.echo("Interrupted", err=True)
@@ -98,16 +98,16 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    # Plain help: Rich would double the time of --help.
+    # Help is plain text, which Rich would take as long to draw as all else takes.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands; a new one is a module with a function, listed below."""
+"""All commands; one more is a module with a function, named below."""
 
 
-def _print_version(requested: bool) -> None:
-    """Print the version and exit, if it was requested."""
-    if requested:
+def _print_version(wanted: bool) -> None:
+    """Print the version and end, if it was asked for."""
+    if wanted:
         from importlib import metadata
 
         typer.echo(f"calibray {metadata.version('calibray')}")
@@ -117,14 +117,13 @@ def _print_version(requested: bool) -> None:
 @app.callback()
 def calibray(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Calibrate the radio materials of a ray-traced scene with measured path loss."""
+    """Calibrate the radio materials of a ray-traced scene from measurements."""
 
 
-COMMANDS = (  # in the order of `--help`
+COMMANDS = (  # one after the other, as `--help` lists them
     doctor,
     demo,
     init,
@@ -142,6 +141,6 @@ COMMANDS = (  # in the order of `--help`
     cache,
 )
 for command in COMMANDS:
-    # Without a short help, Typer shortens the summary.
+    # Of a summary that is not given Typer lists the beginning only.
     app.command(short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
 app.add_typer(scene)

@@ -1,4 +1,4 @@
-"""`calibray demo`: run the experiment of the paper."""
+"""`calibray demo`: the paper's experiment."""
 
 from __future__ import annotations
 
@@ -12,22 +12,19 @@ from calibray.cli.console import Overwrite, log
 
 def demo(
     out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder for tables, figures, results and the report."
-        ),
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write figures and result into.")
     ] = Path("out/demo"),
     engine: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
+            help="replay (trace once), or retrace: run the ray tracer for every candidate, as the paper does.",
         ),
     ] = "replay",
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run the experiment of the paper in the demo district: tables, figures and a report."""
+    """Run the paper's experiment in the demo district, with space mapping and auto: tables, figures and a report."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:

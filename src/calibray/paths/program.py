@@ -54,7 +54,8 @@ class Paths:
         material: Index of its material [I].
         cos_incidence: Cosine of the angle of incidence [I].
         rotation: (cos, sin) of the rotation from the previous frame into the interaction's own [I, 2].
-        vertex: Points of interaction [I, 3], [m], in single precision, for drawing. No field depends on them.
+        vertex: Points of interaction [I, 3], [m], in single precision, or in double far from the origin, for drawing.
+            No field depends on them.
         diffuse: Further constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
         settings: How the paths were traced, for the record.
@@ -76,7 +77,7 @@ class Paths:
     material: NDArray[np.integer]
     cos_incidence: NDArray[np.float64]
     rotation: NDArray[np.float64]
-    vertex: NDArray[np.float32]
+    vertex: NDArray[np.float32] | NDArray[np.float64]
     diffuse: Diffuse = field(default_factory=Diffuse.empty)
     diffraction: Diffraction = field(default_factory=Diffraction.empty)
     settings: Mapping[str, object] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The links of a calibration as the report shows them: positions, groups and residuals."""
+"""The links of a calibration as the report shows them: where they stand, and what is left of their path loss."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.result.record import Record
 
-POSITION_COLUMNS = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
+ENDS = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Survey:
         table: The result's links.
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
-        group: Names of the groups [L]; None without groups.
+        group: Labels of the groups [L]; None without groups.
     """
 
     table: pd.DataFrame
@@ -32,7 +32,7 @@ class Survey:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """Distances between transmitter and receiver [L], [m]."""
+        """Straight distances [L], [m]."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
@@ -41,33 +41,34 @@ class Survey:
         return residual(self.table)
 
 
-def residual(table: pd.DataFrame) -> NDArray[np.float64]:
-    """Calibrated minus measured path loss.
+def residual(table: pd.DataFrame, column: str = "after_db") -> NDArray[np.float64]:
+    """A model minus what was measured.
 
     Args:
         table: A result's links.
+        column: The model's column.
 
     Returns:
-        Residuals [L], [dB]; NaN for links without a path.
+        Differences [L], [dB]; NaN where no path leads or nothing is known.
     """
-    difference = table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
+    difference = table[column].to_numpy(float) - table["measured_db"].to_numpy(float)
     return np.where(np.isfinite(difference), difference, np.nan)
 
 
 def survey(result: Record) -> Survey | None:
-    """Collect the positions of a calibration's links.
+    """Where the links of a calibration stand.
 
     Args:
-        result: The calibration. If its links have no positions, the study's measurements are read.
+        result: The calibration. Results of the version before do not tell; for them the study's links are read.
 
     Returns:
-        The links with positions; None if the measurements cannot be read or have changed.
+        The links with positions; None where they are not to be had any more.
     """
     table = result.links
-    if set(POSITION_COLUMNS) <= set(table.columns):
-        positions = table[list(POSITION_COLUMNS)].to_numpy(float)
+    if set(ENDS) <= set(table.columns):
+        ends = table[list(ENDS)].to_numpy(float)
         group = table["group"].astype(str).to_numpy(object) if "group" in table else None
-        return Survey(table, positions[:, :3], positions[:, 3:], group)
+        return Survey(table, ends[:, :3], ends[:, 3:], group)
     try:
         links = result.study.measurements()
     except InputError:

@@ -1,4 +1,4 @@
-"""Figures that show how far to trust a calibration: posterior, validation and diagnostics."""
+"""Figures of how far a calibration can be trusted: values that the links leave possible, validation, diagnostics."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from calibray.support.figure_style import (
 from calibray.support.messages import shortened
 from calibray.validation.validation import Validation
 
-PARAMETERS: Final = 12
-"""Most parameters that are shown, the least certain first."""
+SHOWN: Final = 12
+"""Parameters that are shown, those that the links tell least first."""
 
 BARS: Final = 36
-"""Bars of the histogram over a parameter's bounds."""
+"""Bars over the range of a parameter."""
 
 ROWS: Final = 14
-"""Most rows of the figure of power."""
+"""Rows of a figure of bars."""
 
 
-def trust_figures(result: Record) -> dict[str, Figure]:
-    """Draw the figures for which the calibration has data.
+def examined(result: Record) -> dict[str, Figure]:
+    """The figures that there is something to show in.
 
     Args:
         result: The calibration.
@@ -67,7 +67,7 @@ def trust_figures(result: Record) -> dict[str, Figure]:
 
 @styled()
 def possible_values(result: Record) -> Figure:
-    """Draw the posterior of every parameter over its bounds, with its 95 % interval.
+    """Draws of every parameter over its range, with the pieces of its interval.
 
     Args:
         result: The calibration, with draws of every parameter.
@@ -75,19 +75,19 @@ def possible_values(result: Record) -> Figure:
     Returns:
         The figure.
     """
-    names = sorted(result.parameters, key=lambda name: -_spread(result, name))[:PARAMETERS]
+    names = sorted(result.parameters, key=lambda name: -_share(result, name))[:SHOWN]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(10.0 if columns > 1 else 6.4, 0.5 + 1.9 * rows), dpi=150, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, name in zip(panels, names, strict=False):
-        _draw_posterior(axes, result, name)
+        _possible(axes, result, name)
     for axes in panels[len(names) :]:
         axes.set_axis_off()
     return figure
 
 
-def _draw_posterior(axes: Axes, result: Record, name: str) -> None:
+def _possible(axes: Axes, result: Record, name: str) -> None:
     section, interval = result.study.parameters[name], result.intervals.get(name)
     lower, upper = map(float, section.bounds)
     log = section.scale == "log"
@@ -107,17 +107,18 @@ def _draw_posterior(axes: Axes, result: Record, name: str) -> None:
         axes.set_title(interval.verdict, fontsize=9, color=FAINT, loc="right")
 
 
-def _spread(result: Record, name: str) -> float:
-    """Standard deviation of a parameter's draws, as a share of its range."""
+def _share(result: Record, name: str) -> float:
+    """Share of a parameter's range that its draws spread over."""
     section = result.study.parameters[name]
     scale = np.log if section.scale == "log" else np.asarray
-    bounds = np.array(section.bounds, dtype=float)
-    return float(np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(bounds)))
+    return float(
+        np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(np.array(section.bounds, dtype=float)))
+    )
 
 
 @styled()
 def held_out_errors(validation: Validation) -> Figure:
-    """Draw the distribution of absolute errors on held-out links, by model.
+    """Share of the links held out whose error is within so many dB, by model.
 
     Args:
         validation: The validation.
@@ -125,7 +126,7 @@ def held_out_errors(validation: Validation) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Absolute error of held-out links [dB]", "Share of links up to this error")
+    figure, axes = plain_figure("Error of a link held out [dB]", "Share of links within it")
     judged, reach = validation.block >= 0, 0.0
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
@@ -140,7 +141,7 @@ def held_out_errors(validation: Validation) -> Figure:
 
 @styled()
 def held_out_blocks(validation: Validation) -> Figure:
-    """Draw the RMSE of every model on every block.
+    """RMSE of every model on every block.
 
     Args:
         validation: The validation.
@@ -149,7 +150,7 @@ def held_out_blocks(validation: Validation) -> Figure:
         The figure.
     """
     count = len(validation.labels)
-    figure, axes = plain_figure("Block", "Held-out RMSE [dB]")
+    figure, axes = plain_figure("Block", "RMSE held out [dB]")
     for name, color in _colors(validation):
         values = [_rmse(validation.errors[name][validation.block == number]) for number in range(count)]
         best = name == validation.best
@@ -163,7 +164,7 @@ def held_out_blocks(validation: Validation) -> Figure:
 
 
 def _colors(validation: Validation) -> list[tuple[str, str]]:
-    """Models with their colours; calibrated models have the main colours of the page."""
+    """Models with the colour of each; the calibrated ones have those of the page."""
     calibrated = iter((BLUE, ORANGE, GREEN))
     others = iter((FAINT, *PALETTE, *PALETTE))
     return [
@@ -178,7 +179,7 @@ def _rmse(error: NDArray[np.float64]) -> float:
 
 @styled()
 def power(table: pd.DataFrame) -> Figure:
-    """Draw power by material and type of interaction.
+    """Share of the links' power by what its paths meet.
 
     Args:
         table: The diagnostics' table "power".
@@ -188,7 +189,7 @@ def power(table: pd.DataFrame) -> Figure:
     """
     shown = table.head(ROWS)
     names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
-    figure, axes = plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))
+    figure, axes = plain_figure("Share of a link's power, on the mean [%]", "", height=1.2 + 0.3 * len(shown))
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x", color=LINE)
     axes.barh(range(len(shown)), 100 * shown["share"], color=BLUE, height=0.6)
@@ -199,7 +200,7 @@ def power(table: pd.DataFrame) -> Figure:
 
 @styled()
 def neighbours(table: pd.DataFrame) -> Figure:
-    """Draw the semivariance of residuals over the distance between links.
+    """Semivariance of residuals over the distance between links.
 
     Args:
         table: The diagnostics' table "neighbours".
@@ -215,7 +216,7 @@ def neighbours(table: pd.DataFrame) -> Figure:
 
 @styled()
 def leverage(table: pd.DataFrame) -> Figure:
-    """Draw the residual of every link over its leverage.
+    """Residual of every link over its leverage.
 
     Args:
         table: The diagnostics' table "leverage".
@@ -233,7 +234,7 @@ def leverage(table: pd.DataFrame) -> Figure:
 
 @styled()
 def by_depth(table: pd.DataFrame) -> Figure:
-    """Draw the mean residual by the number of interactions of the strongest path, with two standard errors.
+    """Mean residual by the number of interactions of the strongest path, with its standard error.
 
     Args:
         table: The diagnostics' table "depth".

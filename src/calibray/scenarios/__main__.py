@@ -1,4 +1,4 @@
-"""Generate the demo district: `python -m calibray.scenarios FOLDER`."""
+"""Write the demo district anew: `python -m calibray.scenarios FOLDER`."""
 
 import sys
 from pathlib import Path

@@ -7,21 +7,32 @@ makes scenes from maps and floor plans. Both import from here, and not from each
 from calibray.scenes.buildings import building_numbers
 from calibray.scenes.export import export_scene
 from calibray.scenes.meshes import Mesh, MeshObject, join_meshes, ply_bytes, read_mesh
-from calibray.scenes.scene import Scene, SceneObject, check_material_name, read_scene
+from calibray.scenes.scene import (
+    Scene,
+    SceneObject,
+    check_material_name,
+    has_copied_meshes,
+    read_scene,
+    xml_with_copied_meshes,
+)
 from calibray.scenes.scene_file import find_scene, read_frame, write_scene
+from calibray.scenes.shapes import COARSE, SurfaceSize
 from calibray.scenes.triangles import Triangles, ground_heights, read_meshes, read_triangles
 
 __all__ = [
+    "COARSE",
     "Mesh",
     "MeshObject",
     "Scene",
     "SceneObject",
+    "SurfaceSize",
     "Triangles",
     "building_numbers",
     "check_material_name",
     "export_scene",
     "find_scene",
     "ground_heights",
+    "has_copied_meshes",
     "join_meshes",
     "ply_bytes",
     "read_frame",
@@ -30,4 +41,5 @@ __all__ = [
     "read_scene",
     "read_triangles",
     "write_scene",
+    "xml_with_copied_meshes",
 ]

@@ -4,8 +4,8 @@ Mitsuba and Sionna RT find wedges between faces that share vertices within one m
 wedge and hence no diffraction.
 
 Mitsuba trusts mesh files. A vertex index out of range ends the process or removes a reflection without a message;
-integer coordinates remove the reflections of the whole mesh; vertices that are not numbers are never hit. `read_mesh`
-refuses such files before Mitsuba sees them.
+vertices that are not numbers are never hit. `read_mesh` refuses such files before Mitsuba sees them. Integer
+coordinates, which are legal, remove the reflections of the whole mesh: the tracer gets a copy in single precision.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.support.messages import first_line, shortened
 
+LARGEST_COORDINATE: Final = 1e9
+"""Largest coordinate of a vertex [m], as of a position in a path file."""
+
 _HEADER: Final = re.compile(
     rb"ply\r?\n(?:(?:comment|obj_info)\b.*\n)*"
     rb"format (?:ascii|binary_little_endian|binary_big_endian) 1\.0\r?\n"
@@ -41,10 +44,14 @@ class Mesh:
     Attributes:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
+        step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
+        misread: Whether Mitsuba would misread it, because its file stores coordinates as integers.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
+    step: float = 0.0
+    misread: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,7 @@ def read_mesh(file: Path, kind: str) -> Mesh:
 
     Raises:
         InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face has a corner that
-            is not a vertex; or, in a PLY file, a face is not a triangle or coordinates are stored as integers.
+            is not a vertex; or, in a PLY file, a face is not a triangle.
     """
     try:
         content = file.read_bytes()
@@ -130,7 +137,7 @@ def read_mesh(file: Path, kind: str) -> Mesh:
         fault = str(error)
     except Exception as error:  # trimesh raises whatever its parser runs into
         fault = f"cannot be read as PLY ({first_line(error)})"
-    raise InputError(f"mesh {file}: {fault}; export it again, as triangles with floating-point coordinates")
+    raise InputError(f"mesh {file}: {fault}; export it again, as triangles")
 
 
 def _read_ply(content: bytes) -> Mesh:
@@ -150,10 +157,7 @@ def _read_ply(content: bytes) -> Mesh:
     vertex, face = (elements.get(name, {"length": 0}) for name in ("vertex", "face"))
     if not vertex["length"] or not face["length"]:
         raise InputError("has no vertices or no faces")
-    for axis in "xyz":
-        stored = np.dtype(vertex["properties"][axis])
-        if stored.kind != "f":
-            raise InputError(f"stores {axis} of its vertices as {stored.name}, which Sionna RT does not read")
+    stored = [np.dtype(vertex["properties"][axis]) for axis in "xyz"]
     name = next((name for name in _INDEX_PROPERTIES if name in face["properties"]), None)
     if name is None:
         raise InputError("its faces have no list vertex_indices")
@@ -170,15 +174,27 @@ def _read_ply(content: bytes) -> Mesh:
     )
     if len(vertices) != vertex["length"] or corners.shape != (face["length"], 3):
         raise InputError("is cut short, or has a face with other than three corners")
-    if (wrong := ~np.isfinite(vertices)).any():
-        row, axis = np.argwhere(wrong)[0]
-        raise InputError(f"{'xyz'[axis]} of vertex {row} is {vertices[row, axis]}, must be finite")
+    _check_range(vertices)
     if (wrong := (corners < 0) | (corners >= len(vertices)) | (corners != np.floor(corners))).any():
         row, corner = np.argwhere(wrong)[0]
         raise InputError(
             f"face {row} names vertex {corners[row, corner]:g}, must be 0 to {len(vertices) - 1}"
         )
-    return Mesh(vertices, corners.astype(np.int64))
+    misread = any(kind.kind != "f" for kind in stored)
+    # Only single precision is coarse enough to matter.
+    is_single = any(kind == np.dtype(np.float32).newbyteorder(kind.byteorder) for kind in stored)
+    step = float(np.spacing(np.float32(np.abs(vertices).max()))) if is_single else 0.0
+    return Mesh(vertices, corners.astype(np.int64), step, misread)
+
+
+def _check_range(vertices: NDArray[np.float64]) -> None:
+    """Refuse vertices that are not finite, or so far away that areas overflow in single precision."""
+    if (wrong := ~(np.abs(vertices) <= LARGEST_COORDINATE)).any():
+        row, axis = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{'xyz'[axis]} of vertex {row} is {vertices[row, axis]:g}, must be finite and at most "
+            f"{LARGEST_COORDINATE:g} m"
+        )
 
 
 def _check_text_faces(text: str, elements: dict[str, dict[str, Any]]) -> None:
@@ -221,7 +237,9 @@ def _read_obj(content: bytes) -> Mesh:
             faces += [(first, second, third) for second, third in pairwise(rest)]
     if not faces:
         raise InputError("has no faces")
-    return Mesh(np.array([positions[index] for index, _ in vertices]), np.array(faces, dtype=np.int64))
+    mesh = Mesh(np.array([positions[index] for index, _ in vertices]), np.array(faces, dtype=np.int64))
+    _check_range(mesh.vertices)
+    return mesh
 
 
 def _obj_index(number: float, count: int) -> int | None:

@@ -15,6 +15,9 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calibray.errors import InputError
 from calibray.materials import (
     BOUNDS,
@@ -26,7 +29,8 @@ from calibray.materials import (
     itu_material,
 )
 from calibray.parameters.laws import frequency_independent_law
-from calibray.scenes.scene_file import check_files, parse, scene_path, shape_mesh
+from calibray.scenes.scene_file import check_files, parse, scene_path
+from calibray.scenes.shapes import SurfaceSize, local_origin, read_surface, write_local_shape
 from calibray.support.messages import did_you_mean
 
 DEFAULT_THICKNESS: Final = 0.1
@@ -66,6 +70,7 @@ class Scene:
         objects: The meshes, in the file's order.
         xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
         laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, else constant.
+        sizes: Size of every object; None for a mesh that only Mitsuba reads.
     """
 
     source: str
@@ -74,6 +79,12 @@ class Scene:
     objects: tuple[SceneObject, ...]
     xml: str
     laws: dict[str, ItuLaw] = field(default_factory=dict)
+    sizes: tuple[SurfaceSize | None, ...] = ()
+
+    @property
+    def local_origin(self) -> NDArray[np.float64]:
+        """Origin of the frame that the scene is traced in [3], [m]; zero unless the scene lies far from its origin."""
+        return local_origin(self.sizes)
 
 
 def read_scene(
@@ -112,8 +123,10 @@ def read_scene(
     laws: dict[str, ItuLaw] = {}
     index: dict[str, int] = {}
     originals: dict[str, str] = {}  # material in the file, by the material that the object gets
+    sizes: list[SurfaceSize | None] = []
     for shape in root.findall("shape"):
-        shape_mesh(shape, path)
+        surface = read_surface(shape, path)
+        sizes.append(None if surface is None else SurfaceSize.of(surface))
         object_name = (shape.get("id") or "").removeprefix("mesh-")
         original = _file_material_name(shape, definitions, path)
         name = _split_name(object_name, split, definitions) or original
@@ -145,7 +158,33 @@ def read_scene(
     for number, material in enumerate(materials.values()):
         root.insert(number, material_element(f"{TRACED}{number}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
-    return Scene(str(source), path, materials, tuple(objects), xml, laws)
+    return Scene(str(source), path, materials, tuple(objects), xml, laws, tuple(sizes))
+
+
+def has_copied_meshes(scene: Scene) -> bool:
+    """Whether the tracer reads copies of meshes: the scene is traced in a local frame, or a shape would be misread."""
+    return bool(scene.local_origin.any()) or any(size is not None and size.misread for size in scene.sizes)
+
+
+def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
+    """Make the XML that the tracer loads instead of `Scene.xml`, with copies of the meshes in the local frame.
+
+    Args:
+        scene: The scene.
+        folder: Folder for the copies.
+
+    Returns:
+        The scene in its local frame.
+
+    Raises:
+        InputError: A mesh cannot be copied.
+    """
+    origin = scene.local_origin
+    root = ElementTree.fromstring(scene.xml)
+    for number, (shape, size) in enumerate(zip(root.findall("shape"), scene.sizes, strict=True)):
+        if origin.any() or (size is not None and size.misread):
+            write_local_shape(shape, scene.path, origin, folder / f"{number}.ply")
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def check_material_name(name: str, materials: Mapping[str, object], location: str) -> None:

@@ -1,4 +1,4 @@
-"""Short forms of records for the Python prompt and notebooks, and of names and frequencies in sentences."""
+"""What a record shows of itself where Python or a notebook prints it: what matters, on one screen."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from calibray.tables import text as plain
 from calibray.tables.table import Table
 
 ROWS: Final = 10
-"""Most rows of a table; the rest is only counted."""
+"""Rows of a table before the rest is only counted."""
 
 CHARACTERS: Final = 60
-"""Most characters of a cell or a name; longer ones are cut."""
+"""Characters of a cell or a name before it is cut short."""
 
 SENTENCE: Final = 200
-"""Most characters of a sentence; longer ones are cut."""
+"""Characters of a sentence before it is cut short."""
 
 
 def text(*parts: Table | str) -> str:
-    """Plain text for `__repr__`.
+    """What `__repr__` answers.
 
     Args:
         parts: Tables and sentences, from top to bottom.
 
     Returns:
-        Text with long tables and cells cut, and control characters escaped.
+        Plain text: long tables and cells cut short, characters that steer a terminal written out.
     """
     return plain.render(*_fitted(parts))
 
 
 def html(*parts: Table | str) -> str:
-    """HTML for `_repr_html_`.
+    """What `_repr_html_` answers.
 
     Args:
         parts: Tables and sentences, from top to bottom.
 
     Returns:
-        A fragment of HTML with long tables and cells cut, and all text escaped.
+        A fragment of HTML, cut short likewise, every text escaped.
     """
     return markup.render(*_fitted(parts))
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """List names, the first ones if there are many.
+    """Names, one by one while they are few.
 
     Args:
         names: The names.
-        count: Most names that are listed.
+        count: How many are named.
 
     Returns:
-        The names with commas between them.
+        Them with commas between.
 
     Example:
         >>> named(["east", "west"])
@@ -60,13 +60,13 @@ def named(names: Iterable[str], count: int = 4) -> str:
         >>> named(f"mast {k}" for k in range(500))
         'mast 0, mast 1, mast 2, mast 3 and 496 more'
     """
-    short = [_short(name, CHARACTERS) for name in names]
-    more = f" and {len(short) - count:,} more" if len(short) > count else ""
-    return ", ".join(short[:count]) + more
+    known = [_short(name, CHARACTERS) for name in names]
+    more = f" and {len(known) - count:,} more" if len(known) > count else ""
+    return ", ".join(known[:count]) + more
 
 
 def hertz(frequency: float) -> str:
-    """Format a frequency in GHz or MHz.
+    """A frequency in GHz or MHz.
 
     Args:
         frequency: The frequency [Hz].
@@ -86,20 +86,17 @@ def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
         if isinstance(part, str):
             yield _short(part, SENTENCE)
         else:
-            table = part.head(ROWS)
+            shown = part.head(ROWS)
             yield replace(
-                table,
+                shown,
                 columns=tuple(
-                    replace(column, name=_short(column.name, CHARACTERS)) for column in table.columns
+                    replace(column, name=_short(column.name, CHARACTERS)) for column in shown.columns
                 ),
-                rows=tuple(tuple(_short(cell, CHARACTERS) for cell in row) for row in table.rows),
+                rows=tuple(tuple(_short(cell, CHARACTERS) for cell in row) for row in shown.rows),
             )
 
 
-def _short(text: str, length: int) -> str:
-    """Text on one line of limited length, with line breaks and control characters escaped."""
-    cut = text if len(text) <= length else f"{text[: length - 3]}..."
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode()
-        for character in cut
-    )
+def _short(words: str, length: int) -> str:
+    """Words on one line of limited length, line breaks and escape characters written out."""
+    cut = words if len(words) <= length else f"{words[: length - 3]}..."
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in cut)

@@ -1,4 +1,4 @@
-"""Tables as data, independent of their layout."""
+"""Tables as data: what is said, apart from how it is laid out."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: Meaning of its cells; empty for the column that names the rows.
-        unit: Unit of all its cells; empty if they have none or different ones.
-        align: "left" for text, "right" for numbers.
+        name: What its cells are; empty where rows name themselves.
+        unit: Unit of all its cells; empty if they have none, or each its own.
+        align: Where cells stand: words "left", numbers "right".
 
     Example:
         >>> Column("time", "s").heading
@@ -26,7 +26,7 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """The name with the unit in brackets."""
+        """Its name with its unit in brackets."""
         return " ".join(part for part in (self.name, self.unit and f"[{self.unit}]") if part)
 
 
@@ -34,7 +34,7 @@ def numbers(name: str = "", unit: str = "") -> Column:
     """A column of numbers, aligned to the right.
 
     Args:
-        name: Meaning of the numbers.
+        name: What they are.
         unit: Their unit.
 
     Returns:
@@ -45,12 +45,12 @@ def numbers(name: str = "", unit: str = "") -> Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with cells of text.
+    """A table whose cells are text already.
 
     Attributes:
-        title: Its title; may be empty.
+        title: What it shows; empty where its columns say that.
         columns: Its columns.
-        rows: The cells of every row, one per column.
+        rows: The cells of every row, one for each column.
 
     Raises:
         ValueError: A row has more or fewer cells than there are columns.
@@ -69,27 +69,27 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"table {self.title!r}: a row has {len(row)} cells, must be {len(self.columns)}: {row}"
+                    f"table {self.title!r}: a row of {len(row)} cells, must be {len(self.columns)}: {row}"
                 )
 
     @property
     def titled(self) -> bool:
-        """Whether the title is above the table; otherwise it is the heading of the first column."""
+        """Whether the title stands above; else it stands over the first column, where that has no heading."""
         return bool(self.title) and bool(self.columns[0].heading)
 
     @property
     def headed(self) -> bool:
-        """Whether the table has a row of headings."""
+        """Whether anything stands over the columns."""
         return bool(self.title) or any(column.heading for column in self.columns)
 
     @property
     def headings(self) -> tuple[str, ...]:
-        """The heading of each column."""
+        """What stands over each column."""
         first = self.columns[0].heading or self.title
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first rows, and a last one with the number of rows that are left out.
+        """The first rows, and a last one that tells how many are left out.
 
         Args:
             count: Rows to keep, at least 1.

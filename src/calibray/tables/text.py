@@ -14,17 +14,17 @@ from rich.text import Text
 from calibray.tables.table import Table
 
 LISTED: Final = 12
-"""Most rows of a file that are listed; the rest is only counted."""
+"""Rows of a file that are named one by one before the rest is only counted."""
 
 WIDEST: Final = 100_000
-"""Characters per line: large, so that no cell is cut; output also goes to files and pipes."""
+"""Characters in a line: output is for files and pipes as much as for a screen, so no cell is ever cut short."""
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as plain text, with an empty line between them.
+    """Tables and sentences as plain text, an empty line between them.
 
     Args:
-        parts: Tables and sentences, from top to bottom; empty strings are left out.
+        parts: What to show, from top to bottom; an empty string is left out.
 
     Returns:
         Lines of text, without a line break at the end.
@@ -42,13 +42,13 @@ def render(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List rows of a file, the first ones if there are many.
+    """Rows of a file, named one by one while they are few.
 
     Args:
-        rows: Numbers of the rows.
+        rows: Lines of the file.
 
     Returns:
-        The rows as text; empty without rows.
+        Them as words, empty if there is none.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -58,19 +58,19 @@ def rows_text(rows: Sequence[int]) -> str:
     """
     if not rows:
         return ""
-    first = ", ".join(map(str, rows[:LISTED]))
+    named = ", ".join(map(str, rows[:LISTED]))
     more = f" and {len(rows) - LISTED} more" if len(rows) > LISTED else ""
-    return f"row{'s' if len(rows) > 1 else ''} {first}{more}"
+    return f"row{'s' if len(rows) > 1 else ''} {named}{more}"
 
 
 def decibels(value: float | None) -> str:
-    """Format a value in decibels for tables.
+    """A value in decibels as tables show it.
 
     Args:
-        value: The value [dB]; None if unknown.
+        value: The value [dB], or None if there is none.
 
     Returns:
-        Two decimals, or a dash if unknown.
+        Two decimals, or a dash.
     """
     return "-" if value is None else f"{value:.2f}"
 

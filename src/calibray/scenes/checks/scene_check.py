@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from calibray.scenes.meshes import MeshObject
 from calibray.scenes.scene import ITU_NAMES
 from calibray.scenes.scene_file import find_scene
+from calibray.scenes.shapes import COARSE, TOO_COARSE
 from calibray.scenes.triangles import read_meshes
 from calibray.support.progress import Progress
 
@@ -111,14 +112,19 @@ def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCh
     """
     _, root = find_scene(source)
     checked: list[MeshFaults] = []
+    coarse: list[Finding] = []
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for item in read_meshes(source):
         checked.append(count_faults(item))
+        if item.mesh.step > COARSE:
+            problem = f"its file stores coordinates in steps of {item.mesh.step:g} m, because it is far from the origin"
+            severity: Severity = "error" if item.mesh.step > TOO_COARSE else "warning"
+            coarse.append(Finding(severity, item.name, problem, "export it with coordinates of type double"))
         low = np.minimum(low, item.mesh.vertices.min(axis=0))
         high = np.maximum(high, item.mesh.vertices.max(axis=0))
         if progress is not None:
             progress("examining", len(checked), len(root.findall("shape")))
-    findings = [*_material_findings(root, checked), *_scale_findings(low, high)]
+    findings = [*_material_findings(root, checked), *_scale_findings(low, high), *coarse]
     for item in checked:
         findings += _mesh_findings(item)
     order = ("error", "warning", "note")
@@ -186,7 +192,7 @@ def _material_findings(root: ElementTree.Element, objects: Sequence[MeshFaults])
 def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iterator[Finding]:
     """Faults of unit and origin, from the corners of the scene's bounds [3]."""
     extent = high - low
-    width, centre = float(extent[:2].max()), float(np.abs((low + high) / 2)[:2].max())
+    width = float(extent[:2].max())
     size = f"{extent[0]:.4g} x {extent[1]:.4g} x {extent[2]:.4g}"
     if width < 1 and np.abs([*low[:2], *high[:2]]).max() <= 180:
         problem = f"the scene is {size} large, as if in degrees of longitude and latitude"
@@ -195,9 +201,6 @@ def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iter
     if width > LARGEST:
         problem = f"the scene is {size} m large, as if in millimetres"
         yield Finding("error", "", problem, "scale it by 0.001 to metres")
-    elif centre > 100 * max(width, 1000.0):
-        problem = f"the scene lies {centre:.0f} m from its origin, where single precision is coarse"
-        yield Finding("error", "", problem, "move the origin into the scene (calibray scene does)")
     if 0 < extent[2] < 0.005 * width and extent[2] < 1:
         problem = f"the scene is {size} m large, flat as a sheet"
         yield Finding("note", "", problem, "check that heights were exported")

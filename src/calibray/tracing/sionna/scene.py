@@ -5,43 +5,131 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
+from numpy.typing import NDArray
 from sionna.rt.antenna_pattern import PolarizedAntennaPattern, antenna_pattern_registry
 from sionna.rt.radio_materials import scattering_pattern_registry
 from sionna.rt.scene import load_scene_from_string
 
 from calibray.errors import InputError
 from calibray.materials import Material
-from calibray.scenes import Scene
+from calibray.scenes import COARSE, Mesh, Scene, SurfaceSize, has_copied_meshes, xml_with_copied_meshes
 from calibray.tracing.gain_table import GainTable, read_gain_table
 from calibray.tracing.settings import Antenna
 from calibray.tracing.sionna.arrays import aligned
 
+_LOG: Final = logging.getLogger(__name__)
+
 
 def load_scene(scene: Scene) -> rt.Scene:
-    """Load a scene into Sionna RT; its mesh files are found relative to the scene file.
+    """Load a scene into Sionna RT, in its local frame; its mesh files are found relative to the scene file.
 
     Raises:
-        InputError: Sionna cannot load it.
+        InputError: Sionna cannot load it, or holds another surface than its files.
     """
+    if has_copied_meshes(scene):
+        with _temporary_folder(scene.path) as folder:
+            loaded = _load(xml_with_copied_meshes(scene, Path(folder)), scene.path)
+    else:
+        loaded = _load(scene.xml, scene.path)
+    _check_surfaces(loaded.mi_scene, scene)
+    step = max((size.step for size in scene.sizes if size is not None), default=0.0)
+    if step > COARSE:
+        _LOG.warning(
+            "%s stores coordinates in steps of %g m, because it is far from the origin: path loss may change by "
+            "hundredths of a dB; export meshes with coordinates of type double", scene.path, step,
+        )  # fmt: skip
+    return loaded
+
+
+def _temporary_folder(path: Path) -> TemporaryDirectory[str]:
+    try:
+        return TemporaryDirectory(prefix="calibray-")
+    except OSError as error:
+        raise InputError(
+            f"{path}: its meshes must be copied for the tracer, but there is no folder for temporary files "
+            f"({error.strerror}); set TMPDIR to a writable folder"
+        ) from None
+
+
+def _load(xml: str, path: Path) -> rt.Scene:
     resolver = mi.file_resolver()
     try:
         search = mi.FileResolver(resolver)
-        search.append(str(scene.path.parent.resolve()))
+        search.append(str(path.parent.resolve()))
         mi.set_file_resolver(search)
-        return load_scene_from_string(scene.xml)
+        return load_scene_from_string(xml)
     except (RuntimeError, ValueError, TypeError) as error:
-        raise InputError(
-            f"{scene.path}: Sionna RT cannot load the scene: {' '.join(str(error).split())}"
-        ) from None
+        raise InputError(f"{path}: Sionna RT cannot load the scene: {' '.join(str(error).split())}") from None
     finally:
         mi.set_file_resolver(resolver)
+
+
+def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
+    """Refuse a scene whose bounds or areas in Mitsuba's memory differ from those of its files.
+
+    Mitsuba reads mesh files itself; a type or layout that it misreads would lose reflections without a message. It
+    merges the objects of a material into one mesh, so the comparison is by material.
+
+    Raises:
+        InputError: A surface differs.
+    """
+    held: dict[int, list[SurfaceSize]] = {}
+    for shape in mitsuba_scene.shapes():
+        held.setdefault(int(shape.bsdf().name.split("-")[-1]), []).append(_size(shape))
+    for number, material in enumerate(scene.materials):
+        of_material = [
+            size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == material
+        ]
+        stored = [size for size in of_material if size is not None]
+        if len(stored) < len(of_material):
+            continue  # a `serialized` mesh, whose file only Mitsuba reads
+        traced = held.get(number, [])
+        if not traced or not _agree(traced, stored, scene.local_origin):
+            raise InputError(
+                f"{scene.path}: Mitsuba holds another surface of material {material!r} than the mesh files "
+                f"({sum(size.area for size in traced):.6g} m^2 instead of "
+                f"{sum(size.area for size in stored):.6g} m^2); export the meshes again, as binary PLY with "
+                "coordinates of type float"
+            )
+
+
+def _size(shape: Any) -> SurfaceSize:
+    """Measure one of Mitsuba's shapes."""
+    values = mi.traverse(shape)
+    if "vertex_positions" not in values:
+        # A rectangle: its shape answers in single precision.
+        bounds, area = shape.bbox(), float(np.array(shape.surface_area()).item())
+        return SurfaceSize(tuple(np.array(bounds.min)), tuple(np.array(bounds.max)), area, 0.0)
+    vertex = np.array(values["vertex_positions"], dtype=float).reshape(-1, 3)
+    return SurfaceSize.of(Mesh(vertex, np.array(values["faces"], dtype=np.int64).reshape(-1, 3)))
+
+
+def _agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
+    """Whether a surface in the local frame is, within single precision, that of objects in the scene frame."""
+    low, high = np.min([size.low for size in stored], axis=0), np.max([size.high for size in stored], axis=0)
+    bounds = np.array([low, high]) - origin
+    # A vertex is rounded when it is stored and once more when it is transformed.
+    rounding = 4 * float(np.spacing(np.float32(np.abs(bounds).max())))
+    area = sum(size.area for size in stored)
+    area_rounding = 1e-5 * area + rounding * sum(size.sides for size in stored)
+    traced_bounds = [
+        np.min([size.low for size in traced], axis=0),
+        np.max([size.high for size in traced], axis=0),
+    ]
+    return bool(
+        np.abs(traced_bounds - bounds).max() <= rounding
+        and abs(sum(size.area for size in traced) - area) <= area_rounding
+    )
 
 
 def shape_ids(mitsuba_scene: Any) -> dict[int, Any]:

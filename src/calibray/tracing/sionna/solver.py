@@ -110,6 +110,8 @@ class Solver:
         self.tx_antenna, self.rx_antenna = tx_antenna, rx_antenna
         self._patterns = AntennaPattern.of(tx_antenna), AntennaPattern.of(rx_antenna)
         self._tx_functions, self._rx_functions = antenna_patterns(tx_antenna), antenna_patterns(rx_antenna)
+        # Everything below is in this local frame (`Scene.local_origin`).
+        self.origin = scene.local_origin
         self._scene = load_scene(scene)
         self._scene.frequency = self.frequency
         # The names of Sionna's materials end in the number of the material (`Scene.xml`).
@@ -246,7 +248,7 @@ class Solver:
         rx: NDArray[np.float64],
         materials: Mapping[str, Material],
     ) -> Paths:
-        """Compile the paths of one buffer; `tx` and `rx` are the ends of every link [L, 3], [m]."""
+        """Compile the paths of one buffer; `tx` and `rx` are the ends of every link, local [L, 3], [m]."""
         return compile_paths(
             self._chains(traced, tx, rx),
             traced.link,

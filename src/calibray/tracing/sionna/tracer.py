@@ -72,9 +72,12 @@ class Trace:
 
     def paths(self) -> Paths:
         """Compile the paths, ordered by link."""
-        paths = concatenate(
-            [self.solver.compile(part, self.tx, self.rx, self.materials) for part in self.buffers]
-        )
+        origin = self.solver.origin
+        tx, rx = self.tx - origin, self.rx - origin
+        paths = concatenate([self.solver.compile(part, tx, rx, self.materials) for part in self.buffers])
+        if origin.any():
+            # In double precision, because single precision would round vertices by up to half a metre.
+            paths = replace(paths, tx_position=self.tx, rx_position=self.rx, vertex=paths.vertex + origin)
         return replace(paths, settings={**paths.settings, **self.record})
 
     def link(self) -> NDArray[np.integer]:
@@ -152,10 +155,10 @@ class Tracer:
         return other
 
     def plan(self, links: Links) -> TracePlan:
-        """Plan the launches of a trace; see `calibray.tracing.Tracer.plan`."""
+        """Plan the launches of a trace in the local frame; see `calibray.tracing.Tracer.plan`."""
         tx, rx = link_positions(links)
         sources = rx if starts_at_receivers(tx, rx, self.settings) else tx
-        return plan_trace(sources, self.settings, LANES, BUFFER)
+        return plan_trace(sources - self.solver.origin, self.settings, LANES, BUFFER)
 
     @unwrap_interruption()
     def trace(
@@ -177,7 +180,7 @@ class Tracer:
         """Find the paths of every link and leave them in Sionna's buffers; arguments as for `trace`."""
         tx, rx = link_positions(links)
         backwards = starts_at_receivers(tx, rx, self.settings)
-        targets = tx if backwards else rx
+        targets = (tx if backwards else rx) - self.solver.origin
         constants = self.solver.set_materials(materials or {})
         plan = self.plan(links)
         max_paths = paths_that_fit(available_memory(), self.settings.max_depth)
@@ -240,7 +243,8 @@ class Tracer:
         directions = np.stack(
             [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         ).reshape(3, -1)
-        origin = np.repeat(np.asarray(points, dtype=float), directions.shape[1], axis=0)
+        local = np.asarray(points, dtype=float) - self.solver.origin
+        origin = np.repeat(local, directions.shape[1], axis=0)
         ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*np.tile(directions, len(points))))
         odd, active = np.zeros(len(origin), dtype=bool), np.ones(len(origin), dtype=bool)
         for _ in range(MAX_CROSSINGS):
