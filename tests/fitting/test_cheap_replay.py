@@ -1,4 +1,4 @@
-"""The replay of a study's own scene as the cheap model of an engine that can only be called."""
+"""The replay of a study's scene as the cheap model of an engine without derivatives."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PRIOR = {"prior": {"value": 4.0, "spread": 0.3}}
 
 
 class Calls:
-    """The planted paths as an engine that can only be called."""
+    """The planted paths as an engine without derivatives."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -48,7 +48,7 @@ PRIORS = {
 
 
 def problem(folder: Path, **sections) -> Problem:
-    """A problem on these calls; the study's own engine traces anew for every candidate."""
+    """A problem with this engine; the study's engine traces for every candidate."""
     table = planted.campaign(noise_db=1.0)
     sections = {"engine": {"name": "retrace"}, **sections}
     return Problem.of(Setup.open(planted.study(folder, table, **sections)), Calls())
@@ -56,7 +56,7 @@ def problem(folder: Path, **sections) -> Problem:
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory) -> Problem:
-    """A problem with offsets, priors and all."""
+    """A problem with offsets and priors."""
     sections = {"offset": {"per": "half", "prior_db": 3.0}, "noise": {"std_db": 1.0}, "parameters": PRIORS}
     return problem(tmp_path_factory.mktemp("asked"), **sections)
 
@@ -69,7 +69,7 @@ def model(asked) -> ReplayedModel:
     return found
 
 
-def test_the_replay_of_the_own_scene_finds_the_optimum_in_a_few_calls(asked, model):
+def test_the_replay_leads_to_the_optimum_in_a_few_calls(asked, model):
     optimizer, calls = choose(asked, model), asked.engine.calls
     values = []
     for _, told in islice(rounds(optimizer, asked.evaluate), 4):
@@ -85,7 +85,7 @@ def test_the_replay_of_the_own_scene_finds_the_optimum_in_a_few_calls(asked, mod
     assert min(values) < 1.01 * asked.evaluate(best.best.x[None]).value[0]
 
 
-def test_derivatives_of_the_cheap_model_are_those_of_its_residuals(asked, model):
+def test_derivatives_of_the_cheap_model_agree_with_its_residuals(asked, model):
     given = model.constants
     point = asked.parameters.to_search(asked.parameters.start)[None] + 0.3
     told = model.answer(point, given.centre[None] + 0.1)
@@ -103,7 +103,7 @@ def test_derivatives_of_the_cheap_model_are_those_of_its_residuals(asked, model)
         assert slope == pytest.approx((there - here)[0] / 2e-5, rel=1e-3, abs=1e-4)
 
 
-def test_links_that_only_the_engine_reaches_are_left_to_the_correction(asked):
+def test_links_that_only_the_engine_reaches_are_unknown_to_the_model(asked):
     paths = planted.engine().paths
     kept = paths.link != 3
 
@@ -118,7 +118,7 @@ def test_links_that_only_the_engine_reaches_are_left_to_the_correction(asked):
     assert not told.by_point[0, 3].any()
 
 
-def test_constants_are_those_that_nothing_else_sets():
+def test_constants_are_those_that_are_not_calibrated():
     wall = Parameter("walls.relative_permittivity", 1.5, 12.0, 5.0)
     materials = {
         "walls": Material(5.0, 0.1, 0.3),
@@ -133,7 +133,7 @@ def test_constants_are_those_that_nothing_else_sets():
     )
 
 
-def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, monkeypatch):
+def test_a_scene_that_cannot_be_traced_gives_a_remark(tmp_path, monkeypatch):
     def missing(*_, **__):
         raise InputError("no libLLVM was found")
 
@@ -151,7 +151,7 @@ def test_where_the_scene_cannot_be_traced_the_run_goes_on_and_says_so(tmp_path, 
 
 
 @pytest.mark.parametrize("method", [{"model": "none"}, {"name": "random"}])
-def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch, method):
+def test_nothing_is_traced_without_a_cheap_model(tmp_path, monkeypatch, method):
     asked = problem(tmp_path, method=method)
     monkeypatch.setattr(Setup, "trace", lambda *_, **__: pytest.fail("traced"))
     assert make_cheap_replay(asked).model is None
@@ -159,7 +159,7 @@ def test_nothing_is_traced_where_no_cheap_model_is_wanted(tmp_path, monkeypatch,
 
 
 def test_a_killed_run_is_repeated_from_its_ledger(tmp_path):
-    """The program answers otherwise than the scene: what is asked depends on the answers, and repeats."""
+    """The program differs from the scene, so the candidates depend on its answers; a restart repeats them."""
     content = programs.content(tmp_path) | {"method": {"name": "auto", "options": {"budget": 7}}}
     study = Study.from_content(content, tmp_path / "study.toml")
     first = calibrate(study, out=tmp_path / "out")

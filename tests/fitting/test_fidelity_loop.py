@@ -1,4 +1,4 @@
-"""Tracing again with the materials found: the gap is measured, and auto calibrates again while it is too large."""
+"""The fidelity loop: the gap after tracing again, and repeated calibration by auto."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -15,13 +15,13 @@ from calibray.tracing.trace_plan import plan_trace
 
 
 def stronger(decibels):
-    """A stand-in for the tracer: the planted paths, all stronger by so many dB."""
+    """The planted paths, stronger by some dB."""
     paths = planted.engine().paths
     return replace(paths, spreading=paths.spreading * 10 ** (decibels / 20))
 
 
 class StandIn:
-    """A stand-in for the tracer: gives paths that were made beforehand, the last ones again and again."""
+    """A fake tracer: returns prepared paths in order, then the last ones repeatedly."""
 
     versions: ClassVar[dict[str, str]] = {"stand-in": "1"}
 
@@ -48,7 +48,7 @@ def _no_cache(monkeypatch):
 
 
 def run(folder, gains, method="auto", tracer=None, **sections):
-    """Calibrate on the planted paths while later traces are stronger by `gains` [dB]; the result, and how many."""
+    """Calibrate on the planted paths, later traces stronger by `gains` [dB]; returns result and number of traces."""
     sampled = {"max_depth": 2, "samples": 20_000, "line_of_sight": False, "refraction": True}
     study = planted.study(folder, planted.campaign(), trace=sampled, **sections)
     options = {"starts": 8} if method == "auto" else {}
@@ -60,19 +60,19 @@ def run(folder, gains, method="auto", tracer=None, **sections):
     return calibrate(study, engine=engine, tracer=tracer), tracer.asked
 
 
-def test_paths_that_stay_leave_no_gap_and_are_traced_once(tmp_path):
+def test_unchanged_paths_leave_no_gap_and_are_traced_once(tmp_path):
     result, asked = run(tmp_path, [0.0])
     assert asked == 1
     assert result.fit.retrace_gap_db == pytest.approx(0, abs=1e-9)
 
 
-def test_the_gap_is_that_of_the_paths(tmp_path):
+def test_the_gap_is_the_change_of_path_loss(tmp_path):
     result, _ = run(tmp_path, [0.25])
     assert result.fit.retrace_gap_db == pytest.approx(0.25, abs=1e-9)
     np.testing.assert_allclose(result.links["retrace_gap_db"], -0.25, atol=1e-9)
 
 
-def test_auto_calibrates_again_on_the_new_paths_until_they_stay(tmp_path):
+def test_auto_calibrates_again_until_the_paths_are_stable(tmp_path):
     # The paths change once, then stay.
     result, asked = run(tmp_path, [0.8])
     assert asked == 2
@@ -88,13 +88,13 @@ def test_rounds_bound_the_loop_and_zero_switches_it_off(tmp_path):
     assert (result.fit.retrace_gap_db, asked) == (None, 0)
 
 
-def test_a_method_with_a_budget_keeps_to_it(tmp_path):
+def test_a_method_with_a_budget_does_not_calibrate_again(tmp_path):
     result, asked = run(tmp_path, [0.8], "sgwo-im")
     assert (result.rt_calls, asked) == (225, 1)
     assert result.fit.retrace_gap_db == pytest.approx(0.8, abs=1e-9)
 
 
-def test_a_link_that_the_new_trace_loses_is_left_out_and_told(tmp_path):
+def test_a_link_lost_by_the_new_trace_is_left_out_and_reported(tmp_path):
     paths = stronger(0.8)
     kept = take(paths, np.flatnonzero(paths.link != 3))
     result, _ = run(tmp_path, [], tracer=StandIn(kept), offset={"bounds": [-5.0, 5.0]})

@@ -16,7 +16,7 @@ from calibray.measurements import Measurements, SourceTable
 
 
 def campaign(count: int, groups: int, seed: int = 0) -> Measurements:
-    """Links in groups, and trees on their way."""
+    """Links in groups, with a column of trees."""
     rng = np.random.default_rng(seed)
     return Measurements(
         tx=np.zeros((count, 3)),
@@ -37,7 +37,7 @@ def planted(links: Measurements, nuisance: Nuisance, truth: np.ndarray, noise: f
     return Objective(measured, target.weight, nuisance, None, 2.0)
 
 
-def test_a_slope_per_decade_beside_offsets_is_recovered():
+def test_a_slope_per_decade_is_recovered_together_with_offsets():
     links = campaign(200, 6)
     terms = make_term(links, "offset", labels=links.group), make_term(links, "clutter", "log_distance")
     nuisance = Nuisance(200, terms)
@@ -53,7 +53,7 @@ def test_a_slope_per_decade_beside_offsets_is_recovered():
 @pytest.mark.parametrize("bounds", [None, (-1.0, 2.0)])
 @pytest.mark.parametrize("prior", [None, 1.5])
 @pytest.mark.parametrize("per_group", [False, True])
-def test_coefficients_in_noise_are_those_of_dense_least_squares(per_group, prior, bounds):
+def test_coefficients_agree_with_dense_least_squares(per_group, prior, bounds):
     links = campaign(150, 4)
     nuisance = Nuisance(
         150,
@@ -140,7 +140,7 @@ def test_many_links_in_many_groups(bounds):
     assert abs(left[free]).max() < 1e-6
 
 
-def test_a_small_design_and_a_large_one_take_the_same_way(monkeypatch):
+def test_dense_and_sparse_designs_agree(monkeypatch):
     links = campaign(300, 8)
     nuisance = Nuisance(
         300, (make_term(links, "offset", labels=links.group), make_term(links, "slope", "log_distance"))
@@ -163,7 +163,7 @@ def test_a_small_design_and_a_large_one_take_the_same_way(monkeypatch):
 
 @pytest.mark.parametrize("columns", [2, 5, 9])
 def test_bounds_are_kept_exactly_in_hard_problems(columns):
-    """Columns nearly alike, and bounds of which many are active: what exchanging all at once can cycle on."""
+    """Nearly equal columns and many active bounds, for which full exchanges can cycle."""
     rng = np.random.default_rng(columns)
     links = Measurements(
         tx=np.zeros((60, 3)),
@@ -190,7 +190,7 @@ def test_bounds_are_kept_exactly_in_hard_problems(columns):
         assert (pull[high] > -1e-9).all()
 
 
-def test_no_end_is_told_and_not_passed_off_as_an_answer(monkeypatch):
+def test_exchanges_without_end_raise_an_error(monkeypatch):
     links = campaign(40, 2)
     terms = make_term(links, "offset", bounds=(-0.1, 0.1)), make_term(links, "slope", "log_distance")
     elimination = Elimination.of(Nuisance(40, terms), links.weight, np.zeros(2))
@@ -199,7 +199,7 @@ def test_no_end_is_told_and_not_passed_off_as_an_answer(monkeypatch):
         elimination.coefficients(np.full((1, 40), 5.0))
 
 
-def test_one_column_at_a_time_is_exchanged_where_all_at_once_go_round(monkeypatch):
+def test_single_exchanges_give_the_same_result(monkeypatch):
     links = campaign(80, 3)
     rng = np.random.default_rng(0)
     terms = (
@@ -214,7 +214,7 @@ def test_one_column_at_a_time_is_exchanged_where_all_at_once_go_round(monkeypatc
     assert elimination.coefficients(gap) == pytest.approx(all_at_once, abs=1e-10)
 
 
-def test_columns_that_repeat_each_other_are_held_at_zero():
+def test_dependent_columns_are_held_at_zero():
     links = campaign(50, 3)
     terms = (
         make_term(links, "all"),
@@ -269,12 +269,12 @@ def test_terms_at_other_links_keep_centre_and_columns():
         ({"by": "tree_m"}, "no column 'tree_m'; did you mean 'trees_m'"),
     ],
 )
-def test_a_term_that_cannot_be_is_refused(options, fault):
+def test_an_invalid_term_is_refused(options, fault):
     with pytest.raises(InputError, match=fault):
         make_term(campaign(5, 2), "x", **options)
 
 
-def test_terms_that_do_not_fit_together_are_refused():
+def test_incompatible_terms_are_refused():
     links = campaign(5, 2)
     with pytest.raises(InputError, match="'x': two terms have this name"):
         Nuisance(5, (make_term(links, "x"), make_term(links, "x", "log_distance")))

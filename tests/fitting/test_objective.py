@@ -1,4 +1,4 @@
-"""The objective against the paper's formula, the former closed form, dense least squares and finite differences."""
+"""The objective against the paper's formula, a closed form, dense least squares and finite differences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINKS = 30
 
 
 def campaign(groups: bool = True) -> Measurements:
-    """Measured links with weights of their own and a column of clutter, in three groups if asked for."""
+    """Measured links with weights and a column of clutter, optionally in three groups."""
     rng = np.random.default_rng(5)
     return Measurements(
         tx=np.zeros((LINKS, 3)),
@@ -33,7 +33,7 @@ def campaign(groups: bool = True) -> Measurements:
 def objective(
     *terms: dict, groups: bool = True, calibrated: np.ndarray | None = None, **options
 ) -> Objective:
-    """The objective over all its links, or some, with terms of a nuisance."""
+    """The objective over all or some links, with terms of a nuisance."""
     links, everything = campaign(groups), np.ones(LINKS, dtype=bool)
     made = tuple(
         make_term(
@@ -101,13 +101,13 @@ def design(request):
 
 
 def built(terms: tuple[dict, ...], **options) -> Objective:
-    """The objective of a design, priors weighed against 3 dB."""
+    """The objective of a design, with 3 dB of noise."""
     return objective(*terms, noise_db=3.0, **options)
 
 
 @dataclass(frozen=True)
 class Former:
-    """Offsets per group as the package computed them before nuisances were designs."""
+    """Offsets per group in closed form."""
 
     measured: np.ndarray
     weight: np.ndarray
@@ -153,7 +153,7 @@ class Former:
 @pytest.mark.parametrize("bounds", [None, (-20.0, 20.0), (-0.5, 0.5), (1.0, 1.5)])
 @pytest.mark.parametrize("groups", [False, True])
 @pytest.mark.parametrize("calibrated", [np.arange(LINKS) >= 0, np.arange(LINKS) % 3 != 1])
-def test_an_offset_per_group_is_the_former_closed_form(groups, bounds, ceiling, calibrated):
+def test_an_offset_per_group_agrees_with_the_closed_form(groups, bounds, ceiling, calibrated):
     term = {**OFFSETS, "bounds": bounds} if groups else {**OFFSET, "bounds": bounds}
     target = objective(term, groups=groups, calibrated=calibrated, ceiling_db=ceiling)
     links = campaign(groups)
@@ -183,7 +183,7 @@ def test_the_rmse_is_that_of_the_paper():
     assert unweighted.rmse(loss)[0] == pytest.approx(np.sqrt(np.mean((loss[0] - links.path_loss_db) ** 2)))
 
 
-def test_links_that_do_not_count_leave_no_trace(design):
+def test_links_without_weight_have_no_effect(design):
     calibrated = np.arange(LINKS) < 20
     target, (loss, slope) = built(design, calibrated=calibrated), model(np.ones((2, 2)))
     changed = np.where(calibrated, loss, np.inf)
@@ -205,7 +205,7 @@ def augmented(target: Objective, loss: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.concatenate([rows, ridge]), np.concatenate([gap, np.zeros(len(ridge))])
 
 
-def test_coefficients_are_those_of_the_dense_problem(design):
+def test_coefficients_agree_with_the_dense_problem(design):
     target, (loss, _) = built(design), model(np.random.default_rng(1).normal(size=(5, 2)))
     if not design:
         assert target.coefficients(loss).shape == (5, 0)
@@ -224,7 +224,7 @@ def test_coefficients_are_those_of_the_dense_problem(design):
         assert (pull[upper] >= 0).all()
 
 
-def test_the_value_is_what_the_coefficients_minimise(design):
+def test_the_coefficients_minimise_the_value(design):
     target, (loss, _) = built(design), model(np.zeros((1, 2)))
     matrix, side = augmented(target, loss[0])
     left = matrix @ target.coefficients(loss)[0] - side
@@ -235,7 +235,7 @@ def test_the_value_is_what_the_coefficients_minimise(design):
     assert (target.rmse(loss)[0] == pytest.approx(target.value(loss)[0])) == (not priors.any())
 
 
-def test_derivatives_are_the_finite_differences(design):
+def test_derivatives_agree_with_finite_differences(design):
     target = built(design, calibrated=np.arange(LINKS) % 7 != 0)
     at = np.array([[0.3, 0.9], [-1.0, 2.0]])
     check_derivatives(target, at)
@@ -249,7 +249,7 @@ def test_derivatives_are_the_finite_differences(design):
         assert plain.jacobian(*model(at)) != pytest.approx(exact, abs=1e-3)
 
 
-def test_derivatives_under_a_ceiling_are_the_finite_differences():
+def test_derivatives_under_a_ceiling_agree_with_finite_differences():
     check_derivatives(objective(OFFSETS, SLOPE, ceiling_db=101.0), np.array([[0.3, 0.9], [-1.0, 2.0]]))
 
 
@@ -263,7 +263,7 @@ def check_derivatives(target: Objective, at: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("name", ["offsets", "offsets and slope", "groups borrow"])
-def test_fitting_with_the_nuisance_eliminated_is_fitting_it_too(name):
+def test_fitting_with_the_nuisance_eliminated_equals_a_joint_fit(name):
     target = built(DESIGNS[name])
     columns = len(target.nuisance.columns)
 
@@ -293,7 +293,7 @@ def test_a_ceiling_censors_before_the_offset():
     assert (plain[0, lost[0] < 100.0] != 0).all()
 
 
-def test_what_no_counted_link_tells_is_said():
+def test_undetermined_columns_are_marked():
     target = objective(OFFSETS, SLOPES, calibrated=np.arange(LINKS) % 3 != 1)
     assert dict(zip(target.nuisance.columns, target.determined.tolist(), strict=True)) == {
         "offset[a]": True,
@@ -328,7 +328,7 @@ def test_a_candidate_that_loses_links_is_not_fitted_to_them():
     assert np.isfinite(target.rmse(loss)).tolist() == [True, False, False]
 
 
-def test_no_link_to_calibrate_on_is_refused():
+def test_no_calibration_link_is_refused():
     links, nothing = campaign(), np.zeros(LINKS, dtype=bool)
     with pytest.raises(
         InputError, match=r"no path reaches any of the 30 calibration links; raise trace.max_depth"
@@ -337,7 +337,7 @@ def test_no_link_to_calibrate_on_is_refused():
     assert make_objective(links, nothing, ~nothing, ceiling_db=120.0).weight.tolist() == links.weight.tolist()
 
 
-def test_a_nuisance_that_does_not_fit_is_refused():
+def test_a_nuisance_of_other_links_is_refused():
     links, everything = campaign(), np.ones(LINKS, dtype=bool)
     with pytest.raises(InputError, match="the nuisance has 7 links, must have 30"):
         make_objective(links, everything, everything, nuisance=Nuisance(7))

@@ -1,4 +1,4 @@
-"""Another quantity than path loss: whatever an engine can answer with is calibrated on by the same loop."""
+"""Calibration on another observable than path loss, with the same loop."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def setup_of(tmp_path, values, **method):
     return Setup.open(planted.study(tmp_path, table, method=method))
 
 
-def test_a_campaign_of_delay_spreads_is_calibrated_on(tmp_path):
+def test_a_calibration_on_delay_spreads(tmp_path):
     engine = planted.engine()
     truth = np.array([planted.TRUTH[name] for name in engine.parameters.names])
     measured = delay_spread(engine, truth[None])[0]
@@ -44,7 +44,7 @@ def test_a_campaign_of_delay_spreads_is_calibrated_on(tmp_path):
     assert not np.allclose(Problem.of(setup, engine, PATH_LOSS).before, problem.before, rtol=0.5)
 
 
-def test_a_method_with_derivatives_is_refused_where_the_quantity_has_none(tmp_path):
+def test_a_method_with_derivatives_is_refused_for_an_observable_without(tmp_path):
     setup = setup_of(tmp_path, 90.0, name="least-squares")
     with pytest.raises(InputError, match="needs derivatives"):
         choose(Problem.of(setup, planted.engine(), SPREAD))

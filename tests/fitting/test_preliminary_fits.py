@@ -1,4 +1,4 @@
-"""Links near the noise floor are chosen by what the model expects of them: fits lean towards no lucky ones."""
+"""Selection of links near the noise floor by predicted path loss, which gives unbiased fits."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WAY = np.tile(np.linspace(0.0, 10.0, 60), 3)
 
 @dataclass
 class Ramp:
-    """An engine whose path loss rises by a parameter over a way."""
+    """An engine whose path loss rises along a route by a parameter."""
 
     way: np.ndarray
     calls: int = 0
@@ -52,7 +52,7 @@ class Ramp:
 
 
 def measured(seed: int) -> Problem:
-    """A problem over the links of a way that were heard."""
+    """A problem over the links above the noise floor."""
     loss = 80.0 + SLOPE * WAY + SPREAD_DB * np.random.default_rng(seed).standard_normal(len(WAY))
     way, loss = WAY[loss < LIMIT_DB], loss[loss < LIMIT_DB]
     place = np.column_stack([way, np.zeros((len(way), 2))])
@@ -65,12 +65,12 @@ def measured(seed: int) -> Problem:
 
 
 def slope(problem: Problem) -> float:
-    """The slope that fits best beside an offset, in closed form."""
+    """The best slope with an offset, in closed form."""
     there = problem.objective.weight > 0
     return float(np.polyfit(problem.engine.way[there], problem.objective.measured[there], 1)[0])  # type: ignore[attr-defined]
 
 
-def test_a_fit_to_what_was_heard_is_too_strong_and_one_to_what_is_expected_is_not():
+def test_selection_by_measurement_is_biased_and_by_prediction_is_not():
     every = [measured(seed) for seed in range(40)]
     chosen = [leave_out_near_floor(problem) for problem in every]
     all_heard, expected = (np.array([slope(each) for each in problems]) for problems in (every, chosen))
@@ -85,7 +85,7 @@ def test_a_fit_to_what_was_heard_is_too_strong_and_one_to_what_is_expected_is_no
     assert model[one.faint].min() == pytest.approx(LIMIT_DB - MARGIN * SPREAD_DB, abs=2.0)
 
 
-def test_without_a_floor_or_far_above_it_all_links_count():
+def test_without_a_floor_or_far_above_it_all_links_are_used():
     problem = measured(0)
     links = problem.setup.links
     for limit in (None, np.full(len(links), 300.0)):
@@ -95,7 +95,7 @@ def test_without_a_floor_or_far_above_it_all_links_count():
         assert kept.objective.num_counted == len(links)
 
 
-def test_links_that_are_all_faint_stay():
+def test_links_stay_if_all_are_faint():
     problem = measured(1)
     links = problem.setup.links
     limit = np.full(len(links), 60.0)
@@ -117,8 +117,8 @@ def test_the_floor_is_a_limit_of_path_loss(quantity, sent, limit):
     assert links.select(np.array([True, False])).limit_db == pytest.approx([limit])
 
 
-def test_the_logarithm_of_a_mean_of_few_samples_is_put_right():
-    """Rayleigh fading about -80 dBm, ten samples a place: their mean's logarithm lies 0.22 dB low."""
+def test_the_logarithm_of_a_mean_of_few_samples_is_unbiased():
+    """Rayleigh fading about -80 dBm, ten samples per cell: the logarithm of their mean is 0.22 dB too low."""
     rng = np.random.default_rng(5)
     power = 1e-8 * rng.exponential(size=(4000, 10))
     rows = {"x": np.repeat(10.0 * np.arange(4000), 10), "y": 0.0, "z": 1.5, "p": 10 * np.log10(power.ravel())}
@@ -130,8 +130,8 @@ def test_the_logarithm_of_a_mean_of_few_samples_is_put_right():
         assert 80.0 - links.path_loss_db.mean() == pytest.approx(off, abs=0.09)
 
 
-def test_links_that_were_not_heard_are_counted_and_judge_nothing(tmp_path):
-    """A street of which a third is beyond the floor: what was not heard tells of materials what is known of it."""
+def test_censored_links_inform_intervals_but_not_the_rmse(tmp_path):
+    """A street with a third of the links below the floor; intervals cover the truth."""
     table = planted.campaign(noise_db=0.3)
     floor = float(-table["path_loss_db"].quantile(0.67))
     table = table.assign(power=np.where(-table["path_loss_db"] > floor, -table["path_loss_db"], np.nan))

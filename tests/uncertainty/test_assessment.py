@@ -1,4 +1,4 @@
-"""What a calibration says of its own certainty: intervals, a free offset, priors, held-out blocks, predictions."""
+"""Assessment of a calibration: intervals, undeclared offset, priors, held-out blocks, prediction errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CENSORED = planted.content("links.csv")["links"] | {
     "quantity": "received_power", "tx_power_dbm": 0.0, "noise_floor_dbm": -100.0, "below_floor": "censor",
 }  # fmt: skip
 STEPS = 31
-"""Values of every parameter that a posterior is taken on."""
+"""Values per parameter of the grid for an exact posterior."""
 
 FEW = {"name": "auto", "options": {"starts": 64}}
 MARBLE = "marble.relative_permittivity"
@@ -62,7 +62,7 @@ def result(tmp_path_factory, noisy) -> Result:
         return run(tmp_path_factory.mktemp("plain"), noisy)
 
 
-def test_intervals_come_from_draws_and_say_why(result):
+def test_intervals_come_from_draws_and_have_reasons(result):
     assert result.cost.uncertainty_replays > 100
     for name, found in result.intervals.items():
         assert (
@@ -75,8 +75,8 @@ def test_intervals_come_from_draws_and_say_why(result):
     assert f"{result.cost.uncertainty_replays:,} in" in text
 
 
-def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp_path, noisy, monkeypatch):
-    """Of parameters that hardly matter each place of one that does is found many times, and 24 would be one of two."""
+def test_draws_start_from_as_many_minima_as_the_first_round_allows(tmp_path, noisy, monkeypatch):
+    """With parameters of little effect, each mode of the others has many minima; 24 starts could miss one of two."""
     problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
     lower, upper = problem.parameters.search_bounds
     trail = search(problem, LeastSquares(lower, upper, starts=64, seed=0))
@@ -92,7 +92,7 @@ def test_draws_start_around_as_many_places_as_their_first_round_has_room_for(tmp
     assert seen["places"] == seen["batch"] // POINTS_PER_START > BASINS
 
 
-def test_draws_explain_the_links_about_as_well(result):
+def test_draws_fit_the_links_about_as_well_as_the_optimum(result):
     names = list(result.parameters)
     points = np.stack([result.uncertainty.draws[name] for name in names], axis=1)
     measured = result.links.measured_db.to_numpy()
@@ -102,7 +102,7 @@ def test_draws_explain_the_links_about_as_well(result):
     assert np.median(np.std(points, axis=0)) > 1e-3
 
 
-def test_an_offset_that_is_not_declared_is_said_aloud(tmp_path, noisy, result):
+def test_an_undeclared_offset_gives_a_warning(tmp_path, noisy, result):
     offset = 8.0  # 4 dB can be put on the materials: 0.66 instead of 0.58 dB is no evidence of an offset
     shifted = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + offset))
     assert shifted.uncertainty.undeclared_offset_db == pytest.approx(
@@ -117,7 +117,7 @@ def test_an_offset_that_is_not_declared_is_said_aloud(tmp_path, noisy, result):
     assert declared.uncertainty.undeclared_offset_db is None
 
 
-def test_a_prior_pulls_and_its_weight_is_that_of_the_noise(tmp_path, noisy, result):
+def test_a_prior_shifts_the_optimum_according_to_the_noise(tmp_path, noisy, result):
     def found(spread, **sections):
         entry = {"bounds": planted.BOUNDS, "prior": {"value": 4.0, "spread": spread}}
         bounds = {name: {"bounds": planted.BOUNDS} for name in planted.TRUTH}
@@ -134,7 +134,7 @@ def test_a_prior_pulls_and_its_weight_is_that_of_the_noise(tmp_path, noisy, resu
     assert np.sqrt(np.mean((loss - noisy.path_loss_db) ** 2)) == pytest.approx(tight.rmse_db)
 
 
-def test_a_slope_is_found_reported_and_predicted_with(tmp_path, noisy):
+def test_a_planted_slope_is_recovered_reported_and_used_for_prediction(tmp_path, noisy):
     distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
     table = noisy.assign(path_loss_db=planted.path_loss() + 9.0 * np.log10(distance), level=np.arange(12.0))
     sections = {"offset": {}, "nuisance": {"clutter": {"by": "log_distance"}}}
@@ -163,12 +163,12 @@ def test_a_slope_is_found_reported_and_predicted_with(tmp_path, noisy):
         ({"parameters": {MARBLE: {"bounds": [1.5, 12], "prior": {"itu": "bread", "spread": 1}}}}, "bread"),
     ],
 )
-def test_keys_that_mean_nothing_are_refused(tmp_path, noisy, sections, message):
+def test_inapplicable_keys_are_refused(tmp_path, noisy, sections, message):
     with pytest.raises(InputError, match=message):
         planted.study(tmp_path, noisy, **sections)
 
 
-def test_the_noise_must_be_stated_where_it_cannot_be_estimated(tmp_path, noisy):
+def test_the_noise_must_be_declared_if_it_cannot_be_estimated(tmp_path, noisy):
     entry = {
         name: {"bounds": planted.BOUNDS, "prior": {"value": 4.0, "spread": 0.3}} for name in planted.TRUTH
     }
@@ -180,19 +180,19 @@ def test_the_noise_must_be_stated_where_it_cannot_be_estimated(tmp_path, noisy):
 
 
 def validation(folder, table, **sections):
-    """Blocks held out in turn, on the paths traced once."""
+    """Validation by blocks on paths traced once."""
     setup = Setup.open(planted.study(folder, table, **sections))
     return validate_problem(Problem.of(setup, planted.engine()), **({} if sections else {"blocks": 3}))
 
 
-def test_calibration_helps_where_its_truth_was_planted(tmp_path, noisy):
+def test_calibration_improves_predictions_of_planted_data(tmp_path, noisy):
     found = validation(tmp_path, noisy)
     assert found.table.loc[Model.CALIBRATED, "rmse_db"] < found.table.loc[Model.LOG_DISTANCE, "rmse_db"]
     assert "did not help" not in found.sentence
     assert found.best.startswith("calibrated")
 
 
-def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
+def test_a_hopeless_variant_is_reported(tmp_path, noisy):
     distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
     noise = 0.5 * np.random.default_rng(5).standard_normal(12)
     law = noisy.assign(path_loss_db=30 + 35 * np.log10(distance) + noise)
@@ -201,8 +201,8 @@ def test_a_twin_without_a_chance_is_called_so(tmp_path, noisy):
     assert found.best not in ("calibrated", "calibrated with prior")
 
 
-def test_beside_known_minima_other_searches_are_soon_given_up(tmp_path, noisy, monkeypatch):
-    """The same models, for fewer replays."""
+def test_searches_away_from_known_minima_end_early(tmp_path, noisy, monkeypatch):
+    """The models are the same and cost fewer replays."""
     problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
     known = {Model.CALIBRATED: variants.find_minima(problem, np.zeros((0, 3)), 64)}
 
@@ -218,7 +218,7 @@ def test_beside_known_minima_other_searches_are_soon_given_up(tmp_path, noisy, m
         assert quick.errors[name] == pytest.approx(errors, abs=0.05, nan_ok=True)
 
 
-def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
+def test_a_run_with_blocks_is_validated_by_them(tmp_path, noisy):
     found = run(tmp_path, noisy, holdout={"by": "half"})
     assert not found.links.held_out.any()
     assert found.holdout_rmse_db > found.rmse_db
@@ -228,13 +228,13 @@ def test_a_run_with_blocks_is_judged_by_them(tmp_path, noisy):
     assert found.prediction.model.name.startswith("calibrated")
 
 
-def test_a_run_that_nothing_judges_says_how_to_have_it_judged(result, tmp_path, noisy):
+def test_a_run_without_validation_says_how_to_validate(result, tmp_path, noisy):
     assert NOT_JUDGED in result.remarks
     assert NOT_JUDGED not in run(tmp_path, noisy, holdout={"where": "half == 'east'"}).remarks
 
 
-def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noisy):
-    """Where distance alone was planted, that is the law."""
+def test_predictions_use_the_model_that_validation_chooses(tmp_path, noisy):
+    """With path loss planted by distance only, that is the distance law."""
     distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
     noise = 0.5 * np.random.default_rng(5).standard_normal(12)
     table = noisy.assign(path_loss_db=30 + 35 * np.log10(distance) + noise)
@@ -253,7 +253,7 @@ def test_the_model_that_blocks_speak_for_is_what_predictions_go_by(tmp_path, noi
     assert loaded.predict_interval(planted.links()).equals(told)
 
 
-def test_prediction_tells_how_sure_it_is(tmp_path, noisy, result):
+def test_predictions_have_standard_errors(tmp_path, noisy, result):
     table = result.predict_interval(planted.links(), 0.9)
     truth = planted.path_loss()
     assert table.path_loss_db.to_numpy() == pytest.approx(result.predict(planted.links()), abs=1e-6)
@@ -268,7 +268,7 @@ def test_prediction_tells_how_sure_it_is(tmp_path, noisy, result):
         result.predict_interval(planted.links(), 1.5)
 
 
-def test_a_group_never_measured_gets_the_spread_of_the_others(tmp_path, noisy):
+def test_an_unmeasured_group_gets_the_spread_of_the_others(tmp_path, noisy):
     shift = noisy.half.map({"west": -6.0, "east": 6.0})
     found = run(tmp_path, noisy.assign(path_loss_db=noisy.path_loss_db + shift), offset={"per": "half"})
     seen = found.predict_interval(planted.links())
@@ -282,8 +282,8 @@ def test_a_group_never_measured_gets_the_spread_of_the_others(tmp_path, noisy):
     assert unseen.path_loss_db.to_numpy() == pytest.approx(middle / 2, abs=1e-6)
 
 
-def test_what_is_well_determined_is_never_called_not_identifiable():
-    """By the posterior with the noise known, on a grid; noise that drowns everything is the control."""
+def test_a_well_determined_parameter_is_never_not_identifiable():
+    """Against the exact posterior on a grid with known noise; overwhelming noise is the control."""
     often = np.tile(np.arange(planted.LINKS), 4)
     links = planted.links().iloc[often].reset_index(drop=True)
     engine = engines.Replay(take_links(planted.engine().paths, often), planted.engine().parameters)
@@ -314,8 +314,8 @@ def test_what_is_well_determined_is_never_called_not_identifiable():
     assert well >= 4
 
 
-def test_points_that_explain_nothing_are_not_asked_what_differing_buildings_change():
-    """Fewer replays for the same densities wherever these matter."""
+def test_heterogeneous_models_are_skipped_at_points_of_low_density():
+    """The relevant densities are the same and cost fewer replays."""
     study = Study.from_content(planted.content("links.csv"))
     problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     measured = planted.campaign(noise_db=0.02).path_loss_db.to_numpy()

@@ -1,4 +1,4 @@
-"""Draws of means together with what buildings have, against closed forms."""
+"""Draws of means, buildings and spread against closed forms."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def _parameters(scale="linear"):
 
 
 def _even(parameters, count=4000):
-    """Draws of a density that is flat."""
+    """Draws of a uniform density."""
     lower, upper = parameters.search_bounds
     point = np.random.default_rng(1).uniform(lower, upper, (count, len(lower)))
     return Draws(point, np.zeros(count), np.full(count, 1.0 / count))
@@ -55,13 +55,13 @@ def _hierarchy(parameters, gaps, links, buildings=6, priors=NO_PRIOR, spread=Non
 
 
 def _silent(point, logarithms):
-    """Links that tell nothing: the same gaps everywhere."""
+    """Uninformative links: the same gaps everywhere."""
     return np.tile([1.0, -1.0, 2.0, -2.0], (len(point), 1))
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
 @pytest.mark.parametrize("spread", [0.7, None])
-def test_means_of_which_nothing_is_told_are_even(scale, spread):
+def test_undetermined_means_are_uniform(scale, spread):
     parameters = _parameters(scale)
     silent = _hierarchy(parameters, _silent, 4, buildings=2, spread=spread)
     found = sample_means(silent, _even(parameters), 2 * COUNT, SWEEPS, seed=2)
@@ -73,7 +73,7 @@ def test_means_of_which_nothing_is_told_are_even(scale, spread):
     assert not found.flattened
 
 
-def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
+def test_undetermined_means_without_buildings_are_uniform():
     parameters = _parameters()
     found = sample_means(
         _hierarchy(parameters, _silent, 4, centred=False), _even(parameters), COUNT, SWEEPS, seed=2
@@ -81,7 +81,7 @@ def test_means_of_what_is_no_building_are_even_where_nothing_is_told():
     assert np.quantile(found.point, [0.25, 0.75]) == pytest.approx([4.125, 9.375], abs=0.4)
 
 
-def test_a_stated_prior_is_kept_where_nothing_is_told():
+def test_undetermined_means_follow_a_declared_prior():
     parameters, prior = _parameters(), LogNormal((0,), (4.0,), (0.1,))
     flat = _even(parameters)
     density = -0.5 * prior.residuals(flat.point)[:, 0] ** 2
@@ -94,11 +94,11 @@ def test_a_stated_prior_is_kept_where_nothing_is_told():
 
 
 BUILDINGS, EACH, SLOPE = 6, 10, 20.0
-"""Buildings, links that lean on each, and how path loss follows the logarithm of its constant [dB]."""
+"""Buildings, links dominated by each, and derivative of path loss by the logarithm of its constant [dB]."""
 
 
 def _planted(spread, seed=4):
-    """Links each of which leans on one building, in straight lines, and what they measure with 1 dB of noise."""
+    """Measured path loss of links dominated by one building each, linear in its constant, with 1 dB of noise."""
     random = np.random.default_rng(seed)
     own = np.log(4.0) + spread * random.standard_normal(BUILDINGS)
     return SLOPE * np.repeat(own, EACH) + random.standard_normal(BUILDINGS * EACH)
@@ -128,7 +128,7 @@ def _closed(measured, spreads, weights):
 
 
 def _alike(parameters, gaps):
-    """Draws where all buildings are alike."""
+    """Draws with equal buildings."""
     flat = _even(parameters, 200_000)
     gap = gaps(parameters.to_unit(parameters.from_search(flat.point)), np.zeros((1, BUILDINGS)))
     density = _marginal(gap.shape[1]).densities(gap)[:, 0]
@@ -143,7 +143,7 @@ def _moments(at, share):
 
 @pytest.mark.parametrize("known", [0.15, None])
 @pytest.mark.parametrize("planted", [0.15, 0.0])
-def test_means_are_those_of_the_closed_form(known, planted):
+def test_means_agree_with_the_closed_form(known, planted):
     parameters, measured = _parameters("log"), _planted(planted)
     gaps = _straight(parameters, measured)
     alike = _alike(parameters, gaps)
@@ -160,7 +160,7 @@ def test_means_are_those_of_the_closed_form(known, planted):
         assert _moments(alike.point[:, 0], alike.weight)[1] < 0.5 * deviation
 
 
-def test_links_that_only_one_building_explains_do_not_tell_the_mean():
+def test_links_on_one_building_determine_the_mean_only_to_the_spread():
     parameters, measured = _parameters("log"), _planted(0.15)
     gaps = _straight(parameters, measured)
     first = slice(0, EACH)  # all links lean on the first building
@@ -175,8 +175,8 @@ def test_links_that_only_one_building_explains_do_not_tell_the_mean():
     assert one.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
 
 
-def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
-    """Links that tell the product of two constants well and their ratio badly, where buildings are as good as alike."""
+def test_correlated_means_agree_with_the_closed_form():
+    """Links that determine the product of two constants well and their ratio badly, with nearly equal buildings."""
     names = ("walls.relative_permittivity", "ground.relative_permittivity")
     parameters = Parameters(
         tuple(Parameter(name, lower=LOWER, upper=UPPER, start=5.0, scale="log") for name in names)
@@ -205,8 +205,8 @@ def test_means_that_make_up_for_each_other_are_those_of_the_closed_form():
         assert told.std() == pytest.approx(deviation, rel=0.2)
 
 
-def test_weights_alone_lead_to_the_posterior(monkeypatch):
-    """Draws that do not move, of one building: the mean is as the building's constant, but for the spread."""
+def test_weights_without_moves_lead_to_the_posterior(monkeypatch):
+    """Draws of one building without moves: the mean is the building's constant plus the spread."""
     monkeypatch.setattr(module, "WEIGHT_POWER", 1.0)
     parameters, measured = _parameters("log"), _planted(0.15)
     gaps = _straight(parameters, measured)
@@ -222,7 +222,7 @@ def test_weights_alone_lead_to_the_posterior(monkeypatch):
     assert told.std() == pytest.approx(np.hypot(deviation, 0.03), rel=0.06)
 
 
-def test_each_step_leaves_a_share_of_the_draws_effective():
+def test_each_step_leaves_half_of_the_draws_effective():
     told = 30.0 * np.random.default_rng(10).standard_normal(1000)
     power = module._next_power(told, 0.1)
     weight = np.exp((power - 0.1) * told)
@@ -241,7 +241,7 @@ def test_draws_are_the_same_for_a_seed():
     assert not np.array_equal(one, other)
 
 
-def test_independent_errors_are_tried_besides_buildings():
+def test_gaussian_errors_are_always_tried_with_buildings():
     tried = tuple(
         NoiseModel(kind, 0.25, offset=offset)
         for kind in ("gaussian", "heterogeneous")

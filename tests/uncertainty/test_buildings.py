@@ -1,4 +1,4 @@
-"""Which building a place belongs to, told by what touches in plan, and what single buildings mean for intervals."""
+"""Buildings of a scene, their replay, and their effect on intervals."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def scene(*boxes: np.ndarray) -> Triangles:
     return Triangles(corners.reshape(-1, 3), face, np.zeros(len(corners), dtype=int), flat)
 
 
-def test_streets_part_buildings_and_what_touches_is_one():
+def test_streets_separate_buildings_and_touching_objects_are_one():
     found = scene(upright((0, 0), (20, 10)), upright((20.0, 0), (40, 10)), upright((45, 0), (60, 10)))
     first, second, beside, inside = building_numbers(
         found, np.array([[0.0, 5.0, 3.0], [40.0, 5.0, 3.0], [45.0, 5.0, 3.0], [52.0, 5.0, 10.0]])
@@ -51,7 +51,7 @@ def test_streets_part_buildings_and_what_touches_is_one():
     assert first != beside
 
 
-def test_a_scene_of_ground_alone_has_none():
+def test_a_scene_with_only_ground_has_no_buildings():
     assert building_numbers(scene(), np.zeros((2, 3))).tolist() == [-1, -1]
 
 
@@ -61,8 +61,8 @@ def problem() -> Problem:
     return Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
 
 
-def test_buildings_alike_are_the_material_and_others_have_their_own(problem):
-    """A factor on all buildings of a material is one on the material; the ground is none of them."""
+def test_equal_buildings_reproduce_the_material_and_factors_act_on_one_building(problem):
+    """A factor on all buildings of a material acts like one on the material; the ground is no building."""
     apart = split_by_building(problem)
     assert apart is not None
     means = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
@@ -89,8 +89,8 @@ def test_buildings_alike_are_the_material_and_others_have_their_own(problem):
     )
 
 
-def test_intervals_are_those_of_the_mean_over_buildings():
-    """Marble and wood are each on one building, which may differ from others; the ground is one and does not."""
+def test_intervals_cover_the_mean_over_buildings():
+    """Marble and wood are on one building each, which may differ from others; the ground does not differ."""
     measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
 
     def told(spread: float):
@@ -116,7 +116,7 @@ def test_intervals_are_those_of_the_mean_over_buildings():
     assert 1.0 < found["mean"][0] / found["seen"][0] < 1.4
 
 
-def test_means_are_drawn_together_with_buildings_and_of_large_scenes_are_behind_others(problem, monkeypatch):
+def test_sampling_and_indirect_inference_agree_roughly(problem, monkeypatch):
     measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
     here = replace(problem, objective=replace(problem.objective, measured=measured))
     trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))

@@ -1,4 +1,4 @@
-"""Links that were not heard count with the probability that they were not: fits lean towards no lucky ones."""
+"""Likelihood of censored links: fits are unbiased."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GAUSS = NoiseModel(GAUSSIAN, 1.0)
 STUDENT = NoiseModel(HEAVY, 1.0, freedom=4.0)
 
 
-def test_the_integral_is_that_by_quadrature():
+def test_the_integral_agrees_with_quadrature():
     random = np.random.default_rng(1)
     gap = 1.5 + 3.0 * random.standard_normal((1, 25))
     censored = gap[0] > 2.5
@@ -42,7 +42,7 @@ def test_the_integral_is_that_by_quadrature():
 
 
 @pytest.mark.parametrize("freedom", [np.inf, 2.0, 4.0])
-def test_derivatives_are_those_of_finite_differences(freedom):
+def test_derivatives_agree_with_finite_differences(freedom):
     random = np.random.default_rng(2)
     censored = np.arange(30) % 3 == 0
     left, columns = 3 * random.standard_normal((4, 30)), random.standard_normal((4, 30, 2))
@@ -56,7 +56,7 @@ def test_derivatives_are_those_of_finite_differences(freedom):
         assert curvature[:, k] == pytest.approx((down - up) / 2e-5, rel=1e-5, abs=1e-5)
 
 
-def test_where_all_were_heard_it_is_what_it_was():
+def test_without_censored_links_the_density_is_the_usual_one():
     random = np.random.default_rng(3)
     gap, way = 3 * random.standard_normal((3, 60)), random.standard_normal(60)
     design, ridge = np.column_stack([np.ones(60), way]), np.zeros(2)
@@ -69,8 +69,8 @@ def test_where_all_were_heard_it_is_what_it_was():
 
 
 @pytest.mark.parametrize("model", [GAUSS, STUDENT])
-def test_half_the_links_unheard_bias_nothing(model):
-    """A way along which path loss rises; from the middle on it is mostly beyond the floor."""
+def test_half_of_the_links_censored_cause_no_bias(model):
+    """Path loss rises along a route; from the middle on it is mostly below the noise floor."""
     told: dict[str, list[float]] = {"censored": [], "left out": [], "at the floor": []}
     for seed in range(25):
         random = np.random.default_rng([seed, 7])
@@ -93,7 +93,7 @@ def test_half_the_links_unheard_bias_nothing(model):
 
 
 def likeliest(measured: np.ndarray, way: np.ndarray, censored: np.ndarray, model: NoiseModel) -> float:
-    """The slope of the largest density, offset and scale integrated out."""
+    """Slope of highest density, with offset and scale integrated out."""
     one = np.ones(len(way))
     marginal = Marginal.of(
         one[:, None], np.zeros(1), one, np.zeros((len(way), 3)), SPREAD_DB, [model], censored
@@ -102,7 +102,7 @@ def likeliest(measured: np.ndarray, way: np.ndarray, censored: np.ndarray, model
     return float(SLOPES[np.argmax(found)])
 
 
-def test_a_link_that_the_model_does_not_hear_either_agrees_with_it():
+def test_a_censored_link_without_a_path_agrees_with_the_model():
     gap = np.array(
         [[1.0, -2.0, 0.5, 3.0, -np.inf], [1.0, -2.0, 0.5, 3.0, -500.0], [1.0, -2.0, 0.5, -np.inf, -3.0]]
     )

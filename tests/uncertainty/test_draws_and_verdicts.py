@@ -1,4 +1,4 @@
-"""Draws against the posterior of a linear model, between basins, within bounds; their credible sets and verdicts."""
+"""Draws from known posteriors, their credible sets and verdicts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import norm, t
 from calibray.result.wording import reason_text
 from calibray.uncertainty.credible_sets import credible
 from calibray.uncertainty.importance_sampling import TOO_FEW, Draws, pooled, sample
-from calibray.uncertainty.verdicts import verdicts
+from calibray.uncertainty.verdicts import Axes, verdicts
 
 NAMES = ("walls.relative_permittivity", "glass.relative_permittivity")
 
@@ -29,7 +29,7 @@ def moments(found: Draws):
     return mean, np.sqrt(found.weight @ (found.point - mean) ** 2)
 
 
-def test_draws_have_the_mean_and_the_size_of_a_known_density():
+def test_draws_have_the_mean_and_deviation_of_a_known_density():
     mean, size = np.array([4.0, 5.0]), np.array([0.3, 0.002])
     found = sample(gaussian(mean, size), np.zeros(2), np.full(2, 9.0), mean[None], np.diag(size**2)[None])
     assert found.effective > 400
@@ -38,15 +38,15 @@ def test_draws_have_the_mean_and_the_size_of_a_known_density():
     assert told[1] == pytest.approx(size, rel=0.08)
 
 
-def test_a_wrong_density_makes_them_too_narrow():
+def test_a_wrong_density_makes_draws_too_narrow():
     mean, size = np.array([4.0, 5.0]), np.array([0.3, 0.2])
     density = gaussian(mean, size)
     found = sample(lambda x: 4 * density(x), np.zeros(2), np.full(2, 9.0), mean[None], np.diag(size**2)[None])
     assert (moments(found)[1] < 0.6 * size).all()
 
 
-def test_a_basin_that_no_minimum_was_known_of_gets_its_share():
-    """Two Gaussians, of which the search knew one; the other holds two thirds."""
+def test_an_unknown_basin_gets_its_share():
+    """Two Gaussians; the search knew one, the other has two thirds of the mass."""
 
     def density(points):
         x = points[:, 0]
@@ -56,13 +56,13 @@ def test_a_basin_that_no_minimum_was_known_of_gets_its_share():
     assert found.weight[found.point[:, 0] > 5].sum() == pytest.approx(2 / 3, abs=0.08)
     pieces = credible(found.point[:, 0], found.weight, 0.0, 10.0, 0.95)
     assert [round(0.5 * (low + high)) for low, high in pieces] == [2, 8]
-    (verdict,) = verdicts(found, lambda x: x, NAMES[:1], np.zeros(1), np.full(1, 10.0), 1.0)
+    (verdict,) = verdicts(found, lambda x: x, Axes(NAMES[:1], np.zeros(1), np.full(1, 10.0)), 1.0)
     assert verdict.name == "ambiguous"
     assert "2 separate ranges" in reason_text(verdict.reason)
 
 
-def test_rounds_go_on_while_draws_are_few_and_more_are_allowed():
-    """A place so narrow that one round does not tell it."""
+def test_rounds_continue_while_draws_are_few():
+    """A mode too narrow for one round."""
     asked: list[int] = []
 
     def density(points):
@@ -80,8 +80,8 @@ def test_rounds_go_on_while_draws_are_few_and_more_are_allowed():
 
 
 @pytest.mark.parametrize("size", [0.006, 0.003])
-def test_many_narrow_places_of_each_parameter_are_all_found(size):
-    """Reflections inside walls: six places for each of four parameters, 1296 together, and one minimum known."""
+def test_many_narrow_modes_of_each_parameter_are_all_sampled(size):
+    """As from reflections inside walls: six modes for each of four parameters, 1296 together, one known minimum."""
     places, count = np.array([0.1, 0.263, 0.419, 0.58, 0.741, 0.9]), 4
     share = np.arange(1.0, 7.0) / 21.0
 
@@ -97,49 +97,52 @@ def test_many_narrow_places_of_each_parameter_are_all_found(size):
         assert found.weight @ near == pytest.approx(share, abs=0.08)
 
 
-def test_what_the_data_cannot_tell_spreads_over_its_bounds():
+def test_an_undetermined_parameter_covers_its_bounds():
     def density(points):
         return -0.5 * ((points[:, 0] - 3.0) / 0.2) ** 2
 
     lower, upper = np.zeros(2), np.full(2, 10.0)
     found = sample(density, lower, upper, np.array([[3.0, 1.0]]), np.array([np.diag([0.04, 9.0])]))
     assert moments(found)[1][1] == pytest.approx(10 / np.sqrt(12), rel=0.08)
-    told = verdicts(found, lambda x: x[:, :1], NAMES, lower, upper, 1.0)
+    told = verdicts(found, lambda x: x[:, :1], Axes(NAMES, lower, upper), 1.0)
     assert [each.name for each in told] == ["identified", "not identifiable"]
     assert "no link's path loss changes by more than 0.0 dB" in reason_text(told[1].reason)
     assert told[0].lower == pytest.approx(3.0 - 1.96 * 0.2, abs=0.08)
 
 
-def test_a_gap_among_draws_of_what_no_link_depends_on_is_chance():
-    """Few draws leave out holes and ends; of what nothing is known it is all, but not where links depend on it."""
+def test_gaps_between_draws_of_a_parameter_without_effect_are_chance():
+    """Few draws leave gaps; without any effect the interval is the whole range, with an effect it is not."""
     point = np.random.default_rng(4).uniform(0.0, 1.0, (400, 1))
     point = 0.06 + 0.88 * point[np.abs(point[:, 0] - 0.5) > 0.08][:100]
     draws = Draws(point, np.zeros(100), np.full(100, 0.01))
 
     def told(slope):
-        return verdicts(draws, lambda x: slope * x, NAMES[:1], np.zeros(1), np.ones(1), 3.0)[0]
+        return verdicts(draws, lambda x: slope * x, Axes(NAMES[:1], np.zeros(1), np.ones(1)), 3.0)[0]
 
     assert told(0.1).name == told(50.0).name == "not identifiable"
     assert len(told(0.1).pieces) == 1
     assert len(told(50.0).pieces) == 2
     assert told(50.0).lower > 0.02
     assert (told(0.1).lower, told(0.1).upper) == (0.0, 1.0)
-    # A prior that keeps it from a bound is no chance.
+    # A prior that keeps draws away from a bound is no chance.
     far = verdicts(
-        replace(draws, point=0.3 + 0.7 * point), lambda x: 0.1 * x, NAMES[:1], np.zeros(1), np.ones(1), 3.0
+        replace(draws, point=0.3 + 0.7 * point),
+        lambda x: 0.1 * x,
+        Axes(NAMES[:1], np.zeros(1), np.ones(1)),
+        3.0,
     )
     assert far[0].name == "not identifiable"
     assert far[0].lower == pytest.approx(0.34, abs=0.04)
     assert far[0].upper == 1.0
 
 
-def test_what_an_interval_has_apart_from_the_set_that_is_judged_is_said():
-    """Seven of a hundred draws lie elsewhere: intervals of 95 % hold them, nine tenths do not."""
+def test_pieces_outside_the_judged_set_are_reported():
+    """Seven of a hundred draws are separate: the 95 % interval covers them, the 90 % set does not."""
     random = np.random.default_rng(3)
     point = np.concatenate([random.normal(3.0, 0.1, 1860), random.normal(8.0, 0.02, 140)])[:, None]
     draws = Draws(point, np.zeros(2000), np.full(2000, 1 / 2000))
     limits = np.zeros(1), np.full(1, 10.0)
-    (verdict,) = verdicts(draws, lambda x: x, NAMES[:1], *limits, 1.0, shown=lambda _, value: 10 * value)
+    (verdict,) = verdicts(draws, lambda x: x, Axes(NAMES[:1], *limits, lambda _, value: 10 * value), 1.0)
     assert verdict.name == "identified"
     assert len(verdict.pieces) == 2
     found = re.fullmatch(
@@ -151,14 +154,17 @@ def test_what_an_interval_has_apart_from_the_set_that_is_judged_is_said():
     assert 79 < low < high < 81
     assert share in (6, 7)
     (alone,) = verdicts(
-        Draws(point[:1860], np.zeros(1860), np.full(1860, 1 / 1860)), lambda x: x, NAMES[:1], *limits, 1.0
+        Draws(point[:1860], np.zeros(1860), np.full(1860, 1 / 1860)),
+        lambda x: x,
+        Axes(NAMES[:1], *limits),
+        1.0,
     )
     assert "also includes" not in reason_text(alone.reason)
 
 
 @pytest.mark.parametrize(("slope", "words"), [(20.0, "other unknowns compensate"), (0.5, "too little")])
-def test_why_links_that_change_do_not_tell_a_parameter(slope, words):
-    """Nothing trades off with it, and links follow it by so many decibels over its range, with errors of 2 dB."""
+def test_reasons_for_an_unidentifiable_parameter_with_effect(slope, words):
+    """No trade-off; links change by the given decibels over the range, with errors of 2 dB."""
     found = sample(
         lambda points: np.zeros(len(points)),
         np.zeros(1),
@@ -166,34 +172,34 @@ def test_why_links_that_change_do_not_tell_a_parameter(slope, words):
         np.array([[5.0]]),
         np.ones((1, 1, 1)),
     )
-    (told,) = verdicts(found, lambda x: slope * x, NAMES[:1], np.zeros(1), np.full(1, 10.0), 2.0)
+    (told,) = verdicts(found, lambda x: slope * x, Axes(NAMES[:1], np.zeros(1), np.full(1, 10.0)), 2.0)
     assert told.name == "not identifiable"
     assert words in reason_text(told.reason)
     assert f"up to {10 * slope:.1f} dB" in reason_text(told.reason)
 
 
-def test_two_that_trade_off_are_said_to():
+def test_a_trade_off_is_reported():
     def density(points):
         return -0.5 * (points.sum(axis=1) - 10.0) ** 2 / 0.1**2
 
     lower, upper = np.zeros(2), np.full(2, 10.0)
     wide = np.array([np.array([[9.0, -8.9], [-8.9, 9.0]])])
     found = sample(density, lower, upper, np.array([[5.0, 5.0]]), wide)
-    told = verdicts(found, lambda x: x.sum(axis=1, keepdims=True), NAMES, lower, upper, 1.0)
+    told = verdicts(found, lambda x: x.sum(axis=1, keepdims=True), Axes(NAMES, lower, upper), 1.0)
     assert told[0].name == "not identifiable"
     assert "trades off with glass.relative_permittivity" in reason_text(told[0].reason)
 
 
-def test_one_that_runs_into_its_bound_is_called_so():
+def test_a_parameter_at_its_bound_is_reported():
     found = sample(lambda x: 20 * x[:, 0], np.zeros(1), np.ones(1), np.array([[0.95]]), np.array([[[0.01]]]))
-    (told,) = verdicts(found, lambda x: x * 5, NAMES[:1], np.zeros(1), np.ones(1), 1.0)
+    (told,) = verdicts(found, lambda x: x * 5, Axes(NAMES[:1], np.zeros(1), np.ones(1)), 1.0)
     assert told.name == "at bound"
     assert told.upper == 1.0
     assert told.lower == pytest.approx(1 - 3.0 / 20, abs=0.02)
 
 
-def test_credible_sets_hold_what_they_say():
-    """Of weighted and of plain draws, wide, narrow and skewed."""
+def test_credible_sets_cover_their_level():
+    """For weighted and unweighted draws, wide, narrow and skewed."""
     random = np.random.default_rng(4)
     for draws in (
         random.normal(5, 1e-4, 3000),
@@ -209,8 +215,8 @@ def test_credible_sets_hold_what_they_say():
     assert (low, high) == pytest.approx((5 - 0.98, 5 + 0.98), abs=0.12)
 
 
-def test_too_few_draws_are_not_taken_for_certainty():
-    # Twelve parameters of which the data tell much: a round or two of points find next to none that explain them.
+def test_too_few_draws_are_flattened():
+    # Twelve well-determined parameters: one or two rounds of points have almost none of high density.
     dimension, size = 12, np.full(12, 0.003)
     density = gaussian(np.linspace(0.2, 0.8, dimension), size)
     start = np.linspace(0.2, 0.8, dimension)[None] + 0.02

@@ -1,4 +1,4 @@
-"""Intervals on engines without derivatives: functions that pass through the calls, and planted truths within."""
+"""Emulated intervals of engines without derivatives cover planted values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOISE_DB = 0.3
 
 
 class Calls:
-    """The program as an engine that can only be called."""
+    """The program as an engine without derivatives."""
 
     def __init__(self, setup: Setup) -> None:
         self.parameters, self.materials, self.calls = setup.parameters, setup.scene.materials, 0
@@ -48,7 +48,7 @@ class Exact(Calls):
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory) -> Study:
-    """A study of the program, its links noisy, which the scene's replay knows nothing of."""
+    """A study of the program with noisy links, without a cheap model."""
     folder = tmp_path_factory.mktemp("program")
     content = programs.content(folder) | {
         "method": {"name": "auto", "model": "none", "options": {"budget": 30}}
@@ -60,7 +60,7 @@ def asked(tmp_path_factory) -> Study:
     return Study.from_content(content, folder / "study.toml")
 
 
-def test_an_engine_that_can_only_be_called_gets_intervals_that_hold_the_truth(asked, tmp_path):
+def test_emulated_intervals_cover_the_truth(asked, tmp_path):
     result = calibrate(asked)
     assert len(programs.calls(asked.path.parent)) == result.rt_calls + 1 == 31  # and the start
     setup = Setup.open(asked)
@@ -86,7 +86,7 @@ def test_an_engine_that_can_only_be_called_gets_intervals_that_hold_the_truth(as
     assert "an emulator was fitted to 31 of its calls" in " ".join(told.split())
 
 
-def test_calls_too_few_to_tell_anything_leave_the_whole_range(asked):
+def test_too_few_calls_give_the_whole_range(asked):
     setup = Setup.open(asked)
     problem = Problem.of(setup, Calls(setup))
     told = certainty(problem, search(problem, VectorSurrogate(*setup.parameters.search_bounds, budget=3)))

@@ -1,4 +1,4 @@
-"""Buildings that differ: what estimates owe to them, by closed forms and by planted buildings."""
+"""Indirect inference of means over buildings, against closed forms and planted buildings."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from calibray.uncertainty.indirect_inference import (
     overconfidence,
 )
 from calibray.uncertainty.noise_models import DIFFERING, NoiseModel, noise_models
-from calibray.uncertainty.verdicts import verdicts
+from calibray.uncertainty.verdicts import Axes, verdicts
 
 COUNTS = np.array([30, 6, 3, 1])
-"""Links that lean on each of four buildings."""
+"""Links dominated by each of four buildings."""
 
 LINK_BUILDING = np.repeat(np.arange(4), COUNTS)
 NONE = np.zeros((len(LINK_BUILDING), 0))
 HALF = 0.5
-"""What the links tell as if all buildings were alike, in the unit cube."""
+"""The estimate with equal buildings, in the unit cube."""
 
 
 def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray = NONE, prior: float = 0.0):
-    """Means that give `HALF` where buildings have so much of their own [n, 4] and path loss is linear [n]."""
+    """Means [n] that imply the estimate `HALF` for deviations of the buildings [n, 4], with linear path loss."""
     effect = np.broadcast_to(effect, len(LINK_BUILDING))
     slope = np.broadcast_to(effect[:, None], (len(own), len(effect), 1))
     precision = np.full((len(own), 1 + design.shape[1]), 0.0)
@@ -45,17 +45,17 @@ def behind(own: np.ndarray, effect: np.ndarray | float = 1.0, design: np.ndarray
 
 
 def drawn(spread: float, count: int = 2000) -> np.ndarray:
-    """What buildings have of their own [n, 4]."""
+    """Deviations of the buildings [n, 4]."""
     return spread * np.random.default_rng(4).standard_normal((count, 4))
 
 
-def test_many_links_on_one_building_are_one():
+def test_many_links_on_one_building_share_its_deviation():
     own, share = drawn(0.05), COUNTS / COUNTS.sum()
     assert behind(own) == pytest.approx(HALF - own @ share)
 
 
-def test_what_buildings_have_is_told_beside_an_offset():
-    """Least squares with an offset beside, to what the means found give, ends where the links said."""
+def test_implied_means_with_an_offset_reproduce_the_estimate():
+    """Least squares with an offset, on data from the implied means, ends in the estimate."""
     own, effect = drawn(0.05, 50), np.random.default_rng(4).uniform(2.0, 20.0, len(LINK_BUILDING))
     found = behind(own, effect, np.ones((len(effect), 1)))
     design = np.column_stack([effect, np.ones(len(effect))])
@@ -64,8 +64,8 @@ def test_what_buildings_have_is_told_beside_an_offset():
     assert np.abs(behind(own, effect) - found).max() > 0.01
 
 
-def test_straight_lines_are_followed_so_far():
-    """With an offset fitted beside; as if every link had a building of its own, it would be said to be far less."""
+def test_the_linear_response_is_that_of_least_squares():
+    """With a fitted offset."""
     random, own, place = np.random.default_rng(4), drawn(0.15, 4000), np.arange(4)
     effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
     design = np.column_stack([effect, np.ones(len(effect))])
@@ -78,19 +78,19 @@ def test_straight_lines_are_followed_so_far():
     assert np.abs(held).max() < 1e-3
 
 
-def test_what_cannot_be_followed_is_taken_straight():
-    """A step of path loss at the estimate: no place near it gives the estimate once buildings differ."""
+def test_means_that_cannot_be_followed_are_the_linear_ones():
+    """With a step of path loss at the estimate, no mean nearby implies the estimate."""
     leaning = LinearModel(np.full((1, 1), HALF), np.ones((1, 3, 1)), np.zeros((3, 0)), np.zeros((1, 1)))
     found = implied_means(leaning, lambda x, portion: np.full((1, 3), 4.0), np.full((1, 1), 0.6))
     assert found.tolist() == [[0.6]]
 
 
-def test_a_prior_holds_what_buildings_could_move():
+def test_a_narrow_prior_keeps_means_at_the_estimate():
     assert np.abs(behind(drawn(0.05), prior=1e6) - HALF).max() < 1e-4
 
 
-def test_waves_that_buildings_smear_do_not_look_like_loss():
-    """A damped wave for each of many buildings: fitted as one wave it looks more damped than it is for any of them."""
+def test_smeared_oscillation_does_not_bias_the_means():
+    """A damped oscillation per building: fitted as one it looks more damped than each of them."""
     random, wave, spread = np.random.default_rng(1), 25.0, 0.05
     link = random.uniform(0.5, 1.5, (1, 60))
     own = spread * random.standard_normal((200, 60))
@@ -127,8 +127,8 @@ def test_waves_that_buildings_smear_do_not_look_like_loss():
     assert np.median(found[:, 0]) == pytest.approx(0.3, abs=0.05)
 
 
-def test_a_density_is_too_sure_which_place_it_is():
-    """Of two places, by the variance of the logarithm of their ratio, over that which noise alone gives it."""
+def test_overconfidence_is_the_ratio_of_variances_between_modes():
+    """Variance of the log ratio of two modes with buildings, over the variance by noise only."""
     random = np.random.default_rng(4)
     effect = random.uniform(2.0, 20.0, len(LINK_BUILDING))
     other = np.where(LINK_BUILDING == 0, random.standard_normal(len(effect)), 0.0)
@@ -157,7 +157,7 @@ def test_a_density_is_too_sure_which_place_it_is():
     assert overconfidence(leaning, shared, others) == pytest.approx(1.0)
 
 
-def test_a_density_divided_is_that_of_more_noise():
+def test_a_divided_log_density_is_that_of_more_noise():
     point = np.random.default_rng(6).uniform(-20.0, 20.0, (40_000, 1))
     density = -0.5 * point[:, 0] ** 2
     draws = Draws(point, density, np.exp(density) / np.exp(density).sum())
@@ -172,13 +172,13 @@ def models() -> tuple[NoiseModel, ...]:
 
 
 def weights(models: tuple[NoiseModel, ...], **kinds: float) -> np.ndarray:
-    """Weights of the models at 4000 draws, so much for each kind [4000, models]."""
+    """Weights of the models at 4000 draws, from weights per kind [4000, models]."""
     number = {kind: sum(model.kind == kind for model in models) for kind in kinds}
     row = [kinds.get(model.kind, 0.0) / number.get(model.kind, 1) for model in models]
     return np.tile(row, (4000, 1))
 
 
-def test_spreads_are_as_likely_as_the_data_say(models):
+def test_spreads_follow_the_evidence(models):
     apart = draw_spreads(models, weights(models, gaussian=0.2, heterogeneous=0.8), models)
     # Four times as likely now and twice before: the data speak for it by two to one, and so was thought before.
     assert np.mean(apart > 0) == pytest.approx(0.8 + 0.2 * 4 / 5, abs=0.015)
@@ -190,20 +190,20 @@ def test_spreads_are_as_likely_as_the_data_say(models):
     assert np.mean(heavy > 0) == pytest.approx(2 / 3, abs=0.03)
 
 
-def test_a_study_of_like_buildings_moves_nothing(models):
+def test_without_heterogeneous_models_the_spread_is_zero(models):
     alike = tuple(model for model in models if model.kind != DIFFERING)
     share = weights(alike, gaussian=1.0)
     assert (draw_spreads(alike, share, alike) == 0).all()
 
 
-def test_models_left_out_count_as_unlikely(models):
-    """Those that explain little are not evaluated; what is left tells of the others."""
+def test_dropped_models_count_as_unlikely(models):
+    """Negligible models are dropped; the remaining ones determine the odds."""
     left = tuple(replace(model) for model in models if model.kind == "gaussian")
     assert np.mean(draw_spreads(left, np.ones((2000, len(left))) / len(left), models) > 0) < 0.01
 
 
-def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():
-    """Links tell those seen to a tenth of the range; that others may differ widens the interval and says so."""
+def test_parameters_of_measured_buildings_stay_weakly_identified():
+    """Measured buildings are known to a tenth of the range; differences to others widen the interval."""
     random = np.random.default_rng(2)
     seen, means = (
         Draws(point, np.zeros(4000), np.full(4000, 1 / 4000))
@@ -212,7 +212,7 @@ def test_what_the_links_tell_of_buildings_seen_is_not_called_unknown():
 
     def told(draws: Draws, lean: Draws | None):
         ends = np.zeros(1), np.ones(1)
-        return verdicts(draws, lambda points: points * 50.0, ["walls"], *ends, 3.0, seen=lean)[0]
+        return verdicts(draws, lambda points: points * 50.0, Axes(["walls"], *ends), 3.0, seen=lean)[0]
 
     assert told(means, seen).name == "weakly identified"
     assert "buildings that were measured" in reason_text(told(means, seen).reason)

@@ -35,7 +35,7 @@ def test_intervals_of_a_linear_problem_are_the_textbook_ones(offset):
 
 
 def coverage(noise: np.ndarray, factor: float = 1.0) -> np.ndarray:
-    """How often the interval, its width times a factor, holds the truth [d], over many campaigns [n, m]."""
+    """Share of intervals, scaled by a factor, that cover the truth [d], over many campaigns [n, m]."""
     hits = np.zeros(2)
     for sample in noise:
         found = intervals(*linear_problem(sample, True), LOWER, UPPER, len(sample) - 3)
@@ -50,7 +50,7 @@ def test_intervals_cover_the_truth_95_times_in_100():
     independent = np.random.default_rng(4).normal(0, 0.5, (4000, 9))
     assert coverage(independent) == pytest.approx(0.95, abs=0.01)
     assert (coverage(independent, factor=0.5) < 0.75).all()
-    # What linear theory promises fails where neighbouring links share their error, as the docstring warns.
+    # Correlated errors make the true intervals wider, as the docstring says.
     shared = np.repeat(np.random.default_rng(4).normal(0, 0.5, (1000, 3)), 10, axis=1)
     order = np.argsort(np.random.default_rng(2).normal(size=(30, 2))[:, 0])
     assert coverage(shared[:, np.argsort(order)]).min() < 0.8
@@ -62,7 +62,7 @@ def verdicts(slope: np.ndarray, best: np.ndarray = TRUTH, noise: float = 0.5) ->
     return [each.verdict for each in intervals(best, residuals, slope, LOWER, UPPER, len(slope) - 2)]
 
 
-def test_verdicts_tell_what_the_data_can():
+def test_verdicts_follow_the_information_in_the_data():
     sharp = np.random.default_rng(3).normal(size=(40, 2))
     assert verdicts(sharp) == ["identified", "identified"]
     assert verdicts(sharp * [1.0, 0.01]) == ["identified", "not identifiable"]

@@ -1,4 +1,4 @@
-"""Densities of the measurements against integrals by brute force, and what planted errors speak for."""
+"""Densities of the measurements against numerical integrals, and posterior weights for planted errors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0) -
 
 
 def integral(log_density) -> float:
-    """Over the logarithm of the noise's size and one coefficient."""
+    """Integral over the log noise level and one coefficient."""
     size, coefficient = np.linspace(-2.5, 4, 261), np.linspace(-30, 30, 601)
     value = log_density(coefficient[:, None, None], np.exp(size)[None, :, None])
     return float(logsumexp(value) + np.log((size[1] - size[0]) * (coefficient[1] - coefficient[0])))
@@ -67,7 +67,7 @@ def test_gaussian_densities_are_the_integrals(model, covariance):
     assert found[0, 0] == pytest.approx(integral(log_density), abs=1e-3)
 
 
-def test_a_forgotten_offset_has_its_prior():
+def test_an_undeclared_offset_has_its_prior():
     def log_density(offset, size):
         prior = norm.logpdf(offset, 0, OFFSET_DB * size / 2.0)[..., 0]
         return norm.logpdf(GAP, offset, size).sum(axis=-1) + prior
@@ -87,8 +87,8 @@ def _mixed(error):
         (NoiseModel("student-t", 1.0, gross=True), _mixed, 0.25),
     ],
 )
-def test_heavy_tails_are_near_their_integral(model, tail, within):
-    """Over 40 links, four of them far off; with few, Laplace's approximation is rough."""
+def test_heavy_tailed_densities_are_near_the_integral(model, tail, within):
+    """For 40 links with four gross errors; for fewer links, Laplace's approximation is rough."""
     random = np.random.default_rng(3)
     gap = 2.0 * random.standard_normal(40) + 20.0 * (np.arange(40) < 4)
 
@@ -101,8 +101,8 @@ def test_heavy_tails_are_near_their_integral(model, tail, within):
 
 
 @pytest.mark.parametrize("tail", [tails.student(4.0), tails.gross()])
-def test_tails_are_densities_with_their_information(tail):
-    """By quadrature; the weight is the derivative of the logarithm."""
+def test_tails_are_normalised_and_have_their_fisher_information(tail):
+    """By quadrature; the weight is the derivative of the log density."""
     error = np.linspace(-200, 200, 400_001)
     density = np.exp(tail.log_density(error**2))
     assert np.trapezoid(density, error) == pytest.approx(1.0, abs=1e-3)
@@ -115,8 +115,8 @@ def test_tails_are_densities_with_their_information(tail):
 
 @pytest.mark.parametrize("tail", [tails.student(2.0), tails.student(4.0), tails.gross()])
 @pytest.mark.parametrize("columns", [0, 3])
-def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
-    """As far as many more steps would lead, of errors among which some are far off."""
+def test_the_iteration_converges_to_the_mode(tail, columns, monkeypatch):
+    """Compared with many more steps, for errors with some gross ones."""
     random = np.random.default_rng(5)
     gap = 3.0 * random.standard_normal((64, 60)) + 20.0 * (random.random((64, 60)) < 0.1)
     design, ridge = random.standard_normal((60, columns)), np.full(columns, 0.2)
@@ -126,7 +126,7 @@ def test_modes_are_followed_to_their_end(tail, columns, monkeypatch):
     assert found == pytest.approx(tails.evidence(gap, design, ridge, tail), abs=0.02)
 
 
-def test_gaps_may_have_degrees_of_freedom_and_priors_of_their_own():
+def test_each_gap_may_have_its_degrees_of_freedom_and_priors():
     random = np.random.default_rng(6)
     gap = 3.0 * random.standard_normal((40, 30)) + 20.0 * (random.random((40, 30)) < 0.1)
     design, freedom = random.standard_normal((30, 2)), random.choice([2.0, 4.0, 8.0], 40)
@@ -139,8 +139,8 @@ def test_gaps_may_have_degrees_of_freedom_and_priors_of_their_own():
     assert np.ptp(found) > 1.0
 
 
-def test_gross_errors_speak_for_themselves():
-    """One link of ten 20 dB off: neither Student's t nor Gaussian errors explain it as well."""
+def test_gross_errors_are_recognised():
+    """With one link of ten 20 dB off, the model with gross errors has the largest weight."""
     random = np.random.default_rng(5)
     position = random.uniform(0, 600, (60, 2))
     gap = 3 * random.standard_normal(60) + 20.0 * (np.arange(60) % 10 == 0)
@@ -153,7 +153,7 @@ def test_gross_errors_speak_for_themselves():
     assert not any(model.gross for model in noise_models(position, kind="student-t"))
 
 
-def test_neighbours_stand_for_all_where_links_are_many():
+def test_nearest_neighbours_approximate_the_exact_whitener():
     random = np.random.default_rng(0)
     position, scale = random.uniform(0, 1000, (300, 3)), random.uniform(0.5, 2, 300)
     exact, near = (whitener(position, scale, 80.0, 0.8, exact=exact) for exact in (300, 10))
@@ -165,8 +165,8 @@ def test_neighbours_stand_for_all_where_links_are_many():
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "correlated", "student-t", "heterogeneous"])
-def test_planted_errors_speak_for_their_kind(kind):
-    """Of 150 links; the kind planted gets the largest weight, and an offset is found where one was planted alone."""
+def test_planted_errors_favour_their_kind(kind):
+    """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
     random = np.random.default_rng(7)
     position = random.uniform(0, 600, (150, 2))
     variance = 0.15**2 * random.choice([0.0, 400.0], 150)
@@ -199,7 +199,7 @@ def test_planted_errors_speak_for_their_kind(kind):
         assert offset < 0.5 < weights(errors + 4.0)[1]
 
 
-def test_what_a_study_states_is_not_tried():
+def test_declared_properties_are_fixed():
     def kinds(**stated):
         return {model.kind for model in noise_models(POSITION, **stated)}
 
@@ -210,8 +210,8 @@ def test_what_a_study_states_is_not_tried():
     assert not any(model.offset for model in noise_models(POSITION, offset=False))
 
 
-def test_corners_tell_the_mean_and_the_variance_of_materials_that_differ():
-    """Of a curved function of three constants, against draws of it: to the second order both are right."""
+def test_corners_give_mean_and_variance_for_differing_buildings():
+    """For a curved function of three constants, against random draws; both are right to second order."""
     slope, bend, spread = np.array([3.0, -2.0, 1.0]), np.array([4.0, 0.0, -7.0]), 0.15
 
     def loss(factor):

@@ -1,4 +1,4 @@
-"""Densities of gaps each under a model of its own against those under all models."""
+"""Densities of gaps with one model each, against the densities under all models."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def _asked(marginal, seed=2):
 
 @pytest.mark.parametrize("columns", [0, 2])
 @pytest.mark.parametrize("most", [module.MAX_LINKS, LINKS - 1])
-def test_each_is_as_under_all_models(columns, most, monkeypatch):
+def test_each_density_is_that_of_its_model(columns, most, monkeypatch):
     monkeypatch.setattr(module, "MAX_LINKS", most)
     marginal = _marginal(columns)
     gap, model = _asked(marginal)
@@ -54,7 +54,7 @@ def test_each_is_as_under_all_models(columns, most, monkeypatch):
     assert found[there] == pytest.approx(wanted[there], abs=1e-3)
 
 
-def test_links_that_were_not_heard_are_left_to_the_density():
+def test_censored_links_use_the_full_density():
     censored = np.arange(LINKS) % 5 == 0
     marginal = _marginal(1, censored)
     gap, model = _asked(marginal)
@@ -64,7 +64,7 @@ def test_links_that_were_not_heard_are_left_to_the_density():
     assert np.delete(found, 3) == pytest.approx(np.delete(wanted, 3), abs=1e-4)
 
 
-def test_one_kind_alone_is_enough():
+def test_a_single_kind_of_model_works():
     marginal = _marginal(0)
     heavy = replace(marginal, models=tuple(model for model in marginal.models if model.kind == "student-t"))
     gap, model = _asked(heavy)

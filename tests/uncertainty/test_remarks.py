@@ -1,4 +1,4 @@
-"""The remark on values of least RMSE that lie outside their own intervals."""
+"""The remark on calibrated values outside their intervals."""
 
 from __future__ import annotations
 

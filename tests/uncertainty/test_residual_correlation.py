@@ -1,4 +1,4 @@
-"""Noise against SciPy's densities, planted scales and ranges, and simulation."""
+"""Correlation of residuals: planted ranges and sizes, restricted likelihood, variogram."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibray.uncertainty.residual_correlation import Correlation, fit_correlati
 
 @pytest.fixture(autouse=True)
 def _one_thread():
-    """Small factors are slower on several threads where others compute too."""
+    """Small matrices are slower on several BLAS threads."""
     with threadpool_limits(1, user_api="blas"):
         yield
 
@@ -26,12 +26,12 @@ def street(count: int, seed: int = 0) -> np.ndarray:
 
 
 def drawn(position: np.ndarray, range_m: float, shared: float, own: float, rng) -> np.ndarray:
-    """Errors of which neighbours share a part."""
+    """Spatially correlated errors."""
     matrix = Correlation(range_m, shared, own, 0.0, 0.0).covariance(position)
     return np.linalg.cholesky(matrix) @ rng.normal(size=len(position))
 
 
-def test_range_and_size_of_a_shared_part_are_recovered():
+def test_range_and_size_of_the_correlated_part_are_recovered():
     position, rng = street(250), np.random.default_rng(3)
     found = [fit_correlation(drawn(position, 60.0, 4.0, 2.0, rng), position) for _ in range(10)]
     assert np.median([each.range_m for each in found]) == pytest.approx(60.0, rel=0.25)
@@ -40,7 +40,7 @@ def test_range_and_size_of_a_shared_part_are_recovered():
     assert all(each.log_likelihood > each.independent + 5 for each in found)
 
 
-def test_errors_that_neighbours_do_not_share_are_said_to_be_independent():
+def test_independent_errors_show_no_correlation():
     position, rng = street(120), np.random.default_rng(4)
     gain = [
         (each := fit_correlation(rng.normal(0, 3, 120), position)).log_likelihood - each.independent
@@ -50,7 +50,7 @@ def test_errors_that_neighbours_do_not_share_are_said_to_be_independent():
     assert max(gain) < 5.0
 
 
-def test_the_restricted_likelihood_is_the_density_of_what_the_columns_leave():
+def test_the_restricted_likelihood_is_the_density_of_the_residual_components():
     rng = np.random.default_rng(5)
     position = street(40)
     columns = np.column_stack([np.ones(40), position[:, 0] / 1000])
@@ -68,7 +68,7 @@ def test_the_restricted_likelihood_is_the_density_of_what_the_columns_leave():
     assert shifted.log_likelihood == pytest.approx(found.log_likelihood, abs=1e-6)
 
 
-def test_columns_that_were_fitted_do_not_pass_for_less_noise():
+def test_fitted_columns_do_not_bias_the_noise():
     rng, position, own = np.random.default_rng(6), street(60), []
     columns = rng.normal(size=(60, 20))
     for _ in range(30):
@@ -81,7 +81,7 @@ def test_columns_that_were_fitted_do_not_pass_for_less_noise():
     assert plain < 2.7
 
 
-def test_errors_that_cannot_tell_are_refused():
+def test_uninformative_errors_are_refused():
     position = street(5)
     with pytest.raises(InputError, match="5 links and 3 fitted columns"):
         fit_correlation(np.ones(5), position, design=np.ones((5, 3)))
@@ -100,13 +100,13 @@ def position() -> np.ndarray:
 
 
 def alike(position: np.ndarray, seed: int, range_m: float = 80.0) -> np.ndarray:
-    """Errors of 3 dB that neighbours share."""
+    """Correlated errors of 3 dB."""
     apart = np.linalg.norm(position[:, None] - position[None], axis=2)
     root = np.linalg.cholesky(np.exp(-apart / range_m) + 1e-9 * np.eye(len(position)))
     return 3.0 * root @ np.random.default_rng(seed).standard_normal(len(position))
 
 
-def test_a_variogram_rises_where_neighbours_share_errors_and_is_level_where_not(position):
+def test_a_variogram_rises_for_correlated_errors_and_is_level_otherwise(position):
     for shared, ratio in ((True, 0.6), (False, None)):
         rise = []
         for seed in range(20):
@@ -122,7 +122,7 @@ def test_a_variogram_rises_where_neighbours_share_errors_and_is_level_where_not(
             assert np.median(rise) == pytest.approx(1.0, abs=0.15)
 
 
-def test_shared_errors_are_found_and_none_in_white_ones(position):
+def test_correlated_errors_are_detected_and_white_ones_are_not(position):
     found = [shared_errors(alike(position, seed), position) is not None for seed in range(8)]
     white = [
         shared_errors(3.0 * np.random.default_rng([3, seed]).standard_normal(COUNT), position) is not None
@@ -132,7 +132,7 @@ def test_shared_errors_are_found_and_none_in_white_ones(position):
     assert sum(white) <= 1
 
 
-def test_few_links_and_one_place_show_nothing():
+def test_few_links_and_one_position_show_no_correlation():
     errors = np.random.default_rng(0).standard_normal(12)
     assert shared_errors(errors[:9], np.arange(27.0).reshape(9, 3)) is None
     assert shared_errors(errors, np.zeros((12, 3))) is None

@@ -90,7 +90,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
 
     Args:
         problem: The problem.
-        progress: Called with the stage "weighing" after every estimate.
+        progress: Called with the stage "estimating noise" after every estimate.
 
     Returns:
         The problem with the standard deviation of a link's error in its objective; unchanged without priors.
@@ -116,7 +116,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]
         if progress is not None:
-            progress("weighing", turn + 1, NOISE_ESTIMATES)
+            progress("estimating noise", turn + 1, NOISE_ESTIMATES)
         before, links = noise_db, problem.objective.num_counted
         noise_db = float(problem.squares(fit.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
         if abs(noise_db - before) <= TOLERANCE * before:

@@ -25,7 +25,7 @@ from calibray.uncertainty.importance_sampling import ENOUGH, Draws, pooled, samp
 from calibray.uncertainty.likelihood import PosteriorDensity
 from calibray.uncertainty.linear_theory import covariances, local_intervals, with_reason
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
-from calibray.uncertainty.verdicts import verdicts, widened
+from calibray.uncertainty.verdicts import Axes, verdicts, widened
 
 COST: Final = 10
 """Replays for draws, at most, per replay of the calibration; the latter compute derivatives and cost twice as much."""
@@ -304,12 +304,9 @@ def _intervals(
     judged = verdicts(
         means,
         density.modelled,
-        parameters.names,
-        lower,
-        upper,
+        Axes(parameters.names, lower, upper, value_at),
         density.marginal.noise_db,
         level=CONFIDENCE,
-        shown=value_at,
         seen=posterior,
     )
     intervals = {}

@@ -74,4 +74,4 @@ class QuadraticForms:
                 square, constant, exponent = form
                 value = np.sum((gap[rows] @ square) * gap[rows], axis=1)
                 log_density[rows] = constant - exponent * np.log(np.maximum(value, 1e-300))
-        return log_density + np.log([each.weight for each in models])[model]
+        return log_density + np.log([other.weight for other in models])[model]

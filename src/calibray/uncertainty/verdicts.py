@@ -44,8 +44,22 @@ LINE: Final = 25
 Modelled = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Maps points [n, d] to the path loss of the m links used [n, m], [dB]."""
 
-Shown = Callable[[int, float], float]
-"""Maps the index of a parameter and a search coordinate to the parameter's value."""
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """The axes of the search space.
+
+    Attributes:
+        names: Names of the parameters.
+        lower: Lower bounds [d].
+        upper: Upper bounds [d].
+        value: Maps the index of a parameter and a search coordinate to the value that reasons state.
+    """
+
+    names: Sequence[str]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    value: Callable[[int, float], float] = lambda _, coordinate: coordinate
 
 
 @dataclass(frozen=True)
@@ -78,13 +92,10 @@ class Verdict:
 def verdicts(
     draws: Draws,
     modelled: Modelled,
-    names: Sequence[str],
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    axes: Axes,
     noise_db: float,
     *,
     level: float = 0.95,
-    shown: Shown = lambda _, value: value,
     seen: Draws | None = None,
 ) -> list[Verdict]:
     """Judge every parameter by its posterior.
@@ -92,12 +103,9 @@ def verdicts(
     Args:
         draws: The posterior, of the means over all buildings if these differ.
         modelled: Computes path loss.
-        names: Names of the parameters.
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
+        axes: The axes of the search space.
         noise_db: Standard deviation of the links' errors [dB].
         level: Share of the posterior that intervals cover.
-        shown: Converts search coordinates to the values that reasons state.
         seen: The posterior for the measured buildings; the same as `draws` if None.
 
     Returns:
@@ -106,41 +114,37 @@ def verdicts(
     best = draws.point[np.argmax(draws.density)]
     seen = draws if seen is None else seen
     result = []
-    for index in range(len(names)):
-        low_bound, high_bound = float(lower[index]), float(upper[index])
-        pieces, reported = credible_sets(
-            draws.point[:, index], draws.weight, low_bound, high_bound, (JUDGED, level)
-        )
+    for index in range(len(axes.names)):
+        lower, upper = float(axes.lower[index]), float(axes.upper[index])
+        pieces, reported = credible_sets(draws.point[:, index], draws.weight, lower, upper, (JUDGED, level))
         seen_pieces = pieces
         if seen is not draws:
-            (seen_pieces,) = credible_sets(
-                seen.point[:, index], seen.weight, low_bound, high_bound, (JUDGED,)
-            )
-        share = _width(pieces) / (upper[index] - lower[index])
-        seen_share = _width(seen_pieces) / (upper[index] - lower[index])
-        ends = _bounds_reached(pieces, low_bound, high_bound)
-        ends = ends or _bounds_reached(seen_pieces, low_bound, high_bound)
+            (seen_pieces,) = credible_sets(seen.point[:, index], seen.weight, lower, upper, (JUDGED,))
+        share = _width(pieces) / (upper - lower)
+        seen_share = _width(seen_pieces) / (upper - lower)
+        ends = _bounds_reached(pieces, lower, upper)
+        ends = ends or _bounds_reached(seen_pieces, lower, upper)
         if share > WEAKLY >= seen_share and len(seen_pieces) == 1 and not ends:
             name = VerdictName.WEAKLY_IDENTIFIED
             reason = Reason(ReasonKind.SEEN_BUILDINGS, {"share": float(seen_share)})
         elif share > WEAKLY and seen_share > WEAKLY:
-            name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, lower, upper)
+            name, change = VerdictName.NOT_IDENTIFIABLE, _effect(index, modelled, best, axes)
             if change < NO_EFFECT_DB:
                 reason = Reason(ReasonKind.NO_EFFECT, {"change_db": change})
-                reported = (_without_chance(reported, low_bound, high_bound),)
+                reported = (_without_chance(reported, lower, upper),)
             else:
-                reason = _confounding(index, draws, names, change, noise_db)
+                reason = _confounding(index, draws, axes.names, change, noise_db)
         elif len(seen_pieces) > 1:
-            name, reason = VerdictName.AMBIGUOUS, _modes(index, seen_pieces, seen, shown)
+            name, reason = VerdictName.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
         elif len(pieces) > 1:
-            name, reason = VerdictName.AMBIGUOUS, _modes(index, pieces, draws, shown)
+            name, reason = VerdictName.AMBIGUOUS, _modes(index, pieces, draws, axes)
         elif ends:
-            other_end = shown(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
+            other_end = axes.value(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = VerdictName.AT_BOUND
         else:
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
-            others = _outlying_pieces(index, pieces, reported, draws, shown)
+            others = _outlying_pieces(index, pieces, reported, draws, axes)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
         result.append(Verdict(reported, float(best[index]), name, reason))
     return result
@@ -168,13 +172,13 @@ def _without_chance(
     return lower if low - lower < slack else low, upper if upper - high < slack else high
 
 
-def _modes(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, shown: Shown) -> Reason:
+def _modes(index: int, pieces: tuple[tuple[float, float], ...], draws: Draws, axes: Axes) -> Reason:
     """The modes of the posterior with their weights."""
     modes, value = [], draws.point[:, index]
     for low, high in pieces:
         inside = (value >= low) & (value <= high)
         middle = value[inside][np.argmax(draws.density[inside])] if inside.any() else 0.5 * (low + high)
-        modes.append((float(shown(index, float(middle))), float(draws.weight[inside].sum())))
+        modes.append((float(axes.value(index, float(middle))), float(draws.weight[inside].sum())))
     return Reason(ReasonKind.SEPARATE_RANGES, ranges=tuple(modes))
 
 
@@ -183,14 +187,14 @@ def _outlying_pieces(
     pieces: tuple[tuple[float, float], ...],
     reported: tuple[tuple[float, float], ...],
     draws: Draws,
-    shown: Shown,
+    axes: Axes,
 ) -> tuple[tuple[float, float, float], ...]:
     """Pieces of the reported interval outside the judged set, with their weights; mostly none."""
     others, value = [], draws.point[:, index]
     for low, high in reported:
         if not any(start <= high and low <= end for start, end in pieces):
             weight = draws.weight[(value >= low) & (value <= high)].sum()
-            others.append((float(shown(index, low)), float(shown(index, high)), float(weight)))
+            others.append((float(axes.value(index, low)), float(axes.value(index, high)), float(weight)))
     return tuple(others)
 
 
@@ -198,12 +202,11 @@ def _effect(
     index: int,
     modelled: Modelled,
     best: NDArray[np.float64],
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    axes: Axes,
 ) -> float:
     """Largest change of a link's path loss over the range of a parameter, the others fixed [dB]."""
     line = np.tile(best, (LINE, 1))
-    line[:, index] = np.linspace(lower[index], upper[index], LINE)
+    line[:, index] = np.linspace(axes.lower[index], axes.upper[index], LINE)
     loss = modelled(line)
     return float(np.nanmax(np.ptp(np.where(np.isfinite(loss), loss, np.nan), axis=0)))
 
