@@ -70,7 +70,7 @@ def main() -> None:
         for links, buildings in ((100, 50), (options.links, options.buildings)):
             result, shown = made_up(links, buildings)
             start = time.perf_counter()
-            text = page(result, shown, figures.every(result, shown.links))
+            text = page(result, shown, figures.result_figures(result, shown.links))
             made = time.perf_counter() - start
             file = Path(folder) / "report.html"
             file.write_text(text, encoding="utf-8")

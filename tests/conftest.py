@@ -35,7 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _no_lines_of_progress():
-    """What stands on stderr does not depend on how busy the machine is."""
+    """No lines of progress on stderr, however busy the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(progress, "EVERY", 1e6)
+        patch.setattr(progress, "LINE_INTERVAL", 1e6)
         yield

@@ -12,7 +12,7 @@ from calibray.calibration.result import Result
 from calibray.paths import Kind, Paths
 from calibray.reporting.link_survey import survey
 from calibray.reporting.page import Shown
-from calibray.reporting.rays import strongest
+from calibray.reporting.viewer import strongest
 from calibray.scenes import Scene, Triangles
 from changed import changed
 

@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_bad_input import run, write
 
 import shown
 from calibray.calibration.result import Result
@@ -24,6 +23,7 @@ from calibray.study.toml_file import expand
 from calibray.support.output_files import check_file, check_folder
 from calibray.tracing import gain_table
 from calibray.validation.validate import validate
+from commands import run, write_wall_study
 from fuzzing import geometry, inputs, stored, workbooks, world
 from fuzzing.outcome import ALLOWED, Watch, judge
 
@@ -36,7 +36,7 @@ FUZZ = settings(max_examples=60, deadline=None, derandomize=True, database=None)
 def found(tmp_path_factory):
     place = tmp_path_factory.mktemp("world")
     (place / "base").mkdir()
-    world.write(place / "base")
+    world.write_wall_study(place / "base")
     return world.World(place, place / "base", {})
 
 
@@ -147,7 +147,7 @@ def test_the_demo_refuses_an_engine_before_it_traces(engine, tmp_path, monkeypat
 
 @pytest.mark.parametrize("arguments", [("--seeds", 10**9), ("--methods", "gwo@9999999999")])
 def test_comparisons_without_end_are_refused(arguments, tmp_path):
-    ended = run("compare", write(tmp_path), "-o", tmp_path / "out", *arguments)
+    ended = run("compare", write_wall_study(tmp_path), "-o", tmp_path / "out", *arguments)
     assert ended.exit_code == 2, ended.output
 
 

@@ -145,8 +145,13 @@ def too_long() -> list[str]:
     ]
 
 
-if __name__ == "__main__":
-    targets = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+def faults() -> list[str]:
+    """Check every Markdown file of the repository.
+
+    Returns:
+        A sentence for each fault.
+    """
+    targets = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     group = cast(Any, typer.main.get_command(app)).commands
     commands = {"make": set(targets[1].split()) if targets else set(), "calibray": set(group)}
     options = {
@@ -158,16 +163,20 @@ if __name__ == "__main__":
     }
     folders = [folder for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")]
     documents = sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in folder.rglob("*.md"))])
-    faults = [
-        f"{document.relative_to(ROOT)}: {fault} does not exist"
-        for document in documents
-        for fault in [
-            *missing_links(document, document.read_text()),
-            *missing_modules(document.read_text()),
-            *missing_commands(document.read_text(), commands),
-            *missing_options(document.read_text(), options),
+    sentences = too_long()
+    for document in documents:
+        text = document.read_text(encoding="utf-8")
+        missing = [
+            *missing_links(document, text),
+            *missing_modules(text),
+            *missing_commands(text, commands),
+            *missing_options(text, options),
         ]
-    ]
-    faults += too_long()
-    sys.stdout.write("\n".join([*faults, f"{len(documents)} documents, {len(faults)} faults"]) + "\n")
-    sys.exit(bool(faults))
+        sentences += [f"{document.relative_to(ROOT)}: {name} does not exist" for name in missing]
+    return sentences
+
+
+if __name__ == "__main__":
+    errors = faults()
+    sys.stdout.write("\n".join([*errors, f"{len(errors)} faults"]) + "\n")
+    sys.exit(bool(errors))

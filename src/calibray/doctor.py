@@ -1,7 +1,7 @@
-"""What this machine has, whether tracing and replay work on it, and what to do if not.
+"""Whether tracing and replay work on this machine, and what to do if not.
 
-Nothing is concluded from versions alone: Dr.Jit, Sionna RT and JAX each do a small piece of real work, in
-processes of their own, because a libLLVM that Dr.Jit cannot use ends the process that tried.
+Versions alone prove nothing, so Dr.Jit, Sionna RT and JAX each run a small piece of real work. They run in
+subprocesses, because a libLLVM that Dr.Jit cannot use kills the process.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from calibray.errors import InputError
+from calibray.tables import Column, Table
 from calibray.tracing import llvm
 from calibray.tracing.llvm import Llvm
 
 CHECK_TIMEOUT = 300.0
-"""Longest time [s] that one check may take; the first import on a slow disk is what takes long."""
+"""Longest time of one check [s]; the first import from a slow disk dominates."""
 
 # Name and, if any, extra: "numpy>=2.0", "pyarrow>=16; extra == 'parquet'".
 _REQUIREMENT = re.compile(r"""^([\w.-]+)(?:.*extra == ['"]([\w-]+)['"])?""")
 
-# Extras for work on Calibray itself, which no user misses.
+# Extras for work on Calibray itself; users do not need them.
 _DEVELOPER_EXTRAS = frozenset({"test", "lint"})
 
-# Sum of min(0, 2) .. min(3, 2). The minimum is what an unusable LLVM cannot compile; a sum alone it can.
+# Sum of min(0, 2) .. min(3, 2). An unusable LLVM fails to compile the minimum; a sum alone compiles.
 _KERNEL = """
 import importlib, sys
 import drjit
@@ -37,7 +38,7 @@ if total != 5.0:
     sys.exit(f"the sum is {total}, not 5")
 """
 
-# In a closed box there are the direct path and one reflection off each of the six faces.
+# A closed box has the direct path and one reflection from each of its six faces.
 _TRACE = """
 import sys
 import mitsuba
@@ -62,11 +63,11 @@ print(", ".join(f"{device.platform}:{device.id}" for device in jax.devices()))
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that Calibray needs, and whether it is there and works.
+    """The check of one library that Calibray needs.
 
     Attributes:
-        name: What was checked.
-        passed: Whether it can be relied on.
+        name: The library.
+        passed: Whether it works.
         detail: What was found, or how it failed.
         remedy: What to do if it failed.
     """
@@ -79,14 +80,14 @@ class Check:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that `calibray doctor` tells.
+    """The state of a machine, as `calibray doctor` prints it.
 
     Attributes:
-        versions: Calibray, Python and each package with its version, or with the command to install it.
-        variant: The Mitsuba variant that traces.
+        versions: Python, Calibray and each package with its version, or with the command that installs it.
+        variant: The Mitsuba variant that is used for tracing.
         cuda_devices: Number of GPUs that Mitsuba can trace on.
-        libraries: Every libLLVM found.
-        checks: What was checked, in the order in which one depends on the other.
+        libraries: Every libLLVM on this machine.
+        checks: The checks; each depends on the ones before.
     """
 
     versions: tuple[tuple[str, str], ...]
@@ -100,12 +101,32 @@ class Diagnosis:
         """Whether Calibray works on this machine."""
         return all(check.passed for check in self.checks)
 
+    def table(self) -> Table:
+        """Versions, libraries, checks with remedies, and a verdict.
+
+        Returns:
+            A table of two columns without headings.
+        """
+        rows = [
+            *self.versions,
+            ("Mitsuba variant", self.variant),
+            ("GPUs for tracing", str(self.cuda_devices)),
+            *(
+                (f"libLLVM {library.label}", f"{library.path}, {library.problem or 'usable'}")
+                for library in self.libraries
+            ),
+            *((check.name, f"{'ok' if check.passed else 'FAILED'}, {check.detail}") for check in self.checks),
+            *(("To do", check.remedy) for check in self.checks if not check.passed),
+            ("Verdict", "Calibray works here" if self.usable else "Calibray cannot trace and replay here"),
+        ]
+        return Table("", (Column(), Column()), tuple(rows))
+
 
 def examine() -> Diagnosis:
-    """Look at this machine and tries it, which takes some seconds.
+    """Check this machine, which takes some seconds.
 
     Returns:
-        What was found; a machine that cannot be used gives a diagnosis too, not an exception.
+        The diagnosis; a machine that cannot be used raises no exception.
     """
     variant = llvm.mitsuba_variant()
     return Diagnosis(
@@ -118,13 +139,13 @@ def examine() -> Diagnosis:
 
 
 def check_tracing(variant: str) -> tuple[Check, ...]:
-    """Check what tracing stands on: libLLVM where it is needed, then Dr.Jit, then Sionna RT.
+    """Check what tracing needs: libLLVM for tracing on the CPU, then Dr.Jit, then Sionna RT.
 
     Args:
-        variant: The Mitsuba variant to trace with.
+        variant: The Mitsuba variant that is used for tracing.
 
     Returns:
-        The checks up to the first that failed, as those after it could only fail too.
+        The checks up to the first that failed; later ones depend on it.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -143,16 +164,16 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 
 
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
-    """Run Python code in a process of its own.
+    """Run Python code in a subprocess.
 
     Args:
-        name: What is checked.
-        code: The code; it prints what it found, and fails with an exception, an exit status or a signal.
+        name: The library that is checked.
+        code: The code; it prints what it found, or fails with an exception, an exit status or a signal.
         arguments: Its `sys.argv[1:]`.
         remedy: What to do if it fails.
 
     Returns:
-        Whether the process ended well, and the telling line of what it printed.
+        The check; its detail is the output, or the line that names the cause of the failure.
     """
     command = [sys.executable, "-c", code, *arguments]
     try:
@@ -161,20 +182,20 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
         return Check(name, False, f"no answer within {CHECK_TIMEOUT:g} s", remedy)
     if run.returncode == 0:
         return Check(name, True, run.stdout.strip() or "works", remedy)
-    lines = run.stderr.strip().splitlines() or [f"ended with {run.returncode}, without a word"]
+    lines = run.stderr.strip().splitlines() or [f"exit status {run.returncode} without a message"]
     if run.returncode < 0:
-        # LLVM names its reason first and dumps its stack after it.
-        return Check(name, False, f"ended by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
-    # Of chained exceptions the first is the cause; an exit message stands alone.
+        # LLVM prints its reason first, then its stack.
+        return Check(name, False, f"killed by {signal.Signals(-run.returncode).name}: {lines[0]}", remedy)
+    # Of chained exceptions the first is the cause. An exit message is the last line.
     reasons = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)] or lines[-1:]
     return Check(name, False, "; ".join(reasons), remedy)
 
 
 def versions() -> tuple[tuple[str, str], ...]:
-    """The versions of Calibray, of Python and of each package that Calibray's own metadata names.
+    """Versions of Python, of Calibray and of each package that Calibray's metadata requires.
 
     Returns:
-        Pairs of name and version; an absent package has the command that installs it instead.
+        Pairs of name and version; for a missing package, the command that installs it.
     """
     packages = {"calibray": "pip install calibray"}
     requirements = metadata.requires("calibray") if _version("calibray") else None

@@ -19,7 +19,7 @@ from calibray.engines import Replay
 from calibray.errors import InputError
 from calibray.optimizers import METHODS
 from calibray.parameters import Parameter, Parameters
-from calibray.reporting.result_tables import offsets
+from calibray.reporting.result_tables import nuisances
 from calibray.study import Setup
 from calibray.tables.text import render
 
@@ -105,7 +105,7 @@ def test_auto_reaches_the_optimum_of_a_brute_force_scan(tmp_path):
     assert 0.3 < result.rmse_db < scan.min()  # with a noise floor, and finer than the scan
 
 
-def test_held_out_links_are_not_looked_at(tmp_path, exact):
+def test_held_out_links_do_not_change_the_fit(tmp_path, exact):
     held_out = exact.rx_x > 10
     noisy = exact.assign(path_loss_db=exact.path_loss_db + 0.5 * np.random.default_rng(0).standard_normal(12))
     shift = {
@@ -146,7 +146,7 @@ def test_weights_act(tmp_path, exact):
         ({"per": "half", "bounds": [-10.0, 10.0]}, {"west": -3.0, "east": 6.0}, {"west": -3.0, "east": 6.0}),
     ],
 )
-def test_offsets_are_found_beside_the_materials(tmp_path, exact, offset, planted_db, found):
+def test_offsets_are_fitted_with_the_materials(tmp_path, exact, offset, planted_db, found):
     shifted = exact.assign(path_loss_db=exact.path_loss_db + exact.half.map(planted_db))
     result = run(tmp_path, shifted, offset=offset)
     assert result.nuisance.offsets_db == pytest.approx(found, abs=1e-4)
@@ -160,7 +160,7 @@ def test_an_offset_stays_within_its_bounds(tmp_path, exact):
     assert run(tmp_path, shifted, offset={"bounds": [-1.0, 1.5]}).nuisance.offsets_db == {"": 1.5}
 
 
-def test_without_a_section_there_is_no_offset(tmp_path, exact):
+def test_a_study_without_offset_has_none(tmp_path, exact):
     result = run(tmp_path, exact.assign(path_loss_db=exact.path_loss_db + 4.0))
     assert (
         result.nuisance.offsets_db,
@@ -174,12 +174,12 @@ def test_without_a_section_there_is_no_offset(tmp_path, exact):
     assert result.rmse_db > 0.5
 
 
-def test_a_group_held_out_as_a_whole_has_no_offset_to_be_judged_with(tmp_path, exact):
+def test_a_group_that_is_held_out_completely_is_refused(tmp_path, exact):
     with pytest.raises(InputError, match="group 'east' has held-out links but no calibration link"):
         run(tmp_path, exact, offset={"per": "half"}, holdout={"where": "half == 'east'"})
 
 
-def test_the_log_distance_rival_is_fitted_to_the_calibration_links_alone(tmp_path, exact):
+def test_the_log_distance_baseline_is_fitted_to_the_calibration_links_only(tmp_path, exact):
     distance = np.linalg.norm(exact[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
     law = exact.assign(path_loss_db=40 + 23 * np.log10(distance) + 9.0 * (exact.rx_x > 10))
     result = run(tmp_path, law, holdout={"where": "rx_x > 10"})
@@ -208,7 +208,7 @@ def blocked(tmp_path_factory) -> dict[str, Result]:
     }
 
 
-def test_a_link_without_a_path_is_told_and_left_out(blocked):
+def test_a_link_without_a_path_is_reported_and_left_out(blocked):
     result = blocked["left out"]
     assert result.links.row[~result.links.has_path].tolist() == [planted.INSIDE + 2]
     assert np.isinf(result.links.before_db[planted.INSIDE])
@@ -238,7 +238,7 @@ def test_a_study_without_any_path_is_refused(tmp_path):
         )
 
 
-def test_of_a_parameter_on_a_logarithmic_scale_the_logarithm_is_uncertain(tmp_path):
+def test_the_interval_does_not_depend_on_the_scale_of_the_search(tmp_path):
     replay, noisy = planted.engine(), planted.campaign(noise_db=0.02)
     logarithmic = Parameters(tuple(replace(parameter, scale="log") for parameter in replay.parameters))
     sections = {name: {"bounds": planted.BOUNDS, "scale": "log"} for name in planted.TRUTH}
@@ -255,7 +255,7 @@ def test_of_a_parameter_on_a_logarithmic_scale_the_logarithm_is_uncertain(tmp_pa
         assert interval.lower < value < interval.upper
 
 
-def test_the_search_space_is_the_logarithm_where_asked_for():
+def test_a_logarithmic_parameter_is_searched_by_its_logarithm():
     parameters = Parameters(
         (
             Parameter("walls.relative_permittivity", 1.5, 12.0, 5.0),
@@ -271,7 +271,7 @@ def test_the_search_space_is_the_logarithm_where_asked_for():
     assert parameters.search_slope(values)[0] == pytest.approx((ahead - behind)[0] / (2 * step))
 
 
-def test_a_surrogate_sees_permittivities_on_a_logarithmic_scale_where_told_to(tmp_path, exact):
+def test_a_surrogate_uses_the_scale_of_a_parameter(tmp_path, exact):
     def history(**options):
         method = {"name": "vector-surrogate", "options": {"budget": 9, **options}}
         return run(tmp_path, exact, None, method=method).history.rmse_db.tolist()
@@ -293,12 +293,12 @@ def test_an_unknown_method_is_refused_before_any_work(tmp_path, exact, method, m
     assert planted.engine().calls == calls
 
 
-def test_an_option_that_a_method_lacks_is_refused(tmp_path, exact):
+def test_an_unknown_option_of_a_method_is_refused(tmp_path, exact):
     with pytest.raises(InputError, match=r"method\.options\.wolfes: the method 'gwo' has no such setting"):
         run(tmp_path, exact, None, method={"name": "gwo", "options": {"wolfes": 3}})
 
 
-def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(tmp_path):
+def test_a_group_without_a_path_is_named_and_only_held_out_links_are_judged(tmp_path):
     """The receiver in the building is a group of its own; of two links held out one has no path."""
     table = planted.campaign(noise_db=0.1).assign(place=lambda each: each.half)
     table.loc[planted.INSIDE, "place"] = "cellar"
@@ -306,7 +306,7 @@ def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(
     result = calibrate(study, engine=planted.engine(blocked=True))
     assert sorted(result.nuisance.offsets_db) == ["east", "west"]
     assert result.nuisance.groups_without_path == ("cellar",)
-    assert re.search(r"^cellar +no link with a path$", render(offsets(result)), re.MULTILINE)
+    assert re.search(r"^cellar +no link with a path$", render(nuisances(result)), re.MULTILINE)
     assert result.content()["nuisance"]["groups_without_path"] == ["cellar"]
 
     held = planted.study(
@@ -318,7 +318,7 @@ def test_a_group_without_a_path_is_named_and_what_is_held_out_is_what_is_judged(
     assert result.holdout_rmse_db == pytest.approx(abs(judged.after_db - judged.measured_db).item(), abs=1e-9)
 
 
-def test_antennas_inside_bodies_are_known_before_the_calibration_and_to_python(tmp_path, monkeypatch):
+def test_antennas_inside_bodies_are_reported(tmp_path, monkeypatch):
     table = planted.campaign(blocked=False).assign(**planted.links(blocked=True)[["rx_x", "rx_y", "rx_z"]])
     seen = []
     original = Setup.enclosed.func

@@ -1,50 +1,12 @@
-"""Bad input: exit code 2, one message that names the place and the remedy, no traceback, nothing written."""
+"""Bad input: exit status 2, one message with file, value and remedy, no traceback, no files."""
 
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from calibray.cli.app import app
-
-SCENE = """<scene version="2.1.0">
-  <bsdf type="itu-radio-material" id="mat-walls"><string name="type" value="brick"/></bsdf>
-  <shape type="ply" id="mesh-house"><string name="filename" value="house.ply"/><ref id="mat-walls" name="bsdf"/></shape>
-</scene>
-"""
-MESH = """ply
-format ascii 1.0
-element vertex 3
-property float x
-property float y
-property float z
-element face 1
-property list uchar int vertex_indices
-end_header
--50 5 0
-50 5 0
-0 5 40
-3 0 1 2
-"""
-LINKS = "x,y,loss,half\n10,0,70.0,a\n20,0,76.0,b\n30,1,80.0,b\n"
-STUDY = """version = 1
-[scene]
-file = "scene.xml"
-frequency = 3.5e9
-[links]
-file = "links.csv"
-tx = [0.0, 0.0, 2.0]
-rx = ["x", "y", 1.5]
-value = "loss"
-[trace]
-max_depth = 1
-samples = 1000
-[parameters]
-"walls.relative_permittivity" = { bounds = [1.5, 12.0] }
-"""
+from commands import STUDY, run, write_wall_study
 
 CASES = {
     "no scene": ("study.toml", ('"scene.xml"', '"absent.xml"'), ["absent.xml", "no such file"]),
@@ -124,28 +86,13 @@ CASES = {
 }
 
 
-def write(folder: Path) -> Path:
-    for name, text in {
-        "study.toml": STUDY,
-        "scene.xml": SCENE,
-        "house.ply": MESH,
-        "links.csv": LINKS,
-    }.items():
-        (folder / name).write_text(text)
-    return folder / "study.toml"
-
-
-def run(*arguments: object):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
-    return write(tmp_path)
+    return write_wall_study(tmp_path)
 
 
-def test_the_unspoilt_study_runs(study):
+def test_the_study_runs_without_faults(study):
     assert tomllib.loads(STUDY)["version"] == 1
     outcome = run("run", study, "--out", study.parent / "out")
     assert outcome.exit_code == 0, outcome.output
@@ -153,7 +100,7 @@ def test_the_unspoilt_study_runs(study):
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case[2] is not None])
-def test_every_fault_is_one_message_that_names_place_and_remedy(study, name):
+def test_every_fault_is_one_message_with_file_and_remedy(study, name):
     file, (old, new), words = CASES[name]
     path = study.with_name(file)
     assert old in path.read_text()
@@ -168,7 +115,7 @@ def test_every_fault_is_one_message_that_names_place_and_remedy(study, name):
     assert sorted(study.parent.rglob("*")) == before
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(study):
+def test_an_invalid_output_folder_is_refused_first(study):
     outcome = run("run", study, "--out", study.parent / "links.csv" / "out")
     assert outcome.exit_code == 2
     assert "output folder" in outcome.stderr
@@ -178,13 +125,13 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(study):
     "arguments", [("run", "{study}", "--out", "{out}", "--engine", "rerun"), ("predict", "{out}", "{study}")]
 )
 def test_bad_arguments(study, arguments):
-    places = {"study": study, "out": study.parent / "out"}
-    outcome = run(*(argument.format(**places) for argument in arguments))
+    paths = {"study": study, "out": study.parent / "out"}
+    outcome = run(*(argument.format(**paths) for argument in arguments))
     assert outcome.exit_code == 2
     assert outcome.stderr.startswith("Error: ")
 
 
-def test_the_installed_program_exits_with_2_and_no_traceback(study):
+def test_the_process_exits_with_2_and_no_traceback(study):
     study.write_text(STUDY.replace("version = 1", "version = 2"))
     program = [sys.executable, "-c", "from calibray.cli import main; main()"]
     finished = subprocess.run(
@@ -195,6 +142,6 @@ def test_the_installed_program_exits_with_2_and_no_traceback(study):
     )
     assert finished.returncode == 2
     assert finished.stdout == ""
-    # A busy machine tells first that it is still starting.
+    # On a busy machine, a line of progress precedes the message.
     assert finished.stderr.splitlines()[-1].startswith("Error: ")
     assert "Traceback" not in finished.stderr

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: streams, exit status, messages."""
+"""Streams, exit status and messages of the command line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from calibray import doctor as diagnosis
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
-from calibray.reporting.doctor_table import table
 from calibray.tables.text import render
 
 HEAVY = (
@@ -41,7 +40,7 @@ def calibray(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def failing_app():
-    """A command line built as Calibray's is, whose commands fail in every way."""
+    """A command line like Calibray's, with commands that fail."""
     commands = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
 
     @commands.command()
@@ -76,7 +75,7 @@ def test_help_lists_the_commands_on_stdout():
         run = calibray(option)
         assert (run.returncode, run.stderr) == (0, "")
         assert "doctor" in run.stdout
-        # Each with all of its summary, however long.
+        # Every summary is complete.
         assert "..." not in run.stdout.replace("[ARGS]...", "")
 
 
@@ -94,12 +93,12 @@ def test_a_wrong_command_line_is_bad_input(arguments):
         ("engine-failure", 1, "Error: the engine ended with 9\n"),
     ],
 )
-def test_an_expected_failure_is_one_message_on_stderr(failing_app, command, status, message):
+def test_an_expected_failure_is_one_message(failing_app, command, status, message):
     result = CliRunner().invoke(failing_app, [command])
     assert (result.exit_code, result.stdout, result.stderr) == (status, "", message)
 
 
-def test_a_mistake_of_ours_is_not_hidden(failing_app):
+def test_an_unexpected_error_is_not_hidden(failing_app):
     result = CliRunner().invoke(failing_app, ["mistake"])
     assert isinstance(result.exception, ZeroDivisionError)
 
@@ -114,10 +113,10 @@ def test_the_real_app_reports_failures_the_same_way(monkeypatch):
 
 
 @pytest.mark.parametrize(("passed", "status"), [(True, 0), (False, 1)])
-def test_doctor_prints_its_table_and_ends_with_its_verdict(monkeypatch, passed, status):
+def test_doctor_prints_its_table_and_fails_if_a_check_failed(monkeypatch, passed, status):
     check = diagnosis.Check("JAX", passed, "cpu:0", "install JAX")
     found = diagnosis.Diagnosis((("python", "3.11"),), "llvm_ad_mono_polarized", 0, (), (check,))
     monkeypatch.setattr(diagnosis, "examine", lambda: found)
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stderr) == (status, "")
-    assert result.stdout == render(table(found)) + "\n"
+    assert result.stdout == render(found.table()) + "\n"

@@ -1,4 +1,4 @@
-"""Commands that trace nothing work where the ray tracer cannot: its libLLVM is unusable."""
+"""Commands that do not trace work without a usable libLLVM."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from test_cli_run import write_study
 
 import programs
 from calibray.calibration.result import Result
 from calibray.engines import Ledger
 from calibray.engines.ledger.answers import LedgerEntry, key
 from calibray.tracing.llvm import PATH_VARIABLE
+from commands import write_study
 
 
 @pytest.fixture
 def calibray(tmp_path):
-    """Run a command in a process of its own, for which a text file stands in for libLLVM."""
+    """Run a command in a subprocess with a text file as libLLVM."""
     (tmp_path / "libLLVM.so.19.1").write_text("no library\n")
     environment = {
         **os.environ,
@@ -53,14 +53,14 @@ def test_an_external_program_is_calibrated(calibray, tmp_path):
     assert list(Result.load(tmp_path / "out").parameters.values()) == pytest.approx(programs.TRUTH, abs=0.5)
 
 
-def test_what_traces_says_why_it_cannot(calibray, tmp_path):
-    """The negative control: the library is unusable indeed, and a command that needs it ends in one message."""
+def test_a_command_that_traces_reports_the_library(calibray, tmp_path):
+    """The negative control: the library is unusable, and a command that needs it ends with one message."""
     content = programs.content(tmp_path)
     del content["engine"]
     write_study(tmp_path, content)
     refused = calibray("trace", tmp_path / "study.toml", "-o", tmp_path / "paths.h5")
     assert (refused.returncode, refused.stdout) == (2, "")
-    # A busy machine tells first that it is still starting.
+    # On a busy machine, a line of progress precedes the message.
     message = refused.stderr.splitlines()[-1]
     assert message.startswith("Error: ")
     assert PATH_VARIABLE in message

@@ -1,4 +1,4 @@
-"""`calibray scene`: what a new user types, what is printed, and what is refused."""
+"""`calibray scene` and `calibray doctor` on scenes: output and refused input."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
 app.add_typer(scene)
 
 
-def typed(*words: object) -> tuple[int, str, str]:
+def scene_command(*words: object) -> tuple[int, str, str]:
     """Exit status, stdout and stderr of a command."""
     result = CliRunner().invoke(app, ["scene", *map(str, words)])
     return result.exit_code, result.stdout, result.stderr
@@ -37,29 +37,29 @@ def test_an_extract_becomes_a_scene(tmp_path):
             ([(x + 20, y) for x, y in SQUARE], {"building": "yes"}),
         ],
     )
-    out = tmp_path / "scene"
-    status, told, heard = typed(
-        "osm", extract, "--out", out, "--wall", "brick:0.24", "--roof", "wall", "--window-share", 0.3,
+    folder = tmp_path / "scene"
+    status, out, err = scene_command(
+        "osm", extract, "--out", folder, "--wall", "brick:0.24", "--roof", "wall", "--window-share", 0.3,
         "--origin", "11.5755,48.1374", "--utm", "--default-height", 7,
     )  # fmt: skip
-    assert (status, heard.strip()) == (0, "Making a scene of 2 buildings")
-    assert "1 buildings: way-2" in told
-    assert "EPSG:32632" in told
-    materials = read_scene(out / "scene.xml", 3.5e9).materials
+    assert (status, err.strip()) == (0, "Making a scene with 2 buildings")
+    assert "1 buildings: way-2" in out
+    assert "EPSG:32632" in out
+    materials = read_scene(folder / "scene.xml", 3.5e9).materials
     assert list(materials) == ["walls", "windows", "ground"]
     assert materials["walls"].thickness == 0.24
-    assert read_frame(out / "scene.xml").crs == "EPSG:32632"
+    assert read_frame(folder / "scene.xml").crs == "EPSG:32632"
 
 
 def test_a_plan_becomes_a_scene(tmp_path):
     plan = tmp_path / "plan.csv"
     plan.write_text("x0,y0,x1,y1,type\n0,0,5000,0,drywall\n5000,0,5000,4000,brick\n5000,4000,0,0,brick\n")
-    status, told, _ = typed(
+    status, out, _ = scene_command(
         "plan", plan, "-o", tmp_path / "flat", "--unit", 0.001, "--material", "drywall=plasterboard:0.1",
         "--no-ceiling",
     )  # fmt: skip
     assert status == 0
-    assert "5 m x 4 m" in told
+    assert "5 m x 4 m" in out
     assert set(read_scene(tmp_path / "flat" / "scene.xml", 3.5e9).materials) == {
         "brick_wall",
         "drywall",
@@ -70,18 +70,18 @@ def test_a_plan_becomes_a_scene(tmp_path):
 def test_footprints_become_a_scene(tmp_path):
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
     # GDAL reads the extract as a layer of polygons with a column of other tags.
-    status, told, _ = typed(
+    status, out, _ = scene_command(
         "footprints", extract, "-o", tmp_path / "out", "--height", 8, "--layer", "multipolygons"
     )
     assert status == 0
-    assert "0.0 m to 8.0 m high" in told
+    assert "0.0 m to 8.0 m high" in out
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["osm", "nowhere.osm", "-o", "out"], "does not exist"),
-        (["osm", "town.osm", "-o", "out", "--utm"], "--utm: needs --origin"),
+        (["osm", "town.osm", "-o", "out", "--utm"], "--utm needs --origin"),
         (["osm", "town.osm", "-o", "out", "--origin", "48"], "must be longitude and latitude"),
         (["osm", "town.osm", "-o", "out", "--wall", "brik"], "did you mean 'brick'"),
         (["osm", "town.osm", "-o", "out", "--wall", "brick:thick"], "'thick' is no thickness"),
@@ -91,36 +91,36 @@ def test_footprints_become_a_scene(tmp_path):
         (["plan", "plan.csv", "-o", "out", "--material", "brick"], "must be TYPE=ITU"),
     ],
 )
-def test_what_cannot_be_made_is_told_in_a_line(tmp_path, monkeypatch, words, message):
+def test_bad_input_is_refused_with_one_message(tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     write_extract(Path("town.osm"), [(SQUARE, {"building": "yes"})])
-    status, told, heard = typed(*words)
-    assert (status, told) == (2, "")
-    assert message in heard
+    status, out, err = scene_command(*words)
+    assert (status, out) == (2, "")
+    assert message in err
     assert not Path("out").exists()
 
 
-def test_a_diagnosis_is_told(tmp_path):
+def test_a_scene_is_checked(tmp_path):
     canyon = check_scene("sionna:simple_street_canyon")
-    text = render(*report.diagnosed(canyon), report.objects(canyon))
+    text = render(*report.findings(canyon), report.objects(canyon))
     assert "can be used" in text
     assert "12 of 12 faces with the normal inward" in text
     assert "building_6" in text
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
-    typed("osm", extract, "-o", tmp_path / "out")
-    assert "Findings" not in render(*report.diagnosed(check_scene(tmp_path / "out" / "scene.xml")))
+    scene_command("osm", extract, "-o", tmp_path / "out")
+    assert "Findings" not in render(*report.findings(check_scene(tmp_path / "out" / "scene.xml")))
 
 
-def doctored(*words: object) -> tuple[int, str, str]:
+def doctor_command(*words: object) -> tuple[int, str, str]:
     """Exit status, stdout and stderr of `calibray doctor`."""
     result = CliRunner().invoke(calibray, ["doctor", *map(str, words)])
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_a_doctor_of_scenes_and_studies(tmp_path):
+def test_doctor_checks_scenes_and_studies(tmp_path):
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes", "height": "12"})])
     assert CliRunner().invoke(calibray, ["scene", "osm", str(extract), "-o", str(tmp_path)]).exit_code == 0
-    status, out, _ = doctored(tmp_path / "scene.xml")
+    status, out, _ = doctor_command(tmp_path / "scene.xml")
     assert status == 0
     assert "can be used" in out
     assert "Objects" in out
@@ -131,19 +131,19 @@ def test_a_doctor_of_scenes_and_studies(tmp_path):
         '[parameters]\n"walls.relative_permittivity" = { bounds = [1.5, 12.0] }\n'
     )
     picture = tmp_path / "antennas.png"
-    assert doctored(tmp_path / "study.toml", "--plot", picture)[0] == 0
+    assert doctor_command(tmp_path / "study.toml", "--plot", picture)[0] == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
-    status, _, err = doctored(tmp_path / "study.toml", "--plot", tmp_path / "links.csv")
-    assert (status, "cannot draw a .csv file" in err) == (2, True)
-    assert doctored(tmp_path / "scene.xml", "--plot", picture)[0] == 2
-    assert doctored("--plot", picture)[0] == 2
+    status, _, err = doctor_command(tmp_path / "study.toml", "--plot", tmp_path / "links.csv")
+    assert (status, "the suffix '.csv' is unknown" in err) == (2, True)
+    assert doctor_command(tmp_path / "scene.xml", "--plot", picture)[0] == 2
+    assert doctor_command("--plot", picture)[0] == 2
 
 
-def test_a_scene_that_cannot_be_used_fails(tmp_path):
-    """The negative control: a mesh called like a material, which Sionna RT refuses."""
+def test_doctor_fails_on_an_unusable_scene(tmp_path):
+    """The negative control: a mesh with the name of a material, which Sionna RT refuses."""
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes", "height": "12"})])
     CliRunner().invoke(calibray, ["scene", "osm", str(extract), "-o", str(tmp_path)])
     file = tmp_path / "scene.xml"
     file.write_text(file.read_text().replace("mesh-all-walls", "mesh-walls"))
-    status, out, _ = doctored(file)
-    assert (status, "cannot be used as it is" in out) == (1, True)
+    status, out, _ = doctor_command(file)
+    assert (status, "cannot be used" in out) == (1, True)

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from test_cli_run import write_study
 from typer.testing import CliRunner
 
 import programs
@@ -28,6 +27,7 @@ from calibray.engines import open_ledger
 from calibray.errors import EngineError
 from calibray.study import Study
 from calibray.support import interruption
+from commands import write_study
 
 # Its standard input becomes the controlling terminal. A background job inherits that Ctrl-C is ignored: reset.
 COMMAND = [
@@ -139,7 +139,7 @@ def test_ctrl_c_prints_the_kept_calls_and_the_same_command_continues(monkeypatch
     kept = kept_calls(out)
     assert kept >= 3
     assert f"Kept: {kept} RT calls in" in plain
-    assert "Start the same command again to go on" in plain
+    assert "Start the same command again to continue" in plain
     assert "Traceback" not in plain
     calls_before = len(programs.calls(tmp_path))
     monkeypatch.setenv("CALIBRAY_CACHE", "")

@@ -1,4 +1,4 @@
-"""Commands whose output nobody watches: while any one step lasts, lines of progress keep coming."""
+"""Commands without a terminal print lines of progress while any slow step lasts."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pathlib import Path
 from threading import Timer
 
 import pytest
-from test_cli_run import write_study
 
 import programs
+from commands import write_study
 
 TOWN = Path(__file__).parents[2] / "examples" / "bring_your_own" / "town.osm"
 LONGEST = 10.0
-"""Time that a redirected command may be silent [s]."""
+"""Longest time without a line [s]."""
 LASTS = 25.0
-"""Time that every slow step lasts [s], by the clock of the lines: each stands for `progress.EVERY`."""
+"""Duration of every slow step [s], counted in lines: each line counts as `LINE_INTERVAL`."""
 DEADLINE = 300.0
-"""Time after which a command that prints nothing more is ended, and the test fails [s]."""
+"""Time after which a silent command is killed and the test fails [s]."""
 SLOW = """
 import importlib, time
 from pathlib import Path
@@ -32,33 +32,33 @@ def last(name):
         time.sleep(0.005)
 """
 PRELUDE = """
-from calibray.cli import main, progress
+from calibray.cli import main, progress_bars
 
-print("every", progress.EVERY, flush=True)
-progress.EVERY = 0.02
+print("every", progress_bars.LINE_INTERVAL, flush=True)
+progress_bars.LINE_INTERVAL = 0.02
 
-def slow(place):
-    home, _, name = place.rpartition(".")
+def slow(function):
+    home, _, name = function.rpartition(".")
     module = importlib.import_module(home)
     quick = getattr(module, name)
-    setattr(module, name, lambda *words, **named: (last(place), quick(*words, **named))[1])
+    setattr(module, name, lambda *words, **named: (last(function), quick(*words, **named))[1])
 """
 LINE = re.compile(r"[a-z].*, \d+ s(, about \d+ s left)?")
 
 
 def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict[str, float], str]:
-    """Run a command whose output is a pipe, and end each slow step when lines for `LASTS` came while it lasted.
+    """Run a command with its output in a pipe; each slow step ends once lines for `LASTS` seconds were printed.
 
     Args:
-        folder: Where it runs.
-        slow: Functions of the package that are made to last.
+        folder: Working directory.
+        slow: Functions of the package that are made slow.
         words: The command line.
 
     Returns:
-        Exit status, how long each slow step lasted by its lines [s], and all that was printed.
+        Exit status, duration of each slow step by its lines [s], and the output.
     """
-    code = "\n".join([SLOW, PRELUDE, *(f"slow({place!r})" for place in slow), "main()"])
-    told: Counter[str] = Counter()
+    code = "\n".join([SLOW, PRELUDE, *(f"slow({function!r})" for function in slow), "main()"])
+    lines: Counter[str] = Counter()
     printed = []
     with subprocess.Popen(
         [sys.executable, "-c", code, *map(str, words)], cwd=folder, env={**os.environ, "CALIBRAY_CACHE": ""},
@@ -68,7 +68,7 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
         deadline.start()
         assert process.stdout is not None
         every = float(process.stdout.readline().split()[1])
-        # Two spells of work, one after the other: the last line of one comes just before the other begins.
+        # Between two consecutive progress displays, two intervals can pass without a line.
         assert 2 * every < LONGEST
         for text in process.stdout:
             printed.append(text)
@@ -77,12 +77,12 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
             for begun in folder.glob("*.begun"):
                 over = begun.with_suffix(".over")
                 if not over.exists():
-                    told[begun.stem] += 1
-                    if told[begun.stem] * every >= LASTS:
+                    lines[begun.stem] += 1
+                    if lines[begun.stem] * every >= LASTS:
                         over.touch()
         status = process.wait()
         deadline.cancel()
-    return status, {step: lines * every for step, lines in told.items()}, "".join(printed)
+    return status, {step: count * every for step, count in lines.items()}, "".join(printed)
 
 
 @pytest.mark.parametrize(
@@ -97,14 +97,14 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
     ids=["a program's call", "the steps before and after"],
 )  # fmt: skip
 def test_a_calibration_whose_steps_last(tmp_path, slow):
-    """One call of a program that says nothing; checks before it, the search about it, the report after it."""
+    """One silent call of an external program, the checks before it, the search, and the report after it."""
     method = {"name": "auto", "options": {"budget": 18}}
     before = "" if slow else f"{SLOW}\nlast('program')"
     write_study(tmp_path, programs.content(tmp_path, before, timeout=DEADLINE) | {"method": method})
-    status, told, printed = redirected(tmp_path, slow, "run", "study.toml", "--out", "out")
+    status, durations, printed = redirected(tmp_path, slow, "run", "study.toml", "--out", "out")
     assert status == 0, printed
-    assert set(told) == set(slow or ["program"])
-    assert min(told.values()) >= LASTS
+    assert set(durations) == set(slow or ["program"])
+    assert min(durations.values()) >= LASTS
 
 
 def test_a_scene_whose_steps_last(tmp_path):
@@ -112,8 +112,8 @@ def test_a_scene_whose_steps_last(tmp_path):
         "calibray.scenes.authoring.read_openstreetmap",
         "calibray.scenes.authoring.make_scene",
     ]
-    status, told, printed = redirected(tmp_path, slow, "scene", "osm", TOWN, "--out", "town")
+    status, durations, printed = redirected(tmp_path, slow, "scene", "osm", TOWN, "--out", "town")
     assert status == 0, printed
-    assert set(told) == set(slow)
+    assert set(durations) == set(slow)
     assert "reading, " in printed
     assert "making, " in printed

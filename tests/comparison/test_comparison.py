@@ -248,12 +248,12 @@ def test_markdown_has_a_row_for_each_method(small):
         ({"names": ["gwoo"]}, "method 'gwoo': there is no such method; did you mean 'gwo'"),
         (
             {"names": ["gwo@x"]},
-            "'gwo@x': a budget of x RT calls; it must be a whole number from 24 to 1,000,000",
+            "'gwo@x': the budget x must be a whole number of RT calls from 24 to 1,000,000",
         ),
-        ({"names": ["gwo@-60"]}, "a budget of -60"),
-        ({"names": ["gwo"], "budget": 10}, "a budget of 10 RT calls"),
-        ({"names": []}, "none is named"),
-        ({"names": ["gwo"], "seeds": 0}, "seeds = 0; it must be 1 to 10,000"),
+        ({"names": ["gwo@-60"]}, "the budget -60 must be"),
+        ({"names": ["gwo"], "budget": 10}, "the budget 10 must be"),
+        ({"names": []}, "the list is empty"),
+        ({"names": ["gwo"], "seeds": 0}, "seeds = 0: must be 1 to 10,000"),
         ({"names": ["gwo"], "workers": 0}, "workers = 0"),
     ],
 )

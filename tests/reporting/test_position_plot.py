@@ -1,20 +1,18 @@
-"""The drawing of antennas over a scene."""
+"""The plan of a scene with the antennas."""
 
 from calibray.reporting.position_plot import draw_positions
 from calibray.scenes.authoring import make_scene
 from planted_maps import L_SHAPE, footprints
 
 
-def test_a_drawing_shows_the_antennas_over_the_footprints(tmp_path):
+def test_a_plan_shows_the_antennas_and_the_footprints(tmp_path):
     made = make_scene(footprints([L_SHAPE], [10.0]), tmp_path)
-    figure = draw_positions(
-        made.path, [[0, 0, 10]], [[5, 5, 1.5], [40, 5, 1.5]], {"within a building": [[5, 5, 1.5]]}
-    )  # fmt: skip
+    figure = draw_positions(made.path, [[0, 0, 10]], [[5, 5, 1.5], [40, 5, 1.5]])
     (axes,) = figure.axes
     labels = {text.get_text() for text in axes.get_legend().get_texts()}
-    assert labels == {"2 receivers", "1 transmitters", "1 within a building"}
-    # Roofs and walls; the ground is left out.
-    assert len(axes.collections) - 3 == 2
+    assert labels == {"2 receivers", "1 transmitters"}
+    # Two collections of antennas, one of roofs and one of walls; the ground is left out.
+    assert len(axes.collections) == 4
     figure.savefig(tmp_path / "map.svg")
     figure.savefig(tmp_path / "map.png")
     assert (tmp_path / "map.svg").read_text().startswith("<?xml")

@@ -28,7 +28,7 @@ def file(tmp_path_factory):
     """A report of 60 links; a material and a group have hostile names."""
     result, shown = made_up(60, 40, names=(HOSTILE, "ground"), groups=(HOSTILE, "south"))
     target = tmp_path_factory.mktemp("report") / "report.html"
-    target.write_text(write(result, shown, figures.every(result, shown.links)), encoding="utf-8")
+    target.write_text(write(result, shown, figures.result_figures(result, shown.links)), encoding="utf-8")
     return target
 
 
@@ -112,7 +112,7 @@ def test_a_click_on_a_link_shows_its_paths(opened):
     assert chosen != first
     assert page.locator("#facts h3").inner_text().startswith(f"Row {chosen}, ")
     assert page.locator("#paths tr").count() == 12
-    assert page.locator("#map-said").inner_text().startswith(f"Row {chosen}, ")
+    assert page.locator("#map-text").inner_text().startswith(f"Row {chosen}, ")
 
 
 def test_a_click_into_the_scene_chooses_a_link(opened):

@@ -1,4 +1,4 @@
-"""The report: every section is there, nothing is loaded, names are text, and it says what the data say."""
+"""The report page: sections, embedded data, escaped names, and sentences that agree with the data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import calibray as cb
@@ -21,10 +20,10 @@ from calibray.paths import Kind
 from calibray.reporting import page as reports
 from calibray.reporting.link_map import plan, ramp
 from calibray.reporting.link_survey import survey
-from calibray.reporting.rays import INTERACTIONS, PER_LINK, strongest
-from calibray.reporting.scene_mesh import Grid
-from calibray.reporting.value_list import values
-from calibray.reporting.wording import summary
+from calibray.reporting.result_tables import values
+from calibray.reporting.summary import summary
+from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
+from calibray.result.held_out import Judgement
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.building_outlines import _loops
 from calibray.uncertainty.linear_theory import Interval
@@ -38,7 +37,7 @@ HOSTILE = "</script><script>hostile()</script>\u2028<img src=x onerror=hostile()
 
 
 class Page(HTMLParser):
-    """What a browser would find: ids, tags, what is referred to, scripts, and the text that people read."""
+    """Ids, tags, references, scripts and text of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -48,17 +47,19 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        given = dict(attrs)
-        if "id" in given:
-            self.ids.append(given["id"])
+        attributes = dict(attrs)
+        if "id" in attributes:
+            self.ids.append(attributes["id"])
         self.references += [
-            given[name] for name in ("href", "src", "xlink:href", "action", "data", "srcset") if name in given
+            attributes[name]
+            for name in ("href", "src", "xlink:href", "action", "data", "srcset")
+            if name in attributes
         ]
-        self.references += re.findall(r"url\(([^)]*)\)", given.get("style") or "")
+        self.references += re.findall(r"url\(([^)]*)\)", attributes.get("style") or "")
         if tag in ("script", "style"):
             self._inside.append(tag)
             self.scripts.append("")
-        assert not any(name.startswith("on") for name in given), (tag, attrs)
+        assert not any(name.startswith("on") for name in attributes), (tag, attrs)
 
     def handle_endtag(self, tag):
         if tag in ("script", "style"):
@@ -77,7 +78,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory) -> Result:
-    """A calibration with an offset per half, a hold-out, and a link without a path; the groups have hostile names."""
+    """A calibration with an offset per half, held-out links, a link without a path, and a hostile group name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", "")
         table = planted.campaign(noise_db=0.3, blocked=True)
@@ -103,53 +104,53 @@ def written(result, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(written) -> Page:
+def html(written) -> Page:
     return Page((written / "report.html").read_text(encoding="utf-8"))
 
 
-def test_every_section_is_there(found):
-    assert set(found.ids) >= SECTIONS
-    assert len(found.ids) == len(set(found.ids))
+def test_every_section_is_there(html):
+    assert set(html.ids) >= SECTIONS
+    assert len(html.ids) == len(set(html.ids))
     assert {"figure-convergence", "figure-cumulative-cost", "figure-path-loss", "figure-residual-over-distance",
-            "figure-residual-by-group"} <= set(found.ids)  # fmt: skip
+            "figure-residual-by-group"} <= set(html.ids)  # fmt: skip
 
 
-def test_nothing_is_loaded_from_anywhere(found, written):
-    inner = {f"#{name}" for name in found.ids}
-    for reference in found.references:
+def test_nothing_is_loaded_from_anywhere(html, written):
+    inner = {f"#{name}" for name in html.ids}
+    for reference in html.references:
         assert reference in inner or reference.startswith("data:"), reference
-    assert not {"iframe", "object", "embed", "form", "base", "img"} & set(found.tags)
+    assert not {"iframe", "object", "embed", "form", "base", "img"} & set(html.tags)
     text = (written / "report.html").read_text(encoding="utf-8")
     assert "://" not in text
     assert "default-src 'none'" in text
-    assert not re.search(r"url\((?!#|&#34;#|data:)", "".join(found.scripts[:1]))
+    assert not re.search(r"url\((?!#|&#34;#|data:)", "".join(html.scripts[:1]))
 
 
-def test_hostile_names_are_text(found, result):
-    assert HOSTILE in found.words
-    assert HOSTILE in found.data["groups"]
+def test_hostile_names_are_text(html, result):
+    assert HOSTILE in html.words
+    assert HOSTILE in html.data["groups"]
     # The page's own three: style, data and viewer.
-    assert len(found.scripts) == 3
-    assert "\u2028" not in found.scripts[1]
+    assert len(html.scripts) == 3
+    assert "\u2028" not in html.scripts[1]
 
 
-def test_data_of_the_page_are_those_of_the_result(found, result):
-    links = found.data["links"]
+def test_embedded_data_equal_the_result(html, result):
+    links = html.data["links"]
     table = result.links
     assert links["row"] == table.row.tolist()
     assert links["measured"] == pytest.approx(table.measured_db.tolist(), abs=0.0051)
     after = [np.inf if value is None else value for value in links["after"]]
     assert after == pytest.approx(table.after_db.tolist(), abs=0.0051)
     assert sum(links["held"]) == table.held_out.sum() > 0
-    words = " ".join(found.words.split())
-    assert f"RMSE is {result.holdout_rmse_db:.2f} dB" in words
+    words = " ".join(html.words.split())
+    assert f"RMSE {result.holdout_rmse_db:.2f} dB" in words
     for name, value in result.parameters.items():
         assert name in words
         assert f"{value:.4g}" in words
 
 
-def test_interaction_points_make_paths_of_the_traced_length(result):
-    """The points that are drawn, with the link's ends, add up to each path's delay."""
+def test_drawn_paths_have_the_traced_length(result):
+    """The lengths between the drawn points add up to each path's delay."""
     paths = result.paths
     for path in range(paths.num_paths):
         link = paths.link[path]
@@ -159,14 +160,14 @@ def test_interaction_points_make_paths_of_the_traced_length(result):
         assert length == pytest.approx(paths.delay[path] * 299_792_458, rel=1e-5)
 
 
-def test_the_strongest_paths_hold_the_power_of_the_link(result):
+def test_the_strongest_paths_have_the_power_of_the_link(result):
     shown = strongest(result.paths, result)
     assert (np.diff(shown.paths.link) >= 0).all()
     for link in np.unique(shown.paths.link):
-        own = shown.gain_db[shown.paths.link == link]
-        assert (np.diff(own) <= 0).all()
-        assert len(own) <= PER_LINK
-    # No link of this scene has more paths than are kept, so their power is the link's.
+        gains = shown.gain_db[shown.paths.link == link]
+        assert (np.diff(gains) <= 0).all()
+        assert len(gains) <= PER_LINK
+    # No link of this scene has more paths than are shown, so their power is that of the link.
     assert shown.paths.num_paths == shown.traced
     power = np.bincount(shown.paths.link, 10 ** (shown.gain_db / 10), len(result.links))
     reached = power > 0
@@ -174,11 +175,11 @@ def test_the_strongest_paths_hold_the_power_of_the_link(result):
     assert -10 * np.log10(power[reached]) + offset[reached] == pytest.approx(
         result.links.after_db[reached], abs=1e-3
     )
-    assert shown.meets["concrete"] > 0
-    assert shown.meets["glass"] == 0
+    assert shown.links_by_material["concrete"] > 0
+    assert shown.links_by_material["glass"] == 0
 
 
-def test_of_many_paths_the_strongest_are_shown(result):
+def test_only_the_strongest_of_many_paths_are_shown(result):
     many = synthetic.program([(Kind.SPECULAR,)] * 600, links=2)
     shown = strongest(many, changed(result, materials=many.materials))
     assert np.bincount(shown.paths.link).tolist() == [PER_LINK, PER_LINK]
@@ -189,7 +190,7 @@ def test_of_many_paths_the_strongest_are_shown(result):
     assert INTERACTIONS > 24
 
 
-def test_an_older_result_is_drawn_from_its_study(written, result, tmp_path):
+def test_positions_missing_in_the_result_come_from_the_study(written, result, tmp_path):
     old = Result.load(written)
     old = changed(old, links=old.links.drop(columns=["tx_x", "group"]))
     links = survey(old)
@@ -197,7 +198,7 @@ def test_an_older_result_is_drawn_from_its_study(written, result, tmp_path):
     assert links.group.tolist() == survey(result).group.tolist()
 
 
-def test_what_cannot_be_read_any_more_is_said(written, result, monkeypatch, tmp_path):
+def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, monkeypatch, tmp_path):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     gone = Result.load(written)
     content = gone.study.content()
@@ -213,7 +214,7 @@ def test_what_cannot_be_read_any_more_is_said(written, result, monkeypatch, tmp_
     assert page.data is None
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(result, tmp_path):
+def test_a_missing_folder_is_refused_before_the_report_is_made(result, tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         cb.report(result, tmp_path / "absent" / "report.html")
 
@@ -236,60 +237,53 @@ def test_figures_are_written_as_svg_and_png(written):
 # Sentences
 
 
-def said(result: Result, heading: str) -> str:
-    parts = summary(result)
-    start = next(place for place, part in enumerate(parts) if part.heading == heading)
-    end = next((place for place in range(start + 1, len(parts)) if parts[place].heading), len(parts))
-    return " ".join(part.text for part in parts[start:end])
+def answer(result: Result, heading: str) -> str:
+    """The sentences of the summary that answer a question."""
+    sentences = summary(result)
+    start = next(k for k, sentence in enumerate(sentences) if sentence.heading == heading)
+    end = next((k for k in range(start + 1, len(sentences)) if sentences[k].heading), len(sentences))
+    return " ".join(sentence.text for sentence in sentences[start:end])
 
 
-HELP = "Did it help where nothing was fitted?"
+HELP = "Did calibration help on held-out links?"
 
 
-def judged(result: Result, after: float, before: float, links: int) -> Result:
-    """The result with held-out links whose errors are planted, of random sign."""
-    random = np.random.default_rng(2)
-    measured = np.full(links, 90.0)
-    sign = random.choice([-1, 1], links) * random.uniform(0.8, 1.2, links)
-    table = pd.DataFrame({
-        "row": np.arange(links), "measured_db": measured, "before_db": measured + before * sign,
-        "after_db": measured + after * random.permutation(sign), "log_distance_db": measured + 9 * sign,
-        "has_path": True, "held_out": True,
-    })  # fmt: skip
-    return changed(
-        result, links=table, holdout_rmse_db=after, initial_holdout_rmse_db=before,
-        log_distance_holdout_rmse_db=9.0, nuisance_only_holdout_rmse_db=None,
-    )  # fmt: skip
+def judged(result: Result, rmse_db: float, baseline_db: float) -> Result:
+    """The result with another judgement, of 60 held-out links in 15 clusters, with an error of 0.5 dB."""
+    judgement = Judgement(60, rmse_db, "a log-distance model", baseline_db, 0.5, 15)
+    return changed(result, judgement=judgement)
 
 
-def test_the_summary_says_whether_it_helped(result):
-    assert "So it helped" in said(judged(result, 2.0, 4.0, 60), HELP)
-    assert "did not beat it" in said(judged(result, 4.0, 3.9, 60), HELP)
-    assert "more than chance" in said(judged(result, 3.9, 4.0, 6), HELP)
-    assert "So it helped" not in said(judged(result, 3.9, 4.0, 6), HELP)
-    rival = changed(judged(result, 2.0, 4.0, 60), log_distance_holdout_rmse_db=1.5)
-    assert "a log-distance model with 1.50 dB. Calibration did not beat it" in said(rival, HELP)
-    none = changed(result, holdout_rmse_db=None, initial_holdout_rmse_db=None)
-    assert "Not known: no links were held out" in said(none, HELP)
+def test_the_summary_says_whether_calibration_helped(result):
+    assert answer(judged(result, 2.0, 4.0), HELP).startswith(
+        "Calibration helped on held-out links: RMSE 2.00 dB"
+    )
+    assert "did not help" in answer(judged(result, 4.0, 3.9), HELP)
+    assert "did not clearly help" in answer(judged(result, 3.9, 4.0), HELP)
+    assert "2.00 dB less than a log-distance model, the best baseline" in answer(
+        judged(result, 2.0, 4.0), HELP
+    )
+    assert answer(changed(result, judgement=None), HELP).startswith("No links were held out")
 
 
-def test_the_summary_says_what_the_data_cannot_tell(result):
+def test_the_summary_says_which_parameters_are_identified(result):
     verdicts = dict(zip(result.parameters, ("identified", "at bound", "not identifiable"), strict=True))
     known = changed(
         result, intervals={name: Interval(0.1, 2.0, 3.0, verdict) for name, verdict in verdicts.items()}
     )
-    sure, _, unsure = verdicts
-    text = said(known, "How sure are the values?")
-    assert f"The links tell 1 of 3: {sure}" in text
-    assert f"{unsure}: not told by these links" in text
-    material = unsure.rpartition(".")[0]
-    for meets, words in ((0, "no path of any link meets it"), (1, "meet it")):
-        parts = summary(known, {material: meets})
-        assert any(part.text.startswith(material) and words in part.text for part in parts)
-    assert "gives no derivatives" in said(changed(result, intervals={}), "How sure are the values?")
+    identified, _, unidentified = verdicts
+    text = answer(known, "How certain are the values?")
+    assert f"The links identify 1 of 3 parameters: {identified}" in text
+    assert f"{unidentified} is not identifiable" in text
+    material = unidentified.rpartition(".")[0]
+    for count, words in ((0, "no path of any link interacts with it"), (1, "paths that interact with it")):
+        sentences = summary(known, {material: count})
+        assert any(part.text.startswith(material) and words in part.text for part in sentences)
+    without_intervals = changed(result, intervals={})
+    assert "gives no derivatives" in answer(without_intervals, "How certain are the values?")
 
 
-def test_bars_stand_where_the_values_are(result):
+def test_bars_show_values_and_intervals_at_their_positions(result):
     entry = values(changed(result, intervals={}))[0]
     assert entry.pieces == ()
     content = result.study.content()
@@ -301,14 +295,14 @@ def test_bars_stand_where_the_values_are(result):
         intervals={name: Interval(1.0, 10**0.5, 1000.0, "identified")},
     )  # fmt: skip
     entry = values(logarithmic)[0]
-    assert entry.places == pytest.approx({"before": 0.5, "after": 0.75})
+    assert entry.positions == pytest.approx({"before": 0.5, "after": 0.75})
     assert entry.pieces[0] == pytest.approx((0.25, 1.0))
 
 
 # Map and scene
 
 
-def test_the_map_shows_footprints_where_they_are(tmp_path, result):
+def test_the_map_shows_footprints_at_their_positions(tmp_path, result):
     ground = [[(-200, -200, 0), (200, -200, 0), (200, 200, 0), (-200, 200, 0)]]
     quads = {"ground": ground, "house": block((0, 0, 0), (20, 10, 8)), "shed": block((30, 0, 0), (35, 5, 3))}
     scene = read_scene(write_scene(tmp_path, quads), 3.5e9)
@@ -322,16 +316,18 @@ def test_the_map_shows_footprints_where_they_are(tmp_path, result):
         for outline in shown.buildings.removeprefix("M").removesuffix("Z").split("ZM")
     ]
     corners = [[(0, 0), (20, 0), (20, 10), (0, 10)], [(30, 0), (35, 0), (35, 5), (30, 5)]]
-    expected = [{tuple(at) for at in shown.place(np.array(each)).round(1).tolist()} for each in corners]
+    expected = [
+        {tuple(point) for point in shown.place(np.array(corner)).round(1).tolist()} for corner in corners
+    ]
     assert sorted(map(sorted, outlines)) == sorted(map(sorted, expected))
 
 
-def test_outlines_run_around_faces_that_share_edges():
+def test_faces_that_share_edges_have_one_outline():
     assert [sorted(loop) for loop in _loops([[0, 1, 2], [0, 2, 3]])] == [[0, 1, 2, 3]]
     assert sorted(map(len, _loops([[0, 1, 2], [3, 4, 5]]))) == [3, 3]
 
 
-def test_objects_that_cannot_be_drawn_are_named(tmp_path):
+def test_objects_that_cannot_be_read_are_listed(tmp_path):
     file = write_scene(
         tmp_path, {"house": block((0, 0, 0), (20, 10, 8)), "broken": block((0, 0, 0), (1, 1, 1))}
     )
@@ -342,19 +338,19 @@ def test_objects_that_cannot_be_drawn_are_named(tmp_path):
     assert len(triangles.face) == 12
 
 
-def test_colours_part_more_from_less():
+def test_colours_distinguish_positive_and_negative_residuals():
     colors = ramp(np.array([-9.0, 0.0, 9.0, np.nan]), 5.0)
     assert colors == ["#1f5fa8", "#a9b4bd", "#b34a00", "none"]
 
 
-def test_the_grid_keeps_positions():
+def test_the_grid_rounds_positions_to_its_step():
     points = np.random.default_rng(1).uniform(-800, 1200, (500, 3))
     grid = Grid.over(points)
     assert grid.low + grid.step * grid.steps(points) == pytest.approx(points, abs=0.51 * grid.step)
     assert grid.step < 0.04
 
 
-def test_measured_power_keeps_its_sign_in_the_links(tmp_path, monkeypatch):
+def test_links_contain_received_power_with_its_sign(tmp_path, monkeypatch):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     table = planted.campaign(noise_db=0.3)
     power = table.assign(power_dbm=30.0 - table.path_loss_db).drop(columns="path_loss_db")
@@ -372,7 +368,7 @@ def test_measured_power_keeps_its_sign_in_the_links(tmp_path, monkeypatch):
     )
 
 
-def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
+def test_a_failing_report_does_not_lose_the_result(written, monkeypatch, tmp_path):
     from typer.testing import CliRunner
 
     from calibray.cli.app import app
@@ -382,12 +378,12 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     monkeypatch.setattr(reports, "page", None)
 
-    def found(*_, out, **__):
+    def calibrate(*_, out, **__):
         result = Result.load(written)
         result.save(out)
         return result
 
-    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", found)
+    monkeypatch.setattr("calibray.calibration.calibrate.calibrate", calibrate)
     file = tmp_path / "study.toml"
     file.write_text(
         'version = 1\nscene = { file = "sionna:simple_street_canyon", frequency = 3.5e9 }\n'
@@ -396,7 +392,7 @@ def test_a_page_that_fails_loses_no_result(written, monkeypatch, tmp_path):
     )
     done = CliRunner().invoke(app, ["run", str(file), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
-    assert "Warning: no report" in done.stderr
+    assert "Warning: the report was not written" in done.stderr
     assert "calibray report" in done.stderr
     assert Result.load(tmp_path / "out").parameters == Result.load(written).parameters
     assert not (tmp_path / "out" / "report.html").exists()

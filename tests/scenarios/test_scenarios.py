@@ -261,7 +261,7 @@ def test_all_antennas_stand_on_streets_and_clear_of_lamp_posts():
     across = np.abs(spots[:, :1] - np.array(district.AVENUES)).min(axis=1)
     along = np.abs(spots[:, 1:] - np.array(district.STREETS)).min(axis=1)
     assert np.minimum(across, along).max() < district.STREET_HALF_WIDTH
-    to_post = np.linalg.norm(spots[:, None] - district.lamp_places(), axis=2)
+    to_post = np.linalg.norm(spots[:, None] - district.lamp_positions(), axis=2)
     assert to_post.min() > 1.0
 
 
@@ -290,7 +290,7 @@ def test_the_truth_is_complete(truth, links):
             error = np.array(entry[f"{end}_m"]) + entry[f"{end}_error_m"]
             assert error.tolist() == pytest.approx([row[f"{end}_{axis}_m"] for axis in "xyz"], abs=2e-3)
     assert len(truth["links"]) == 40
-    assert len(truth["lamp_posts_m"]) == len(district.lamp_places())
+    assert len(truth["lamp_posts_m"]) == len(district.lamp_positions())
 
 
 def test_planted_permittivities_scatter_as_said(truth):
@@ -322,7 +322,7 @@ def test_the_true_world_has_its_own_materials_and_lamp_posts():
     faces = {item.name: len(item.mesh.faces) for item in objects}
     calibrated = {item.name: len(item.mesh.faces) for item in district.scene_objects(BUILDINGS)}
     assert sum(n for name, n in faces.items() if name.startswith("structures")) == calibrated["structures"]
-    assert faces["lamp_posts"] == 10 * len(district.lamp_places())
+    assert faces["lamp_posts"] == 10 * len(district.lamp_positions())
 
 
 # The sounder
@@ -379,8 +379,8 @@ def test_the_order_of_the_paths_does_not_matter():
     assert sound(*shuffled) == pytest.approx(sound(power, delay, diffuse), rel=1e-12)
 
 
-@pytest.mark.parametrize(("power", "fault"), [([], "no path"), ([1e-17], "above the noise")])
-def test_a_receiver_that_hears_nothing_is_refused(power, fault):
+@pytest.mark.parametrize(("power", "fault"), [([], "no path"), ([1e-17], "the noise of")])
+def test_a_receiver_below_the_noise_is_refused(power, fault):
     with pytest.raises(InputError, match=fault):
         sound(power, [1e-6] * len(power), np.full(len(power), False))
 

@@ -73,10 +73,10 @@ def test_the_last_round_is_the_check(yard: Tracer, rounds: Paths) -> None:
     assert rounds.settings["samples"] == "auto"
     assert rounds.settings["rays"] >= 4 * 250_000
     assert 0 <= rounds.settings["last_round_db"] <= 0.05
-    text = report.rounds(rounds.settings, 0.5)
-    assert text.startswith("Converged: 1,000,000 rays a position") or rounds.settings["rays"] > 1_000_000
-    assert report.rounds({"rays": 8, "last_round_db": 0.7}, 0.5) == (
-        "Not converged: 8 rays a position were sent out; the later half of them changed a link by 0.70 dB "
+    text = report.last_round(rounds.settings, 0.5)
+    assert text.startswith("Converged: 1,000,000 rays per position") or rounds.settings["rays"] > 1_000_000
+    assert report.last_round({"rays": 8, "last_round_db": 0.7}, 0.5) == (
+        "Not converged: 8 rays per position; the second half of them changed a link by 0.70 dB "
         "(fidelity.tolerance_db = 0.5)."
     )
     with pytest.raises(InputError, match="its last round of rays is the check"):
@@ -126,7 +126,7 @@ def test_a_trace_without_interactions_sends_no_rays(yard: Tracer) -> None:
     direct = yard.with_settings(replace(AUTO, max_depth=0)).trace(LINKS)
     assert direct.num_interactions == direct.settings["rays"] == 0
     assert direct.link.tolist() == [0, 2, 3]
-    assert report.rounds(direct.settings, 0.5).startswith("Converged: only direct paths")
+    assert report.last_round(direct.settings, 0.5).startswith("Converged: only direct paths")
 
 
 def test_diffuse_reflection_needs_a_number() -> None:

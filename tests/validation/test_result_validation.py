@@ -11,8 +11,8 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.reporting.page import page
-from calibray.reporting.trust_figures import examined
-from calibray.reporting.wording import summary
+from calibray.reporting.summary import summary
+from calibray.reporting.trust_figures import trust_figures
 from calibray.result.files import VALIDATION_FILE, read_validation, write_validation
 from calibray.result.held_out import Model
 from calibray.validation.validation import Validation
@@ -68,7 +68,7 @@ def test_a_damaged_validation_is_refused(validation, tmp_path, change, words):
 def test_the_report_shows_the_validation(validation):
     result, shown = made_up(LINKS, 12)
     result = replace(result, held_out=validation)
-    figures = examined(result)
+    figures = trust_figures(result)
     assert {"held-out-errors", "held-out-blocks"} <= set(figures)
     text = page(result, shown, figures)
     assert "figure-held-out-errors" in text
@@ -76,7 +76,7 @@ def test_the_report_shows_the_validation(validation):
     assert "<b>" not in text.partition('id="validation"')[2].partition("</section>")[0].replace(
         "&lt;b&gt;", ""
     )
-    helped = next(part for part in summary(result) if part.heading.startswith("Did it help"))
+    helped = next(part for part in summary(result) if part.heading.startswith("Did calibration help"))
     assert validation.sentence in helped.text
     assert helped.kind == "good"
     assert "calibray validate STUDY" in page(replace(result, held_out=None), shown, {})

@@ -1,1 +1,1 @@
-"""Calibration: the story from a study to its result."""
+"""Calibration: from a study to its result."""

@@ -1,4 +1,4 @@
-"""Calibrate a study: open it, search, trace again, assess, validate, and assemble the result."""
+"""Calibrate a study: open it, search, trace again, assess the uncertainty, validate, and make the result."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
-from calibray.calibration.outcome import Timing, outcome
+from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
@@ -30,11 +30,11 @@ from calibray.uncertainty.assessment import certainty
 from calibray.validation.validate import check_engine, validate_problem
 from calibray.validation.variants import NO_MINIMA
 
-FEW_MINIMA: Final = 2
-"""Minima that a method without multi-start keeps: not enough to start a validation from."""
+MINIMA_WITHOUT_MULTISTART: Final = 2
+"""Minima that a method without multi-start returns at most, which are too few starting points for a validation."""
 
 
-# An interrupted import leaves modules half-made, and errors that follow from that hide the Ctrl-C.
+# Ctrl-C during an import leaves half-initialized modules, whose errors would hide the interruption.
 @ensure_interruption()
 @unwrap_interruption()
 def calibrate(
@@ -54,14 +54,14 @@ def calibrate(
 
     Args:
         study: The study, opened or not.
-        method: Method in place of the study's: "auto", "sgwo-im", "gwo", ...
-        seed: Seed in place of the study's.
-        out: Folder to save the result in; checked before anything is computed. The ledger of RT calls is kept there,
-            so that a run that was killed repeats none of them when it is started again.
-        engine: Engine to run on, over all links of the study; made from the study, with a ledger, if None.
-        workers: What runs the calls of a batch on the engine "command", or holds chunks of links on the engine
-            "replay"; see `engines`.
-        progress: Called as the work goes on.
+        method: Method instead of the study's: "auto", "sgwo-im", "gwo", ...
+        seed: Seed instead of the study's.
+        out: Folder to save the result in, which is checked before anything is computed. The ledger of RT calls is
+            written there, so that an interrupted run repeats none of them when it is started again.
+        engine: Engine over all links of the study; made from the study, with a ledger, if None.
+        workers: Workers (`engines.open_workers`) that run the calls of a batch on the engine "command", or chunks of
+            links on the engine "replay"; this process if None.
+        progress: Called with the name of each stage, the work done and the total.
         tracer: Opens the scene in a ray tracer; an opened study brings its own.
         overwrite: Replace files in `out` that Calibray did not write; the study's own are never replaced.
         cheap_model: A study of the same links and materials whose replay is the cheap model of an expensive engine;
@@ -73,6 +73,12 @@ def calibrate(
     Raises:
         InputError: Something in the study, the method or the folder cannot be used.
         EngineError: The engine failed.
+
+    Example:
+        >>> from calibray.scenarios import demo_study_path
+        >>> result = calibrate(Study.load(demo_study_path()))  # doctest: +SKIP
+        >>> result.rmse_db < result.initial_rmse_db  # doctest: +SKIP
+        True
     """
     replaced = study.replace(method=method, seed=seed)
     plan, setup = (replaced.study, replaced) if isinstance(replaced, Setup) else (replaced, None)
@@ -91,21 +97,26 @@ def calibrate(
         engine = engines.make(setup, None, progress, ledger, workers)
         can_trace = True
     problem = Problem.of(setup, engine)
-    # With an engine that is handed in, there may be no ray tracer on this machine to look for enclosed antennas.
+    # With a given engine, this machine may have no ray tracer, which the check for enclosed antennas needs.
     enclosed = setup.enclosed if can_trace else None
     traced = time.perf_counter()
     problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
+    # Making the cheap model does not count as time of the search.
     paused = time.perf_counter()
     cheap = make_cheap_replay(problem, progress, None if cheap_model is None else cheap_model.opened())
     traced += time.perf_counter() - paused
     trail = search(problem, choose(problem, cheap.model), progress)
-    problem, trail, gap = retrace(problem, trail, progress)
+    problem, trail, gap_db = retrace(problem, trail, progress)
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
-    minima = {Model.CALIBRATED: trail.minima} if len(trail.minima) > FEW_MINIMA else NO_MINIMA
-    validation = validate_problem(problem, progress=progress, known_minima=minima) if by_blocks else None
-    result = outcome(problem, trail, gap, assessment, validation, enclosed, timing, cheap)
+    validation = None
+    if by_blocks:
+        many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART
+        starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
+        validation = validate_problem(problem, progress=progress, known_minima=starts)
+    run = Run(problem, trail, gap_db, cheap, enclosed, timing)
+    result = make_result(run, assessment, validation)
     if out is not None:
-        # The folder was checked before the work: a file that appeared since must not cost the result.
+        # The folder was checked before the search; a file that appeared since then must not cost the result.
         result.save(out, overwrite=True)
     return result

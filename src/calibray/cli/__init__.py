@@ -1,4 +1,4 @@
-"""The command line: parse, call, print; one file a command."""
+"""The command line: one file per command, which parses arguments, calls the package and prints."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import NoReturn
 __all__ = ["main"]
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it: 128 and the number of the signal."""
+"""Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
 
 
 def main() -> None:
-    """Run the command line of this process and end it."""
+    """Run the command line of this process and exit."""
     try:
         from calibray.cli.app import app
 
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def _leave() -> NoReturn:
-    """End at once: compiled libraries that were interrupted can crash while Python takes them down."""
+    """Exit without Python's shutdown, in which interrupted compiled libraries can crash."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

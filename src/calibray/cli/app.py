@@ -1,7 +1,7 @@
-"""The command line as a whole: its commands, and how their failures end.
+"""The commands, and how their failures are reported.
 
-Data goes to stdout, progress and messages to stderr. The exit status is 0 for done, 1 for failed while running, 2 for
-bad input, 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
+Data go to stdout, progress and messages to stderr. The exit status is 0 for success, 1 for a failure while running, 2
+for bad input and 130 for Ctrl-C. Commands import what they need when they run, so that `--version` answers at once.
 """
 
 from __future__ import annotations
@@ -32,40 +32,39 @@ from calibray.errors import EngineError, InputError
 from calibray.support.interruption import ensure_interruption
 
 LONGEST: Final = 4096
-"""The number of characters beyond which an argument is refused; Linux takes no longer path."""
+"""Most characters of an argument; paths on Linux are no longer."""
 
 
 class Commands(TyperGroup):
-    """A group of commands whose expected failures are one message and an exit status, not a traceback."""
+    """Commands that report expected failures by a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Part the command from what is its own.
+        """Refuse overlong arguments, then parse.
 
         Args:
-            ctx: What will be parsed.
+            ctx: Context of the command.
             args: The command line.
 
         Returns:
-            The arguments that are the command's.
+            The remaining arguments.
         """
         for argument in args:
             if len(argument) > LONGEST:
-                ctx.fail(f"an argument has {len(argument)} characters, must have at most {LONGEST}")
+                ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
 
         Args:
-            ctx: What was parsed from the command line.
+            ctx: Context of the command, with the parsed command line.
 
         Returns:
-            What the command returns.
+            The value that the command returns.
 
         Raises:
-            typer.Exit: With 2 on bad input, with 1 when an engine failed, or a file could not be read or
-                written, with 130 on Ctrl-C.
-            BrokenPipeError: Nobody reads on; what calls this knows how to end.
+            typer.Exit: 2 on bad input; 1 when an engine failed or a file could not be read or written; 130 on Ctrl-C.
+            BrokenPipeError: The reader of stdout has closed it; Typer handles this.
         """
         try:
             with ensure_interruption():
@@ -79,13 +78,14 @@ class Commands(TyperGroup):
         except BrokenPipeError:
             raise
         except OSError as error:
-            place = "" if error.filename is None else f"{error.filename}: "
+            file = "" if error.filename is None else f"{error.filename}: "
             typer.echo(
-                f"Error: {place}cannot be used ({error.strerror or error}); check it, and the disk", err=True
+                f"Error: {file}cannot be read or written ({error.strerror or error}); check permissions and disk space",
+                err=True,
             )
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            # What the command has to say of what was kept it said itself; what went wrong on the way is not to be lost.
+            # The command itself reports what was kept. Report here an error that occurred during the interruption.
             if isinstance(error.__cause__, (InputError, EngineError)):
                 typer.echo(f"Error: {error.__cause__}", err=True)
             typer.echo("Interrupted", err=True)
@@ -98,16 +98,16 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    # Help is plain text, which Rich would take as long to draw as all else takes.
+    # Plain help: Rich would double the time of --help.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-"""All commands; one more is a module with a function, named below."""
+"""All commands; a new one is a module with a function, listed below."""
 
 
-def _print_version(wanted: bool) -> None:
-    """Print the version and end, if it was asked for."""
-    if wanted:
+def _print_version(requested: bool) -> None:
+    """Print the version and exit, if it was requested."""
+    if requested:
         from importlib import metadata
 
         typer.echo(f"calibray {metadata.version('calibray')}")
@@ -117,13 +117,14 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def calibray(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Calibrate the radio materials of a ray-traced scene from measurements."""
+    """Calibrate the radio materials of a ray-traced scene with measured path loss."""
 
 
-COMMANDS = (  # one after the other, as `--help` lists them
+COMMANDS = (  # in the order of `--help`
     doctor,
     demo,
     init,
@@ -141,6 +142,6 @@ COMMANDS = (  # one after the other, as `--help` lists them
     cache,
 )
 for command in COMMANDS:
-    # Of a summary that is not given Typer lists the beginning only.
+    # Without a short help, Typer shortens the summary.
     app.command(short_help=(command.__doc__ or "").partition("\n\n")[0])(command)
 app.add_typer(scene)

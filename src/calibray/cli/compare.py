@@ -1,4 +1,4 @@
-"""`calibray compare`: methods at equal budgets."""
+"""`calibray compare`: compare methods at equal budgets."""
 
 from __future__ import annotations
 
@@ -11,34 +11,39 @@ from calibray.cli.console import Overwrite, log
 
 
 def compare(
-    study_file: Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).")],
+    study_file: Annotated[Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.")],
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder for tables and figure; finished runs are kept there."
+            "--out",
+            "-o",
+            metavar="DIR",
+            help="Folder for the tables and the figure; finished runs are kept in it.",
         ),
     ],
     methods: Annotated[
         str,
-        typer.Option(metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets another budget."),
+        typer.Option(
+            metavar="NAMES", help="Methods, separated by commas; METHOD@CALLS sets the budget of one method."
+        ),
     ] = "sgwo-im,gwo,gwo@600,vector-surrogate,gaussian-process,differential-evolution,random,least-squares",
-    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, from seeds 0 to N - 1.")] = 25,
-    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls of a run.")] = 225,
-    workers: Annotated[int, typer.Option(metavar="N", help="Number of processes.")] = 1,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of each method, with seeds 0 to N - 1.")] = 25,
+    budget: Annotated[int, typer.Option(metavar="CALLS", help="RT calls per run.")] = 225,
+    workers: Annotated[int, typer.Option(metavar="N", help="Number of local processes.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run methods from many seeds on a study's stored paths at equal budgets."""
+    """Compare methods on a study: many seeds, equal budgets of RT calls, replayed paths."""
     import os
 
-    # The matrices are small, so BLAS threads cost more than they gain; runs are distributed over cores instead.
-    # NumPy reads the variables when it is imported, here and in the workers.
+    # The matrices are small, so threads of BLAS cost more than they gain; runs are distributed over processes instead.
+    # NumPy reads these variables when it is imported, here and in the workers.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
     from functools import partial
 
     from calibray.cli.progress_bars import progress_bars
-    from calibray.comparison.compare import compare as run_all
+    from calibray.comparison.compare import compare as run_comparison
     from calibray.comparison.compare import parse_methods
     from calibray.comparison.comparison import optimum_text, table
     from calibray.comparison.comparison_files import FILES, write
@@ -52,15 +57,16 @@ def compare(
     parsed = parse_methods(names, budget)
     calls = seeds * sum(method.budget for method in parsed)
     typer.echo(
-        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in all, minus those kept in {out}", err=True
+        f"{seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs kept in {out} are not repeated",
+        err=True,
     )
     with progress_bars(log()) as progress:
-        finished = run_all(
+        comparison = run_comparison(
             partial(study_problem, study_file),
             names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
         )  # fmt: skip
-    write(finished, out)
-    typer.echo(render(table(finished), optimum_text(finished)))
-    for name, seed, failure in finished.failures():
+    write(comparison, out)
+    typer.echo(render(table(comparison), optimum_text(comparison)))
+    for name, seed, failure in comparison.failures():
         typer.echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
     typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)

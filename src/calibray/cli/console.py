@@ -1,4 +1,4 @@
-"""Where commands write, and the arguments that several of them take."""
+"""The console for messages, and arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 @cache
 def log() -> Console:
-    """Where progress and messages go; data goes to stdout through `typer.echo`.
+    """The console for progress and messages, on stderr; data go to stdout by `typer.echo`.
 
-    Rich is loaded when something is to be shown: `--version` and `--help` do without it.
+    Rich is imported here, on first use, so that `--version` and `--help` do not load it.
     """
     from rich.console import Console
 
@@ -28,24 +28,25 @@ StudyFile = Annotated[
 ]
 
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files there that Calibray did not write.")
+    bool, typer.Option("--overwrite", help="Replace existing files that Calibray did not write.")
 ]
-"""Whether output may take the place of a user's file; an input is never replaced."""
+"""Whether output may replace a user's file; an input is never replaced."""
 
 AllowChangedInputs = Annotated[
     bool,
     typer.Option(
-        "--allow-changed-inputs", help="Go on although a file of the result, the scene or an antenna changed."
+        "--allow-changed-inputs",
+        help="Continue although a file of the result, the scene or an antenna has changed.",
     ),
 ]
-"""Whether a result is used although what it was calibrated with changed."""
+"""Whether a result is used although its inputs have changed."""
 
 Workers = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Processes here that blocks of links are shared out to."),
+    typer.Option(metavar="N", help="Number of local processes that chunks of links are distributed to."),
 ]
 
 Scheduler = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers take blocks of links."),
+    typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers process chunks of links."),
 ]

@@ -1,4 +1,4 @@
-"""`calibray demo`: the paper's experiment."""
+"""`calibray demo`: run the experiment of the paper."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from calibray.cli.console import Overwrite, log
 
 def demo(
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write figures and result into.")
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder for tables, figures, results and the report."
+        ),
     ] = Path("out/demo"),
     engine: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="replay (trace once), or retrace: run the ray tracer for every candidate, as the paper does.",
+            help="replay (trace once) or retrace (run the ray tracer for every candidate, as in the paper).",
         ),
     ] = "replay",
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the methods.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run the paper's experiment in the demo district, with space mapping and auto: tables, figures and a report."""
+    """Run the experiment of the paper in the demo district: tables, figures and a report."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:

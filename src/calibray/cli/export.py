@@ -1,4 +1,4 @@
-"""`calibray export`: the calibrated scene and its materials for other tools."""
+"""`calibray export`: write the calibrated scene and its materials for other tools."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def export(
     ],
     copy: Annotated[
         bool,
-        typer.Option("--copy", help="Copy the meshes too, so that the folder can be given away."),
+        typer.Option("--copy", help="Copy the meshes too, so that the folder is self-contained."),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:

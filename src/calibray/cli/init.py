@@ -1,4 +1,4 @@
-"""`calibray init`: a study drafted from a scene and a table of links."""
+"""`calibray init`: draft a study from a scene and a table of links."""
 
 from __future__ import annotations
 
@@ -22,58 +22,62 @@ def init(
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="Study file to write; never replaced.")
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Study file to write; an existing one is never replaced."
+        ),
     ] = Path("study.toml"),
     transmitters: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Table of the transmitters' positions.")
+        Path | None, typer.Option(metavar="FILE", help="Table of transmitter positions.")
     ] = None,
     track: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="GPX track that tells where each row was measured.")
+        Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
     ] = None,
     tx: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene's frame [m].")
+        str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
     ] = None,
     frequency: Annotated[float | None, typer.Option(metavar="HZ", help="Carrier frequency [Hz].")] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Draw the antennas over the scene: .png, .svg or .pdf."),
+        typer.Option(metavar="FILE", help="Draw the antennas over the scene (.png, .svg or .pdf)."),
     ] = None,
 ) -> None:
-    """Look at a scene and a table of links, tell what is assumed and why, and write a study that runs."""
+    """Draft a study from a scene and a table of links, and list its assumptions with their reasons."""
     from calibray.cli.link_warnings import warn
     from calibray.cli.progress_bars import progress_bars
     from calibray.support.output_files import check_file, write_text
 
     if out.exists() or out.is_symlink():
-        raise InputError(f"{out}: is there already; name another file with --out, or remove it")
+        raise InputError(f"{out}: exists already; choose another file with --out, or remove it")
     inputs = [links, *(file for file in (transmitters, track) if file)]
     check_file(out, inputs)
     with progress_bars(log()) as progress:
-        from calibray.reporting.scene_tables import assumed, save_positions
-        from calibray.study.draft import draft
+        from calibray.reporting.position_plot import save_positions
+        from calibray.reporting.scene_tables import assumptions
+        from calibray.study.draft import draft as draft_study
         from calibray.study.draft_text import SCHEMA_FILE
         from calibray.study.schema import schema_text
         from calibray.tables.text import render
 
-        progress("looking at scene and links", 0, None)
-        found = draft(
+        progress("reading scene and links", 0, None)
+        draft = draft_study(
             scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track
         )
-        measured = found.study.measurements()
-    typer.echo(render(assumed(found)))
-    counts = [f"{number} {what}" for what, number in measured.prepared.items()]
+        measured = draft.study.measurements()
+    typer.echo(render(assumptions(draft)))
+    counts = [f"{number} {cause}" for cause, number in measured.prepared.items()]
     typer.echo("\n" + ", ".join([f"{len(measured)} links", *counts]))
     with progress_bars(log()) as progress:
         progress("checking positions", 0, None)
-        warn(found.study, measured)
+        warn(draft.study, measured)
         if plot is not None:
-            save_positions(plot, found.study.scene_source, measured.tx, measured.rx, inputs)
+            save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs)
     if plot is not None:
         typer.echo(f"Written to {plot}", err=True)
     schema = out.parent / SCHEMA_FILE
     if not schema.exists():
         write_text(schema, schema_text())
-    write_text(out, found.text)
+    write_text(out, draft.text)
     typer.echo(f"Written to {out}; next: calibray run {out} --out result", err=True)
 
 
@@ -81,5 +85,5 @@ def _position(text: str) -> list[float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--tx {text}: must be x, y and z in metres, 0,0,2.5") from None
+        raise InputError(f"--tx {text}: must be x, y and z in metres, such as 0,0,2.5") from None
     return [x, y, z]

@@ -14,32 +14,33 @@ if TYPE_CHECKING:
 
 
 def warn(study: Study, links: Measurements) -> None:
-    """Print what is suspicious about links to stderr.
+    """Print warnings about suspicious links to stderr.
 
     Args:
         study: The study.
         links: Its links.
 
     Raises:
-        InputError: The links have nothing to do with the scene, or the scene cannot be read.
+        InputError: The links are far from the scene, or the scene cannot be read.
     """
     from importlib.util import find_spec
 
-    from calibray.reporting.scene_tables import warned
+    from calibray.reporting.scene_tables import warning_lines
     from calibray.study.link_checks import examine
 
     if missing := [name for name in ("shapely", "trimesh") if find_spec(name) is None]:
         typer.echo(
-            f"Positions were not checked against the scene: {missing[0]} is missing, pip install 'calibray[scenes]'",
+            f"Positions were not checked against the scene: {missing[0]} is not installed; "
+            "run pip install 'calibray[scenes]'",
             err=True,
         )
         return
     try:
-        found = examine(study, links)
+        findings = examine(study, links)
     except InputError:
-        # An external program may read the scene's file in its own way.
+        # An external program may read scene files that Calibray cannot.
         if study.engine.external:
             return
         raise
-    if found:
-        typer.echo(warned(found), err=True)
+    if findings:
+        typer.echo(warning_lines(findings), err=True)

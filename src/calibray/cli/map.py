@@ -1,4 +1,4 @@
-"""`calibray map`: path loss over an area, with the calibrated scene."""
+"""`calibray map`: predict path loss over an area."""
 
 from __future__ import annotations
 
@@ -19,55 +19,55 @@ def map(
     tx: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            metavar="X Y Z", help="Transmitter position [m]; that of the calibration, if it had only one."
+            metavar="X Y Z",
+            help="Transmitter position [m]; by default that of the links, if they have only one.",
         ),
     ] = None,
     height: Annotated[
-        float, typer.Option(metavar="M", help="Height of the receivers over the ground [m].")
+        float, typer.Option(metavar="M", help="Height of the receivers above the ground [m].")
     ] = 1.5,
     cell: Annotated[float, typer.Option(metavar="M", help="Width of the cells [m].")] = 5.0,
     bounds: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
-            metavar="W S E N", help="West, south, east and north of the area [m]; the whole scene if absent."
+            metavar="W S E N",
+            help="West, south, east and north end of the area [m]; by default the whole scene.",
         ),
     ] = None,
     level: Annotated[
         float,
         typer.Option(
-            metavar="P", help="Probability that a measurement lies within the interval; 0 for no interval."
+            metavar="P", help="Probability that a measurement lies in the interval; 0 for no interval."
         ),
     ] = 0.9,
     power: Annotated[
         float | None,
-        typer.Option(
-            metavar="DBM", help="Transmitted power [dBm], for received power in place of path loss."
-        ),
+        typer.Option(metavar="DBM", help="Transmit power [dBm], for received power instead of path loss."),
     ] = None,
     samples: Annotated[
         str | None,
         typer.Option(
             metavar="N|auto",
-            help="Rays in place of the study's: the time goes with them, and with too few paths are missed.",
+            help="Number of rays instead of the study's. Time grows with it; too few rays miss paths.",
         ),
     ] = None,
     column: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="What a column of the study's links, of groups or carriers, holds for this transmitter; repeatable.",
+            help="Value of a group or frequency column of the links for this transmitter; may be repeated.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write into instead of DIR."),
+        typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the map instead of DIR."),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict path loss over an area, and write it as GeoTIFF, picture and table: map.tif, map.png, map.csv."""
+    """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv."""
     from calibray.cli.progress_bars import progress_bars
 
     target = out or folder
@@ -82,7 +82,7 @@ def map(
 
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         inputs = result.study.files()
-        # Before anything is traced.
+        # Checked before the tracing, which takes long.
         check_outputs(target, FILES, inputs, overwrite)
         with open_workers(workers, scheduler) as pool:
             coverage = coverage_map(
@@ -104,27 +104,29 @@ def map(
     reached = np.isfinite(coverage.path_loss_db)
     typer.echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
     if len(names) < len(FILES):
-        typer.echo("No GeoTIFF without rasterio; install it with: pip install 'calibray[scenes]'", err=True)
+        typer.echo(
+            "map.tif was not written: rasterio is not installed; run pip install 'calibray[scenes]'", err=True
+        )
     typer.echo(f"Written to {target}: {', '.join(names)}", err=True)
 
 
-def _samples(given: str) -> int | Literal["auto"]:
-    """Rays, as the study takes them."""
-    if given == "auto":
+def _samples(text: str) -> int | Literal["auto"]:
+    """The number of rays, or "auto"."""
+    if text == "auto":
         return "auto"
     try:
-        return int(given)
+        return int(text)
     except ValueError:
-        raise InputError(f'--samples {shortened(given)}: must be a whole number, or "auto"') from None
+        raise InputError(f'--samples {shortened(text)}: must be a whole number or "auto"') from None
 
 
-def _columns(given: list[str]) -> dict[str, object]:
-    """Columns by name; numbers as numbers."""
+def _columns(entries: list[str]) -> dict[str, object]:
+    """Values by column, as numbers where they are numbers."""
     columns: dict[str, object] = {}
-    for entry in given:
+    for entry in entries:
         name, equals, value = entry.partition("=")
         if not equals or not name:
-            raise InputError(f"--column {entry}: must be NAME=VALUE, as sector=north")
+            raise InputError(f"--column {entry}: must be NAME=VALUE, such as sector=north")
         try:
             columns[name] = float(value)
         except ValueError:

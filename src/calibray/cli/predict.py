@@ -1,4 +1,4 @@
-"""`calibray predict`: path loss at new links."""
+"""`calibray predict`: predict path loss at new links."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-PREDICTED: Final = ("path_loss_db", "lower_db", "upper_db")
-"""The columns that `predict` adds, all but the first with --level alone; others tell what was measured."""
+PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
+"""Columns that `predict` adds, those after the first only with --level. Other measured quantities add more."""
 
-UNREACHED: Final = "no path leads to"
-"""What is to be said of links without a path."""
+TEXTS: Final = ("basis", "remark")
+"""Text columns that are added with --level."""
 
-SAID: Final = ("basis", "remark")
-"""Columns of words, with --level."""
+NO_PATH: Final = "no path leads to"
+"""The warning about links without a path."""
 
 
 def predict(
@@ -36,9 +36,8 @@ def predict(
         Path,
         typer.Argument(
             metavar="LINKS",
-            help="CSV or Parquet file with the columns that the study names for positions, or tx_x, tx_y, tx_z, rx_x, "
-            "rx_y, rx_z [m], and its group column if its offset has one; its frequency column, if it has one, gives "
-            "the carriers.",
+            help="CSV or Parquet file with the position columns of the study, or tx_x, tx_y, tx_z, rx_x, rx_y, rx_z "
+            "[m]; with its group column if its offset has one, and its frequency column if it has one.",
             show_default=False,
         ),
     ],
@@ -52,8 +51,8 @@ def predict(
         float | None,
         typer.Option(
             metavar="P",
-            help="Add the interval that a measurement would lie in with this probability, as 0.9: columns lower_db, "
-            "upper_db and basis, and a remark on places where no antenna should be.",
+            help="Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db, "
+            "upper_db and basis, and a remark where an antenna is inside a building or outside the scene.",
         ),
     ] = None,
     workers: Workers = None,
@@ -78,33 +77,33 @@ def predict(
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))
-        names = PREDICTED[: 1 if level is None else None]
-        own = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
-        _refuse_columns(links_file, first.frame, (*names, *own, *(() if level is None else SAID)))
+        names, texts = (PREDICTIONS[:1], ()) if level is None else (PREDICTIONS, TEXTS)
+        # A prediction of NaN for the first link shows which columns the measured quantity adds.
+        measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
+        _refuse_columns(links_file, first.frame, (*names, *measured, *texts))
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)
-        odd: dict[str, array[int]] = {}
+        warnings: dict[str, array[int]] = {}
         with (
             open_workers(workers, scheduler) as pool,
-            _printed() if out is None else growing_table(out) as append,
+            _printer() if out is None else growing_table(out) as append,
         ):
-            for links, told in predict_batches(
+            for links, predictions in predict_batches(
                 result, table, level, progress, pool, allow_changed_inputs=allow_changed_inputs
             ):
-                own = as_measured(study, links, told)
-                columns = {
-                    name: told[name].to_numpy() for name in (*names, *(() if level is None else ("basis",)))
-                }
-                columns |= own | ({} if level is None else {"remark": told["remark"].to_numpy()})
-                append(links.frame.assign(**columns))
-                _note(odd, links.row, told)
-    for what in sorted(odd, key=lambda each: (each != UNREACHED, each)):
-        _warn(what if what == UNREACHED else f"{what}:", odd[what], table.rows)
+                columns = {name: predictions[name].to_numpy() for name in (*names, *texts)}
+                measured = as_measured(study, links, predictions)
+                # In the order: predictions, basis, the measured quantity, remark.
+                remark = {} if level is None else {"remark": columns.pop("remark")}
+                append(links.frame.assign(**columns, **measured, **remark))
+                _collect_warnings(warnings, links.row, predictions)
+    for warning in sorted(warnings, key=lambda text: (text != NO_PATH, text)):
+        _warn(warning if warning == NO_PATH else f"{warning}:", warnings[warning], table.rows)
 
 
 @contextmanager
-def _printed() -> Iterator[Callable[[pd.DataFrame], None]]:
-    """What prints rows as CSV, the header before the first."""
+def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
+    """A function that prints tables as CSV, with a header before the first."""
     header = True
 
     def append(table: pd.DataFrame) -> None:
@@ -115,27 +114,29 @@ def _printed() -> Iterator[Callable[[pd.DataFrame], None]]:
     yield append
 
 
-def _note(odd: dict[str, array[int]], row: NDArray[np.int64], told: pd.DataFrame) -> None:
-    """Add the rows of which something is to be said, by what is to be said."""
-    said: dict[str, list[int]] = {UNREACHED: row[~(told["path_loss_db"].to_numpy() < float("inf"))].tolist()}
-    for number, remark in zip(row.tolist(), told["remark"].tolist(), strict=True):
-        for part in filter(None, remark.split(", ")):
-            said.setdefault(part, []).append(number)
-    for what, rows in said.items():
-        # Eight bytes a row, of a million rows as many megabytes.
-        odd.setdefault(what, array("q")).extend(rows)
+def _collect_warnings(
+    warnings: dict[str, array[int]], row: NDArray[np.int64], predictions: pd.DataFrame
+) -> None:
+    """Add the rows of links without a path, and of links with remarks, to the warnings."""
+    without_path = ~(predictions["path_loss_db"].to_numpy() < float("inf"))
+    rows: dict[str, list[int]] = {NO_PATH: row[without_path].tolist()}
+    for number, remarks in zip(row.tolist(), predictions["remark"].tolist(), strict=True):
+        for remark in filter(None, remarks.split(", ")):
+            rows.setdefault(remark, []).append(number)
+    for warning, numbers in rows.items():
+        # An array takes 8 bytes per row, so a million rows take 8 MB; a list of integers would take 36 MB.
+        warnings.setdefault(warning, array("q")).extend(numbers)
 
 
-def _warn(what: str, rows: Sequence[int], count: int) -> None:
-    """Say of which rows something is to be said, if of any."""
+def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables.text import rows_text
 
     if rows:
-        typer.echo(f"Warning: {what} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        typer.echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _refuse_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:
-    """Refuse a table that has a column of predictions already."""
+    """Refuse a table that already has a column that would be added."""
     for name in columns:
         if name in frame:
             raise InputError(f"{file}: has a column {name!r} already; rename or remove it")

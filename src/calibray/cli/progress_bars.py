@@ -1,4 +1,4 @@
-"""Progress for people who wait: bars on a terminal, plain lines every few seconds elsewhere."""
+"""Progress of commands: bars on a terminal, plain lines every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -15,30 +15,26 @@ from rich.console import Console
 from calibray.support import interruption
 from calibray.support.progress import Progress
 
-EVERY: Final = 4.0
-"""Seconds between two lines where there is no terminal; work that is shorter prints none.
-
-A command with two spells of work, one after the other, is silent for less than twice as long.
-"""
-
+LINE_INTERVAL: Final = 4.0
+"""Time between two lines without a terminal [s]; shorter work prints none."""
 
 STARTING: Final = "starting"
-"""What is told before the first stage that counts: reading, loading, compiling."""
+"""The stage shown before the first one that counts: reading, importing, compiling."""
 
 
 @contextmanager
 def progress_bars(console: Console, every: float | None = None) -> Iterator[Progress]:
-    """Progress, stage by stage: bars on a terminal, else lines.
+    """Show progress by stage: bars on a terminal, else lines.
 
     Args:
-        console: Where to show them.
-        every: Time between two lines [s]; `EVERY` if None.
+        console: The console.
+        every: Time between two lines [s]; `LINE_INTERVAL` if None.
 
     Yields:
-        What to call with the stage's name, how much is done, and out of how much.
+        A function of the stage, the amount done and the total (None if unknown).
     """
-    told = _bars(console) if console.is_terminal else _lines(console, every or EVERY)
-    with told as report, interruption.ensure_interruption():
+    display = _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
+    with display as report, interruption.ensure_interruption():
 
         def progress(stage: str, done: int, total: int | None) -> None:
             interruption.raise_pending_interruption()
@@ -62,25 +58,26 @@ def _bars(console: Console) -> Iterator[Progress]:
         *columns,
         console=console,
         transient=True,
-        speed_estimate_period=3600.0,  # [s]; a launch of rays may take longer than Rich looks back by itself
+        # [s]; a launch of rays can take longer than the 30 s over which Rich averages by default.
+        speed_estimate_period=3600.0,
     ) as bars:
-        # Reading, loading and compiling come before the first stage that counts.
         tasks = {STARTING: bars.add_task(STARTING, total=1)}
 
         def report(stage: str, done: int, total: int | None) -> None:
             if STARTING in tasks:
                 bars.remove_task(tasks.pop(STARTING))
-            known = 1 if total is None and not done else total
+            # Without a total and with nothing done, the stage is a single step.
+            shown_total = 1 if total is None and not done else total
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=known, completed=done)
-            bars.update(tasks[stage], completed=done, total=known)
+                tasks[stage] = bars.add_task(stage, total=shown_total, completed=done)
+            bars.update(tasks[stage], completed=done, total=shown_total)
 
         yield report
 
 
 @dataclass
 class _State:
-    """How far the work is."""
+    """The current stage and how much of it is done."""
 
     stage: str = STARTING
     done: int = 0
@@ -101,33 +98,33 @@ class _State:
 
 @contextmanager
 def _lines(console: Console, every: float) -> Iterator[Progress]:
-    """Lines from a thread of its own: work that says nothing for long is told of too."""
-    state, over = _State(), Event()
+    """Lines from a separate thread, so that they also appear while the work reports nothing."""
+    state, finished = _State(), Event()
 
-    def tell() -> None:
-        while not over.wait(every):
+    def print_lines() -> None:
+        while not finished.wait(every):
             console.print(state.line(), soft_wrap=True, markup=False)
 
-    teller = Thread(target=tell, name="progress", daemon=True)
-    teller.start()
+    printer = Thread(target=print_lines, name="progress", daemon=True)
+    printer.start()
     try:
         yield state.report
     finally:
-        over.set()
-        teller.join()
+        finished.set()
+        printer.join()
 
 
 def line(stage: str, done: int, total: int | None, seconds: float) -> str:
-    """Progress as a plain line.
+    """Progress as one line of text.
 
     Args:
         stage: The stage.
-        done: How much is done.
-        total: Out of how much; None if unknown.
+        done: The amount done.
+        total: The total amount; None if unknown.
         seconds: Time since the stage began [s].
 
     Returns:
-        Stage, share, rate and time left, as far as they are known.
+        Stage, share, rate, time and remaining time, as far as they are known.
 
     Example:
         >>> line("tracing", 30, 120, 15.0)

@@ -1,4 +1,4 @@
-"""`calibray report`: a result as a page to look at."""
+"""`calibray report`: write a result as an HTML page."""
 
 from __future__ import annotations
 
@@ -19,20 +19,24 @@ def report(
         typer.Option("--out", "-o", metavar="FILE", help="HTML file to write instead of DIR/report.html."),
     ] = None,
     figures: Annotated[
-        bool, typer.Option("--figures", help="Write the figures as well, as SVG and PNG, into DIR/figures.")
+        bool, typer.Option("--figures", help="Also write the figures as SVG and PNG into DIR/figures.")
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a result as one HTML file that opens from disk: summary, values, figures, map, and the scene in 3-D."""
+    """Write a result as one HTML file: summary, values, figures, map, and the scene in 3-D."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.reporting.page import FIGURES, FILE
-        from calibray.reporting.page import report as write
+        from calibray.reporting.page import report as write_report
 
         result = Result.load(folder)
-        pictures = folder / FIGURES if figures else None
-        file = out or folder / FILE
-        written = write(result, file, figures=pictures, overwrite=overwrite, progress=progress)
-    typer.echo(f"Written to {written}", err=True)
+        file = write_report(
+            result,
+            out or folder / FILE,
+            figures=folder / FIGURES if figures else None,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    typer.echo(f"Written to {file}", err=True)

@@ -16,28 +16,29 @@ if TYPE_CHECKING:
 
 def run(
     study_file: StudyFile,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write the result into.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the result.")],
     method: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Method in place of the study's: auto, sgwo-im, gwo, ..."),
+        typer.Option(metavar="NAME", help="Method instead of the study's: auto, sgwo-im, gwo, ..."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed in place of the study's.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed instead of the study's.")] = None,
     engine: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Engine in place of the study's: replay, retrace or command."),
+        typer.Option(metavar="NAME", help="Engine instead of the study's: replay, retrace or command."),
     ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
             metavar="N",
-            help="Processes here that blocks of links are shared out to, or programs of the engine 'command' at once.",
+            help="Number of local processes that chunks of links are distributed to, or of simultaneous programs of "
+            "the engine 'command'.",
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Dask scheduler whose workers take blocks of links, or run the engine 'command'.",
+            help="Dask scheduler whose workers process chunks of links, or run the engine 'command'.",
         ),
     ] = None,
     as_json: Annotated[
@@ -45,14 +46,14 @@ def run(
     ] = False,
     overwrite: Overwrite = False,
     figures: Annotated[
-        bool, typer.Option("--figures", help="Write the report's figures as well, as SVG and PNG.")
+        bool, typer.Option("--figures", help="Also write the figures of the report as SVG and PNG.")
     ] = False,
 ) -> None:
-    """Calibrate a study's materials, print the result, and write it with the calibrated scene and a report."""
+    """Calibrate a study, print the result, and write it with the calibrated scene and a report."""
     from calibray.cli.progress_bars import progress_bars
 
     try:
-        # Loading libraries, tables and the scene takes seconds too.
+        # Importing libraries and reading the scene take seconds as well, so the progress starts here.
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
             from calibray.cli.link_warnings import warn
@@ -72,37 +73,37 @@ def run(
             with open_workers(workers, scheduler) as pool:
                 result = calibrate(setup, out=out, workers=pool, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
-        typer.echo(_kept(out), err=True)
+        typer.echo(_kept_text(out), err=True)
         raise
     if as_json:
         typer.echo(json.dumps(result.content(), indent=2))
     else:
         typer.echo(render(tables.heading(result), *tables.tables(result)))
-    written = [*FILES, *_reported(result, out, figures, overwrite)]
-    typer.echo(f"Written to {out}: {', '.join(written)}", err=True)
+    names = [*FILES, *_write_report(result, out, figures, overwrite)]
+    typer.echo(f"Written to {out}: {', '.join(names)}", err=True)
 
 
-def _kept(out: Path) -> str:
-    """What an interrupted run left, and how to go on."""
+def _kept_text(out: Path) -> str:
+    """What is kept of an interrupted run, and how to continue."""
     from contextlib import closing
 
     from calibray.engines import open_ledger
     from calibray.engines.ledger.ledger import LEDGER_FILE
-    from calibray.support import cache_folder as caching
-    from calibray.tracing import cache
+    from calibray.support.cache_folder import cache_folder
+    from calibray.tracing.cache import stored_traces
 
     parts = []
     if (out / LEDGER_FILE).is_file():
         with closing(open_ledger(out)) as ledger:
             parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
-    if cache.stored_traces():
-        parts.append(f"finished traces in {caching.cache_folder()}")
-    kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished that could be kept."
-    return f"{kept} Start the same command again to go on; what is kept is not computed twice."
+    if stored_traces():
+        parts.append(f"finished traces in {cache_folder()}")
+    kept = f"Kept: {' and '.join(parts)}." if parts else "Nothing was finished, so nothing is kept."
+    return f"{kept} Start the same command again to continue; what is kept is not computed again."
 
 
-def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
-    """Write the report beside a result that is safe by now: what goes wrong here is told, and loses nothing."""
+def _write_report(result: Result, out: Path, figures: bool, overwrite: bool) -> list[str]:
+    """Write the report next to the result; a failure is a warning only, since the result is already saved."""
     from calibray.cli.progress_bars import progress_bars
 
     try:
@@ -112,6 +113,8 @@ def _reported(result: Result, out: Path, figures: bool, overwrite: bool) -> list
         with progress_bars(log()) as progress:
             page.report(result, out / page.FILE, figures=folder, overwrite=overwrite, progress=progress)
     except Exception as error:
-        typer.echo(f"Warning: no report ({error}); try again with: calibray report {out}", err=True)
+        typer.echo(
+            f"Warning: the report was not written ({error}); try again with: calibray report {out}", err=True
+        )
         return []
     return [page.FILE, *([f"{page.FIGURES}/"] if figures else [])]

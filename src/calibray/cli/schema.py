@@ -1,4 +1,4 @@
-"""`calibray schema`: what a study file may hold, for editors."""
+"""`calibray schema`: print the JSON schema of study files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import typer
 
 
 def schema() -> None:
-    """Print the JSON schema of study files, by which editors complete and check them."""
+    """Print the JSON schema of study files, with which editors complete and check them."""
     from calibray.study.schema import schema_text
 
     typer.echo(schema_text(), nl=False)

@@ -1,4 +1,4 @@
-"""`calibray suggest`: where to measure next."""
+"""`calibray suggest`: suggest where to measure next."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ def suggest(
         Path,
         typer.Argument(
             metavar="CANDIDATES",
-            help="CSV or Parquet file of where one could measure, with the columns that `calibray predict` takes.",
+            help="CSV or Parquet file of candidate links, with the columns that `calibray predict` reads.",
             show_default=False,
         ),
     ],
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="How many points to suggest.")] = 5,
+    count: Annotated[int, typer.Option(metavar="N", min=1, help="Number of links to suggest.")] = 5,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="CSV or Parquet file to write as well.")
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Also write the table to this CSV or Parquet file."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Suggest where to measure next: the points that are expected to narrow the parameters' intervals the most."""
+    """Suggest where to measure next: the candidate links that are expected to narrow the intervals most."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
         from calibray.calibration.result import Result
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
-        from calibray.prediction.suggestion import suggest as find
+        from calibray.prediction.suggestion import suggest as suggest_links
         from calibray.prediction.suggestion import suggestion_tables
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
@@ -48,9 +49,11 @@ def suggest(
         links = as_links(result, read_table(candidates_file))
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
-        found = find(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
+        suggestion = suggest_links(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
     typer.echo(
-        json.dumps(found.to_dict("records"), indent=2) if as_json else render(*suggestion_tables(found))
+        json.dumps(suggestion.to_dict("records"), indent=2)
+        if as_json
+        else render(*suggestion_tables(suggestion))
     )
     if out is not None:
-        write_table(out, found)
+        write_table(out, suggestion)

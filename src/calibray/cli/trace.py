@@ -1,4 +1,4 @@
-"""`calibray trace`: find paths and store them, or check that enough rays were sent out."""
+"""`calibray trace`: trace the links of a study and store the paths, or check that there are enough rays."""
 
 from __future__ import annotations
 
@@ -20,58 +20,61 @@ if TYPE_CHECKING:
 def trace(
     study_file: StudyFile,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file to write the paths into.")
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="HDF5 file for the paths.")
     ] = None,
     check: Annotated[
         bool,
         typer.Option(
             "--check",
-            help="Trace again with twice the samples and another seed, and tell what changes; where the samples are "
-            "'auto', tell what the last round of rays changed.",
+            help="Trace again with twice the samples and another seed, and show the changes. If the samples are "
+            "'auto', show the changes by the last round of rays.",
         ),
     ] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Find the paths of a study's links and store them as a path program, or check that enough rays were sent out."""
+    """Trace the links of a study and store the paths, or check that there are enough rays."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
         from calibray.engines import open_workers
         from calibray.engines.cluster.chunks import stated_chunk_size, trace_in_chunks
         from calibray.engines.cluster.workers import InProcess
-        from calibray.reporting import trace_tables as report
+        from calibray.reporting import trace_tables
         from calibray.study import Study
         from calibray.support.output_files import check_file
         from calibray.tables.text import render
 
         study = Study.load(study_file)
-        _refuse_idleness(out, check)
+        if out is None and not check:
+            raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
         if out is not None:
             check_file(out, study.files(), overwrite)
         setup = study.opened()
-        links, again = setup.links, check and not study.trace.adaptive
-        with open_workers(workers, scheduler) as opened:
-            if opened is None and stated_chunk_size(setup) is None:
-                paths, found = _traced(setup, out, again, progress)
+        links, trace_again = setup.links, check and not study.trace.adaptive
+        with open_workers(workers, scheduler) as pool:
+            if pool is None and stated_chunk_size(setup) is None:
+                paths, change = _trace(setup, out, trace_again, progress)
             else:
-                paths, found = trace_in_chunks(setup, opened or InProcess(), check=again, progress=progress)
+                paths, change = trace_in_chunks(
+                    setup, pool or InProcess(), check=trace_again, progress=progress
+                )
                 if out is not None:
                     paths.save(out)
-    typer.echo(render(report.found(paths, links.row, setup.enclosed)))
+    typer.echo(render(trace_tables.overview(paths, links.row, setup.enclosed)))
     if check and study.trace.adaptive:
-        typer.echo("\n" + report.rounds(paths.settings, study.fidelity.tolerance_db))
-    if found is not None:
-        typer.echo("\n" + render(*report.convergence(found, links.row, study.fidelity.tolerance_db)))
+        typer.echo("\n" + trace_tables.last_round(paths.settings, study.fidelity.tolerance_db))
+    if change is not None:
+        typer.echo("\n" + render(*trace_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
     if out is not None:
         typer.echo(f"Written to {out}", err=True)
 
 
-def _traced(
-    setup: Setup, out: Path | None, again: bool, progress: Progress
+def _trace(
+    setup: Setup, out: Path | None, trace_again: bool, progress: Progress
 ) -> tuple[Paths, Convergence | None]:
-    """Trace all links at once, store the paths, and check them if asked to."""
+    """Trace all links at once, store the paths, and trace again as a check if requested."""
     from functools import partial
 
     from calibray.fields import path_loss
@@ -79,18 +82,12 @@ def _traced(
     from calibray.tracing import convergence
 
     study, links, tracer = setup.study, setup.links, setup.tracer
-    if told := tracer.plan(links).announcement(len(links)):
-        typer.echo(told, err=True)
+    if announcement := tracer.plan(links).announcement(len(links)):
+        typer.echo(announcement, err=True)
     paths = tracer.trace(links, progress)
     if out is not None:
         paths.save(out)
+    if not trace_again:
+        return paths, None
     loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)
-    return paths, convergence.check(
-        tracer, links, paths, loss, with_stage(progress, "checking")
-    ) if again else None
-
-
-def _refuse_idleness(out: Path | None, check: bool) -> None:
-    """Refuse to trace for nothing."""
-    if out is None and not check:
-        raise InputError("trace: give -o FILE to store the paths, --check to check them, or both")
+    return paths, convergence.check(tracer, links, paths, loss, with_stage(progress, "checking"))

@@ -1,4 +1,4 @@
-"""`calibray validate`: what calibration is worth where nothing was fitted."""
+"""`calibray validate`: refit without each block of links in turn and predict the block."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ def validate(
             metavar="N",
             min=2,
             max=100,
-            help="Spatial blocks, each held out in turn; the study's, or 4, unless given.",
+            help="Number of blocks, each held out in turn; by default that of the study, or 4.",
         ),
     ] = None,
     by: Annotated[
         str | None,
         typer.Option(
-            metavar="COLUMN", help="Hold out each label of a column in turn; tx for each transmitter."
+            metavar="COLUMN",
+            help="Hold out the links of each value of a column in turn; tx for each transmitter.",
         ),
     ] = None,
     out: Annotated[
@@ -34,7 +35,7 @@ def validate(
             "--out",
             "-o",
             metavar="DIR",
-            help="Write it into this folder, that of a result of the study: `calibray report DIR` shows it then.",
+            help="Write the validation into this folder of a result, for `calibray report DIR` to show it.",
         ),
     ] = None,
     workers: Workers = None,
@@ -42,7 +43,7 @@ def validate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate without each block of links in turn, and judge the twin and its rivals by the block left out."""
+    """Calibrate without each block of links in turn, and compare models on the held-out block."""
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
@@ -51,15 +52,15 @@ def validate(
         from calibray.study import Study
         from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
-        from calibray.validation.validate import validate as judge
+        from calibray.validation.validate import validate as run_validation
 
         study = Study.load(study_file)
         if out is not None:
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
         with open_workers(workers, scheduler) as pool:
-            found = judge(study, blocks=blocks, by=by, workers=pool, progress=progress)
-    typer.echo(json.dumps(found.content(), indent=2) if as_json else render(*found.summary()))
+            validation = run_validation(study, blocks=blocks, by=by, workers=pool, progress=progress)
+    typer.echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_validation(found, out, found.content())
+        write_validation(validation, out, validation.content())
         typer.echo(f"Written to {out / VALIDATION_FILE}", err=True)

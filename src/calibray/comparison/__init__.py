@@ -1,1 +1,1 @@
-"""Methods compared at equal budgets, and the paper's experiment."""
+"""Comparison of methods at equal budgets, and the experiment of the paper."""

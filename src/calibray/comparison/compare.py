@@ -1,4 +1,4 @@
-"""Methods compared at equal budgets: every method from many seeds on one problem."""
+"""Comparison of methods at equal budgets: every method from many seeds on one problem."""
 
 from __future__ import annotations
 
@@ -69,16 +69,16 @@ def compare(
         The comparison.
 
     Raises:
-        InputError: A method, a number or the folder cannot be used.
+        InputError: A method, a number or the folder is invalid.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):
         if not 1 <= value <= LIMITS[name]:
-            raise InputError(f"{name} = {value}; it must be 1 to {LIMITS[name]:,}")
+            raise InputError(f"{name} = {value}: must be 1 to {LIMITS[name]:,}")
     methods = parse_methods(names, budget)
     check_folder(out)
     problem = open_problem()
     for method in methods:
-        method.optimizer(problem, 0)  # refuses missing libraries and unfit methods before anything is run
+        method.optimizer(problem, 0)  # refuses missing libraries and unsuitable methods before any run
     file = RunFile(Path(out) / "runs.jsonl", f"{problem.fingerprint}-{code_fingerprint()}")
     tasks = [(method, seed) for seed in range(seeds) for method in methods]
     missing = [(method, seed) for method, seed in tasks if file.find(method.key(seed)) is None]
@@ -99,7 +99,7 @@ def compare(
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:
-    """Read methods with their budgets, duplicates left out.
+    """Parse methods with their budgets; duplicates are left out.
 
     Args:
         names: Methods, each with the common budget or another one as in "gwo@600".
@@ -109,16 +109,16 @@ def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ..
         The methods.
 
     Raises:
-        InputError: There is none, no such method, or a budget cannot be used.
+        InputError: The list is empty, a method is unknown, or a budget is invalid.
     """
     methods = tuple(BudgetedMethod.parse(name, budget) for name in dict.fromkeys(names))
     if not methods:
-        raise InputError(f"methods: none is named; {did_you_mean('', METHODS)}")
+        raise InputError(f"methods: the list is empty; {did_you_mean('', METHODS)}")
     return methods
 
 
 def _search_optimum(problem: ComparisonProblem) -> MethodRun:
-    """Least squares from so many starts that its end counts as the global optimum."""
+    """Least squares from many starts, enough for its result to count as the global optimum."""
     starts = OPTIMUM_STARTS[problem.large]
 
     def make() -> Optimizer:
@@ -129,9 +129,11 @@ def _search_optimum(problem: ComparisonProblem) -> MethodRun:
     return run_optimizer(problem, OPTIMUM, make)
 
 
-def _lowest(known: float, reference: MethodRun, runs: dict[str, tuple[MethodRun, ...]]) -> tuple[float, str]:
+def _lowest(
+    earlier: float, reference: MethodRun, runs: dict[str, tuple[MethodRun, ...]]
+) -> tuple[float, str]:
     """The lowest objective of all searches, and the first of them that reached it within rounding."""
-    ends = [(reference.at(reference.evaluations), "many-start least squares"), (known, "earlier searches")]
+    ends = [(reference.at(reference.evaluations), "many-start least squares"), (earlier, "earlier searches")]
     for name, finished in runs.items():
         ends += [(run.at(run.evaluations), f"{name}, seed {run.seed}") for run in finished]
     optimum = min(objective for objective, _ in ends)

@@ -1,7 +1,7 @@
 """The result of a comparison: excess of every method over RT calls, as numbers and as tables.
 
-The excess is the best objective so far minus the global optimum of the same data. The optimum is that of least squares
-from very many starts, or of any run that went lower.
+The excess is the best objective so far minus the global optimum of the same data. The optimum comes from least squares
+with many starts, or from a run that reached a lower value.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from calibray.optimizers import METHODS, label
 from calibray.tables import Column, Table, display, numbers
 
 CALLS: Final = (30, 60, 225)
-"""RT calls after which the excess is tabulated, besides the end."""
+"""RT calls after which the excess is tabulated, in addition to the end."""
 
 EXCESSES_DB: Final = (0.05, 0.02, 0.01)
-"""Excesses whose first RT call is tabulated [dB]."""
+"""Levels of excess; the table shows how many RT calls reach each [dB]."""
 
 COLUMNS: Final = (
     Column("method"), Column("uses"), numbers("RT calls"),
@@ -41,9 +41,9 @@ class Comparison:
     Attributes:
         name: The problem.
         methods: The methods, in the order requested.
-        runs: Their runs by name, one for each seed.
-        optimum: Lowest objective known, [dB].
-        found_by: The search that found it.
+        runs: Their runs by name, one per seed.
+        optimum: Lowest known objective [dB].
+        found_by: The search that found the optimum.
     """
 
     name: str

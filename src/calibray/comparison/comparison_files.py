@@ -16,7 +16,7 @@ from calibray.support.output_files import write_table
 
 FILES: Final = ("compare.csv", "runs.csv", "compare.png")
 FLOOR_DB: Final = 1e-4
-"""Smallest excess drawn [dB]; lower ones are drawn there."""
+"""Smallest excess that is drawn [dB]; lower ones are drawn at this value."""
 
 
 def write(comparison: Comparison, folder: Path) -> None:
@@ -24,7 +24,7 @@ def write(comparison: Comparison, folder: Path) -> None:
 
     Args:
         comparison: The comparison.
-        folder: Folder to write into, which exists.
+        folder: An existing folder.
     """
     write_table(folder / FILES[0], comparison.table())
     write_table(folder / FILES[1], comparison.history())

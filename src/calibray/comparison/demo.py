@@ -1,4 +1,4 @@
-"""The paper's experiment: the demo district calibrated by GWO, SGWO-IM, space mapping and `auto`.
+"""The experiment of the paper: the demo district calibrated by GWO, SGWO-IM, space mapping and `auto`.
 
 Space mapping runs on the ray tracer itself, which traces again for every candidate, with a trace of fewer interactions
 as its cheap model. This is how an engine without stored paths is calibrated. `auto` runs on stored paths.
@@ -26,7 +26,7 @@ from calibray.support.progress import Progress, with_stage
 RECORD: Final = "result.json"
 FIGURES: Final = ("cumulative-cost.png", "convergence.png", "path-loss.png")
 FILES: Final = (RECORD, *FIGURES, page.FILE)
-"""Files of the experiment, besides a folder for each method."""
+"""Files of the experiment, in addition to a folder for each method."""
 
 MAPPING_CALLS: Final = 8
 """RT calls of space mapping, each a trace."""
@@ -39,15 +39,15 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
     """Run the experiment.
 
     Args:
-        engine: "replay" (trace once), or "retrace" to trace for every RT call as the paper does.
+        engine: "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
         seed: Seed of the methods.
-        progress: Called as the work goes on, with the method's name in front.
+        progress: Called with every stage, which begins with the name of the method.
 
     Returns:
         The experiment.
 
     Raises:
-        InputError: The engine is unknown, or the seed is impossible.
+        InputError: The engine or the seed is invalid.
     """
     study = Study.load(demo_study_path())
     started = time.perf_counter()
@@ -55,9 +55,11 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
     setup.replace(seed=seed, engine=engine)  # refuses an unknown engine or seed before anything is traced
     replay = engines.make(setup, "replay", progress)
     trace_seconds = time.perf_counter() - started
-    chosen = replay if engine == "replay" else engines.make(setup, engine)
+    paper_engine = replay if engine == "replay" else engines.make(setup, engine)
     results = {
-        method: calibrate(setup, method, seed, engine=chosen, progress=with_stage(progress, label(method)))
+        method: calibrate(
+            setup, method, seed, engine=paper_engine, progress=with_stage(progress, label(method))
+        )
         for method in METHODS
     }
     results[MAPPING] = _space_mapping(setup, seed, with_stage(progress, label(MAPPING)))
@@ -77,7 +79,7 @@ def write_demo(demo: Demo, out: Path) -> Path:
 
     Args:
         demo: The experiment.
-        out: Folder to write into; made if absent.
+        out: Folder to write into; created if needed.
 
     Returns:
         The report, an HTML file.

@@ -1,4 +1,4 @@
-"""The result of the paper's experiment: our figures and the paper's in the same tables."""
+"""The result of the paper's experiment, in tables next to the values that the paper reports."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class Demo:
 
     Attributes:
         results: Results by method, `auto` last; space mapping runs on the engine "retrace".
-        optimum_db: RMSE of the global optimum, [dB], found by `auto` on stored paths.
+        optimum_db: RMSE of the global optimum [dB], found by `auto` on stored paths.
         truth: Planted mean permittivities by material.
         engine: The engine of the paper's methods.
-        trace_seconds: Time to load and trace the district, which replay spends once, [s].
+        trace_seconds: Time to load and trace the district, which replay needs once [s].
     """
 
     results: dict[str, Result]
@@ -85,7 +85,7 @@ class Demo:
 
 
 def cost(demo: Demo) -> Table:
-    """RT calls and time of every method, with the paper's."""
+    """RT calls and time of every method, and those that the paper reports."""
     columns = (
         Column("method"), numbers("RT calls"), numbers("time", "s"),
         numbers("paper: calls"), numbers("paper: time", "s"),
@@ -103,7 +103,7 @@ def cost(demo: Demo) -> Table:
 
 
 def permittivity(demo: Demo) -> Table:
-    """Permittivities of every method, the planted ones, and the paper's at its own site."""
+    """Permittivities of every method, the planted ones, and those of the paper at its own site."""
     columns = (
         Column("material"),
         Column("before"),

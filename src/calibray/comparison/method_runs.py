@@ -1,4 +1,4 @@
-"""Runs of methods with equal budgets: one run, its record, and a file that keeps finished runs."""
+"""Runs of methods with a budget: a run, its record, and a file that keeps finished runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calibray.optimizers import METHODS, Optimizer
 from calibray.support.output_files import exists
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
-"""Largest numbers accepted: a comparison with more would not end."""
+"""Largest accepted numbers; a comparison with more would not end in useful time."""
 
 RunKey = tuple[str, int, int]
 """Method, budget and seed, which identify a run on a problem."""
@@ -51,7 +51,7 @@ class BudgetedMethod:
 
     @staticmethod
     def parse(name: str, budget: int) -> BudgetedMethod:
-        """Read a method with its budget.
+        """Parse a method with its budget.
 
         Args:
             name: A method, or `METHOD@CALLS` with another budget than the common one.
@@ -61,7 +61,7 @@ class BudgetedMethod:
             The method.
 
         Raises:
-            InputError: There is no such method, or the budget is no whole number, or too small.
+            InputError: The method is unknown, or the budget is no whole number or too small.
 
         Example:
             >>> BudgetedMethod.parse("gwo@600", 225)
@@ -75,7 +75,7 @@ class BudgetedMethod:
         least = 1 if schedule is None else schedule.least
         if (calls and calls != str(budget)) or not least <= budget <= LIMITS["budget"]:
             raise InputError(
-                f"method {name!r}: a budget of {calls or budget} RT calls; it must be a whole number from {least} to "
+                f"method {name!r}: the budget {calls or budget} must be a whole number of RT calls from {least} to "
                 f"{LIMITS['budget']:,}"
             )
         return BudgetedMethod(name, method, budget)
@@ -109,7 +109,7 @@ class BudgetedMethod:
         )
 
     def run(self, problem: ComparisonProblem, seed: int) -> MethodRun:
-        """Run the method; an error ends the run, and its message is kept."""
+        """Run the method; an error ends the run and its message is recorded."""
         return run_optimizer(problem, self.key(seed), lambda: self.optimizer(problem, seed))
 
 
@@ -159,7 +159,7 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
         make: Makes the optimizer.
 
     Returns:
-        The run; an error ends it, and its message is kept.
+        The run; an error ends it and its message is recorded.
     """
     calls: list[int] = []
     best: list[float] = []
@@ -172,23 +172,23 @@ def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Op
                 if value < (best[-1] if best else np.inf):
                     calls.append(evaluations)
                     best.append(value)
-    except Exception as error:  # a failed run is a result about its method
+    except Exception as error:  # a failed run is a result too
         failure = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - started
     return MethodRun(*key, evaluations, tuple(calls), tuple(best), seconds, failure)
 
 
 class RunFile:
-    """Finished runs of one problem, in a file of JSON lines that may hold runs of others.
+    """Finished runs of one problem, in a file of JSON lines that can also contain runs of other problems.
 
     Runs are appended one by one, so a comparison that was killed continues where it stopped.
 
     Args:
-        path: The file; made when the first run is added.
+        path: The file; created when the first run is added.
         problem: Digest of everything that a run depends on apart from method, budget and seed.
 
     Raises:
-        InputError: The file holds something else.
+        InputError: The file contains something else.
     """
 
     def __init__(self, path: Path, problem: str) -> None:
@@ -199,10 +199,12 @@ class RunFile:
         for line in text.splitlines():
             try:
                 record = json.loads(line)
-            except ValueError:  # the line that a killed process was writing
+            except ValueError:  # an incomplete line of a killed process
                 continue
             if not isinstance(record, dict) or "problem" not in record:
-                raise InputError(f"{path}: holds something else than finished runs; name another folder")
+                raise InputError(
+                    f"{path}: contains something other than finished runs; choose another folder"
+                )
             if record.pop("problem") == problem:
                 run = MethodRun(**{**record, "calls": tuple(record["calls"]), "best": tuple(record["best"])})
                 self._runs[run.method, run.budget, run.seed] = run
@@ -223,7 +225,7 @@ class RunFile:
 
 @cache
 def code_fingerprint(method: str | None = None) -> str:
-    """Digest of the optimizers' code: runs of other code are not comparable.
+    """Digest of the code of the optimizers; runs of different code are not comparable.
 
     Args:
         method: Digest only the module of this method and all optimizer modules that it imports; None for all methods.

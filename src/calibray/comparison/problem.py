@@ -1,4 +1,4 @@
-"""A problem on which methods are compared, and one made of a study on its stored paths."""
+"""The problem on which methods are compared; a study on stored paths is one."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class ComparisonProblem:
         fingerprint: Digest of everything that an evaluation depends on.
         lower: Lower bounds of the search space [d].
         upper: Upper bounds [d].
-        start: Starting point of a user [d]; None if there is none.
-        starts: Further starting points for methods that take them; their default if None.
-        large: Whether evaluations are so expensive that the reference search has few starts.
-        minimum: Lowest objective known beforehand; +inf if unknown.
-        evaluate: The function that is minimised.
-        cheap_model: Makes a cheap model of it; None if there is none.
-        wrong_constants: Whether that cheap model has wrong constants.
+        start: Starting point given by the user [d]; None without one.
+        starts: Number of further starting points of methods that use several; None for their default.
+        large: Whether evaluations are too expensive for a reference search with many starts.
+        minimum: Lowest objective known in advance; +inf if unknown.
+        evaluate: The function to minimise.
+        cheap_model: Makes a cheap model of the function; None without one.
+        wrong_constants: Whether the cheap model has wrong constants.
     """
 
     name: str
@@ -54,7 +54,7 @@ class ComparisonProblem:
 
 
 def study_problem(path: str | Path) -> ComparisonProblem:
-    """A study on its stored paths, which are traced if they are not in the cache.
+    """Make a problem of a study on its stored paths, which are traced if they are not in the cache.
 
     Args:
         path: The study file.
@@ -68,11 +68,11 @@ def study_problem(path: str | Path) -> ComparisonProblem:
     study = Study.load(path)
     if study.engine.external:
         raise InputError(
-            f"{path}: engine {study.engine.name!r} is too expensive for hundreds of runs; methods are compared on "
-            "stored paths: set engine.name to 'replay'"
+            f"{path}: the engine {study.engine.name!r} is too expensive for hundreds of runs; set engine.name to "
+            "'replay' to compare methods on stored paths"
         )
     setup = Setup.open(study.replace(engine="replay"))
-    # A replay gives derivatives.
+    # The replay engine always gives derivatives.
     engine = cast(engines.Differentiable, engines.make(setup))
     problem = estimate_noise(Problem.of(setup, engine))
     objective, parameters, links = problem.objective, problem.parameters, setup.links

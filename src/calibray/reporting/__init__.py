@@ -1,5 +1,5 @@
-"""What is shown: records as tables, tables as text, as HTML and in Markdown, and figures.
+"""The report page, tables, figures and exports of finished calibrations.
 
-Records are handed in. This room imports none of the machinery that makes them, so that a record can show itself and a
-command print it where nothing can be traced.
+This room only reads records. It does not import `calibration`, so that a result can show itself on machines that cannot
+trace.
 """

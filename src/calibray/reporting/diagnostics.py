@@ -1,4 +1,4 @@
-"""What is remarkable about a calibration, as tables: residuals, leverage, power, trade-offs, neighbours, priors."""
+"""Diagnostics of a finished calibration: residuals, leverage, power, trade-offs, neighbours and changes, as tables."""
 
 from __future__ import annotations
 
@@ -9,49 +9,50 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray.reporting.link_survey import POSITION_COLUMNS, residual
 from calibray.result.record import Record
 from calibray.tables import Column, Table
+from calibray.tables.text import rows_text
+from calibray.uncertainty.residual_correlation import variogram
 
 CLASSES: Final = 6
-"""Classes of distance that residuals are shown in, of about equally many links."""
+"""Most classes of distance, each with about as many links as the others."""
 
-PAIRS: Final = 300
-"""Unknowns up to which every pair of them is compared."""
+MOST_UNKNOWNS: Final = 300
+"""Most unknowns whose draws are compared pair by pair."""
 
-STRONG: Final = 0.7
-"""Correlation of two unknowns from which one is said to make up for the other."""
+TRADE_OFF: Final = 0.7
+"""Correlation of the draws from which two unknowns are reported as compensating for each other."""
 
 DECIDING: Final = 0.5
-"""Leverage from which a link is said to decide something by itself."""
+"""Leverage above which a link is reported as determining an unknown almost alone."""
 
 CLEAR: Final = 2.0
-"""Standard errors beyond which a trend is not taken for chance."""
+"""Standard errors above which a difference counts as significant."""
 
-FEW: Final = 8
-"""Links below which trends are not looked for."""
+FEWEST: Final = 8
+"""Fewest links for which trends are tested."""
 
 EVEN_DB: Final = 0.1
-"""Mean residual below which classes of links are not told apart [dB]."""
-
-PLACES: Final = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
+"""Mean residual [dB] below which no class of links is reported."""
 
 
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
-    """All that can be looked at, as tables.
+    """Compute tables that describe the residuals and the certainty of a calibration.
 
     Args:
         result: The calibration.
 
     Returns:
-        Tables by name, those that cannot be known left out. "distance", "depth" and "group": number, mean and standard
-        deviation of the residuals [dB], model minus measurement, of the links calibrated on. "leverage": every such
-        link's share in deciding the unknowns. "power": share of the links' power by material and kind of interaction.
-        "trade_offs": correlation of every two unknowns over the draws. "neighbours": semivariance of residuals over the
-        distance between links, both ends counted. "moved": where every parameter came from and went to, and what of its
-        range is left.
+        Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
+        and standard deviation of the residuals [dB] on the calibration links. "leverage": leverage and residual of
+        every calibration link. "power": share of the links' power by material and type of interaction. "trade_offs":
+        correlation of the draws of every two unknowns. "neighbours": semivariance of the residuals over the distance
+        between links, both ends counted. "moved": value of every parameter before and after, the change and the 95 %
+        interval as shares of its range.
     """
-    found = {
-        "distance": _over_distance(result),
+    tables = {
+        "distance": _by_distance(result),
         "depth": _by(result, "depth"),
         "group": _by(result, "group"),
         "leverage": _leverage(result),
@@ -60,45 +61,46 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
         "neighbours": _neighbours(result),
         "moved": _moved(result),
     }
-    return {name: table for name, table in found.items() if len(table)}
+    return {name: table for name, table in tables.items() if len(table)}
 
 
-def remarkable(result: Record) -> Table:
-    """The same in a few lines.
+def diagnostics_table(result: Record) -> Table:
+    """Summarize the diagnostics in a line each.
 
     Args:
         result: The calibration.
 
     Returns:
-        A table: what was looked at, and what it says.
+        A table: the subject, and the finding.
     """
-    known = diagnostics(result)
-    lines = {
-        "power": _power_said(known),
-        "over distance": _distance_said(result),
-        "by depth": _spread_said(known, "depth", "paths of {} interactions"),
-        "by group": _spread_said(known, "group", "group {}"),
-        "neighbours": _neighbours_said(known),
-        "leverage": _leverage_said(known),
-        "trade-offs": _trade_offs_said(known),
-        "moved": _moved_said(known),
+    tables = diagnostics(result)
+    findings = {
+        "power": _power_text(tables),
+        "over distance": _distance_text(result),
+        "by depth": _class_text(tables, "depth", "paths of {} interactions"),
+        "by group": _class_text(tables, "group", "group {}"),
+        "neighbours": _neighbours_text(tables),
+        "leverage": _leverage_text(tables),
+        "trade-offs": _trade_offs_text(tables),
+        "largest change": _moved_text(tables),
     }
-    rows = tuple((name, said) for name, said in lines.items() if said)
+    rows = tuple((name, text) for name, text in findings.items() if text)
     return Table("Diagnostics", (Column(), Column()), rows)
 
 
-def _used(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
-    """The links calibrated on whose residual is known, and these residuals [m], [dB]."""
-    left = result.links["after_db"].to_numpy(float) - result.links["measured_db"].to_numpy(float)
-    used = np.isfinite(left) & ~result.links["held_out"].to_numpy(bool)
-    return result.links[used], left[used]
+def _calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
+    """The calibration links with a path, and their residuals [dB]."""
+    residuals = residual(result.links)
+    mask = np.isfinite(residuals) & ~result.links["held_out"].to_numpy(bool)
+    return result.links[mask], residuals[mask]
 
 
 def _ends(links: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    if not set(PLACES) <= set(links.columns):
+    """Positions of transmitters and receivers [links, 3], [m]; None if unknown."""
+    if not set(POSITION_COLUMNS) <= set(links.columns):
         return None
-    ends = links[list(PLACES)].to_numpy(float)
-    return ends[:, :3], ends[:, 3:]
+    positions = links[list(POSITION_COLUMNS)].to_numpy(float)
+    return positions[:, :3], positions[:, 3:]
 
 
 def _distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
@@ -106,62 +108,65 @@ def _distance(links: pd.DataFrame) -> NDArray[np.float64] | None:
     return None if ends is None else np.linalg.norm(ends[1] - ends[0], axis=1)
 
 
-def _over_distance(result: Record) -> pd.DataFrame:
-    links, left = _used(result)
+def _by_distance(result: Record) -> pd.DataFrame:
+    links, residuals = _calibration_links(result)
     distance = _distance(links)
-    if distance is None or len(left) < FEW:
+    if distance is None or len(residuals) < FEWEST:
         return pd.DataFrame()
-    parts = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(left) // 4))
+    classes = np.array_split(np.argsort(distance, kind="stable"), min(CLASSES, len(residuals) // 4))
     return pd.DataFrame(
         [
-            {"from_m": distance[part].min(), "to_m": distance[part].max(), **_figures(left[part])}
-            for part in parts
+            {
+                "from_m": distance[members].min(),
+                "to_m": distance[members].max(),
+                **_statistics(residuals[members]),
+            }
+            for members in classes
         ]
     )
 
 
 def _by(result: Record, column: str) -> pd.DataFrame:
-    links, left = _used(result)
+    links, residuals = _calibration_links(result)
     if column not in links:
         return pd.DataFrame()
-    labels = links[column].to_numpy()
-    known = pd.unique(labels[pd.notna(labels)])
-    return pd.DataFrame(
-        [{column: label, **_figures(left[labels == label])} for label in sorted(known.tolist())]
-    )
+    values = links[column].to_numpy()
+    distinct = sorted(pd.unique(values[pd.notna(values)]).tolist())
+    return pd.DataFrame([{column: value, **_statistics(residuals[values == value])} for value in distinct])
 
 
-def _figures(left: NDArray[np.float64]) -> dict[str, float]:
-    return {"links": len(left), "mean_db": float(left.mean()), "standard_deviation_db": float(left.std())}
+def _statistics(residuals: NDArray[np.float64]) -> dict[str, float]:
+    return {
+        "links": len(residuals),
+        "mean_db": float(residuals.mean()),
+        "standard_deviation_db": float(residuals.std()),
+    }
 
 
 def _leverage(result: Record) -> pd.DataFrame:
-    links, left = _used(result)
+    links, residuals = _calibration_links(result)
     if "leverage" not in links or not np.isfinite(links["leverage"]).any():
         return pd.DataFrame()
-    return pd.DataFrame(
-        {"row": links["row"].to_numpy(), "leverage": links["leverage"].to_numpy(float), "residual_db": left}
-    )
+    leverage = links["leverage"].to_numpy(float)
+    return pd.DataFrame({"row": links["row"].to_numpy(), "leverage": leverage, "residual_db": residuals})
 
 
 def _power(result: Record) -> pd.DataFrame:
     rows = [
         {"material": material, "interaction": kind, "share": share}
-        for material, kinds in result.fit.power_shares.items()
-        for kind, share in kinds.items()
+        for material, shares in result.fit.power_shares.items()
+        for kind, share in shares.items()
     ]
-    return (
-        pd.DataFrame(rows).sort_values("share", ascending=False, ignore_index=True)
-        if rows
-        else pd.DataFrame()
-    )
+    if not rows:
+        return pd.DataFrame()
+    return pd.DataFrame(rows).sort_values("share", ascending=False, ignore_index=True)
 
 
 def _trade_offs(result: Record) -> pd.DataFrame:
     names = [name for name, values in result.uncertainty.draws.items() if np.ptp(values) > 0]
-    if not 2 <= len(names) <= PAIRS:
+    if not 2 <= len(names) <= MOST_UNKNOWNS:
         return pd.DataFrame()
-    matrix = np.atleast_2d(np.corrcoef([_searched(result, name) for name in names]))
+    matrix = np.atleast_2d(np.corrcoef([_scaled_draws(result, name) for name in names]))
     rows = [
         {"first": names[i], "second": names[k], "correlation": float(matrix[i, k])}
         for i, k in combinations(range(len(names)), 2)
@@ -169,125 +174,121 @@ def _trade_offs(result: Record) -> pd.DataFrame:
     return pd.DataFrame(rows).sort_values("correlation", key=lambda column: -abs(column), ignore_index=True)
 
 
-def _searched(result: Record, name: str) -> NDArray[np.float64]:
-    """Draws of an unknown on the scale of the search."""
+def _scaled_draws(result: Record, name: str) -> NDArray[np.float64]:
+    """Draws of an unknown, logarithmic if the parameter is searched on a logarithmic scale."""
     values = np.array(result.uncertainty.draws[name])
     section = result.study.parameters.get(name)
     return np.log(values) if section is not None and section.scale == "log" else values
 
 
 def _neighbours(result: Record) -> pd.DataFrame:
-    from calibray.uncertainty.residual_correlation import variogram
-
-    links, left = _used(result)
+    links, residuals = _calibration_links(result)
     ends = _ends(links)
-    if ends is None or len(left) < FEW:
+    if ends is None or len(residuals) < FEWEST:
         return pd.DataFrame()
-    # At one receiver the links of two transmitters are no neighbours.
-    distance, half, pairs = variogram(left, np.hstack(ends))
-    return pd.DataFrame({"distance_m": distance, "semivariance_db2": half, "pairs": pairs})
+    # Distance in six dimensions: links of two transmitters to the same receiver are no neighbours.
+    distance, semivariance, pairs = variogram(residuals, np.hstack(ends))
+    return pd.DataFrame({"distance_m": distance, "semivariance_db2": semivariance, "pairs": pairs})
 
 
 def _moved(result: Record) -> pd.DataFrame:
     rows = []
     for name, after in result.parameters.items():
         section, before = result.study.parameters[name], result.fit.initial_parameters[name]
-        ends = np.array(section.bounds, dtype=float)
-        log = section.scale == "log"
-        scale = (lambda value: np.log(value)) if log else (lambda value: np.asarray(value, dtype=float))
-        width = float(np.ptp(scale(ends)))
         interval = result.intervals.get(name)
-        left = np.nan if interval is None else float(np.ptp(scale([interval.lower, interval.upper]))) / width
-        moved = float(scale(after) - scale(before)) / width
-        rows.append({"parameter": name, "before": before, "after": after, "moved": moved, "interval": left})
+        ends = (np.nan, np.nan) if interval is None else (interval.lower, interval.upper)
+        values = np.array([*section.bounds, before, after, *ends], dtype=float)
+        lower, upper, start, end, low, high = np.log(values) if section.scale == "log" else values
+        width = upper - lower
+        rows.append(
+            {
+                "parameter": name,
+                "before": before,
+                "after": after,
+                "moved": float((end - start) / width),
+                "interval": float((high - low) / width),
+            }
+        )
     return pd.DataFrame(rows)
 
 
-def _power_said(known: dict[str, pd.DataFrame]) -> str:
-    if "power" not in known:
+def _power_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "power" not in tables:
         return ""
-    rows = known["power"].head(5).itertuples()
-    return ", ".join(
-        f"{row.material} {row.interaction} {row.share:.0%}".replace("  ", " ") for row in rows
-    ) + (" of the links' power, on the mean")
+    rows = tables["power"].head(5).itertuples()
+    shares = (f"{row.material} {row.interaction} {row.share:.0%}".replace("  ", " ") for row in rows)
+    return f"mean share of a link's power: {', '.join(shares)}"
 
 
-def _distance_said(result: Record) -> str:
-    links, left = _used(result)
+def _distance_text(result: Record) -> str:
+    links, residuals = _calibration_links(result)
     distance = _distance(links)
-    if distance is None or len(left) < FEW or np.ptp(distance) == 0:
+    if distance is None or len(residuals) < FEWEST or np.ptp(distance) == 0:
         return ""
     decades = np.log10(distance) - np.log10(distance).mean()
-    slope = float(decades @ left / (decades @ decades))
-    rest = left - left.mean() - slope * decades
-    error = float(np.sqrt(rest @ rest / (len(left) - 2) / (decades @ decades)))
+    slope = float(decades @ residuals / (decades @ decades))
+    rest = residuals - residuals.mean() - slope * decades
+    error = float(np.sqrt(rest @ rest / (len(residuals) - 2) / (decades @ decades)))
     verdict = "a trend" if abs(slope) > CLEAR * error else "no trend"
-    return f"{verdict}: residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
+    return f"{verdict}: the residuals change by {slope:+.1f} dB per decade, standard error {error:.1f} dB"
 
 
-def _spread_said(known: dict[str, pd.DataFrame], name: str, words: str) -> str:
-    if name not in known or len(known[name]) < 2:
+def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> str:
+    """The class of links with the largest mean residual."""
+    if column not in tables or len(tables[column]) < 2:
         return ""
-    table = known[name]
-    many = table[table["links"] >= 3]
-    if not len(many):
+    table = tables[column][tables[column]["links"] >= 3]
+    if not len(table):
         return ""
-    worst = many.iloc[int(np.argmax(many["mean_db"].abs()))]
+    worst = table.iloc[int(np.argmax(table["mean_db"].abs()))]
     if abs(worst["mean_db"]) < EVEN_DB:
         return ""
-    label = f"{worst[name]:g}" if isinstance(worst[name], float) else str(worst[name])
-    clear = (
-        ""
-        if abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
-        else ", which may be chance"
+    name = f"{worst[column]:g}" if isinstance(worst[column], float) else str(worst[column])
+    clear = abs(worst["mean_db"]) > CLEAR * worst["standard_deviation_db"] / np.sqrt(worst["links"])
+    return (
+        f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
+        + ("" if clear else " (not significant)")
     )
-    said = words.format(label)
-    return f"furthest off are {said}: {worst['mean_db']:+.1f} dB on the mean of {worst['links']:.0f} links{clear}"
 
 
-def _neighbours_said(known: dict[str, pd.DataFrame]) -> str:
-    if "neighbours" not in known or len(known["neighbours"]) < 3:
+def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "neighbours" not in tables or len(tables["neighbours"]) < 3:
         return ""
-    table = known["neighbours"]
-    nearest, level = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
-    share = 1.0 - nearest["semivariance_db2"] / level if level > 0 else 0.0
-    # A semivariance of so many pairs is known to about this share of itself.
+    table = tables["neighbours"]
+    nearest, sill = table.iloc[0], float(table["semivariance_db2"].iloc[len(table) // 2 :].mean())
+    share = 1.0 - nearest["semivariance_db2"] / sill if sill > 0 else 0.0
+    # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
     if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
-        return f"links {nearest['distance_m']:.0f} m apart share no more of their errors than others do"
+        return f"the errors of links {nearest['distance_m']:.0f} m apart are not correlated"
     return f"links {nearest['distance_m']:.0f} m apart share {share:.0%} of the variance of their errors"
 
 
-def _leverage_said(known: dict[str, pd.DataFrame]) -> str:
-    if "leverage" not in known:
+def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "leverage" not in tables:
         return ""
-    from calibray.tables.text import rows_text
-
-    table = known["leverage"]
-    mighty = table[table["leverage"] > DECIDING]
-    if len(mighty):
-        rows = rows_text(mighty["row"].tolist())
-        links = "link decides" if len(mighty) == 1 else "links decide"
-        return f"{len(mighty)} {links} something almost alone (leverage above {DECIDING:g}): {rows}"
-    top = table.iloc[int(np.argmax(table["leverage"]))]
-    return f"no link decides anything alone; the largest is {top['leverage']:.2f}, in row {top['row']:.0f}"
+    table = tables["leverage"]
+    deciding = table[table["leverage"] > DECIDING]
+    if len(deciding):
+        links = "1 link determines" if len(deciding) == 1 else f"{len(deciding)} links determine"
+        rows = rows_text(deciding["row"].tolist())
+        return f"{links} an unknown almost alone (leverage above {DECIDING:g}): {rows}"
+    largest = table.iloc[int(np.argmax(table["leverage"]))]
+    return f"no link determines an unknown alone; the largest is {largest['leverage']:.2f}, in row {largest['row']:.0f}"
 
 
-def _trade_offs_said(known: dict[str, pd.DataFrame]) -> str:
-    if "trade_offs" not in known:
+def _trade_offs_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "trade_offs" not in tables:
         return ""
-    table = known["trade_offs"]
-    strong = table[table["correlation"].abs() > STRONG].head(3)
+    table = tables["trade_offs"]
+    strong = table[table["correlation"].abs() > TRADE_OFF].head(3)
     if not len(strong):
-        return "no two unknowns make up for one another"
+        return f"no two unknowns have a correlation above {TRADE_OFF:g}"
     return "; ".join(f"{row.first} and {row.second} ({row.correlation:+.2f})" for row in strong.itertuples())
 
 
-def _moved_said(known: dict[str, pd.DataFrame]) -> str:
-    if "moved" not in known:
+def _moved_text(tables: dict[str, pd.DataFrame]) -> str:
+    if "moved" not in tables:
         return ""
-    table = known["moved"]
-    far = table.iloc[int(np.argmax(table["moved"].abs()))]
-    return (
-        f"furthest {far['parameter']}, from {far['before']:.4g} to {far['after']:.4g}: {abs(far['moved']):.0%} of "
-        "its range"
-    )
+    table = tables["moved"]
+    row = table.iloc[int(np.argmax(table["moved"].abs()))]
+    return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {abs(row['moved']):.0%} of its range"

@@ -1,4 +1,4 @@
-"""Export: the calibrated scene as plain Sionna RT loads it, and its materials as tables for other tools."""
+"""Export of the calibrated scene for plain Sionna RT, and of its materials as tables for other tools."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ FILES: Final = (
     "scene.xml", "load_scene.py", "calibration.json", "links.csv", "materials.csv", "materials.json", "materials.m",
 )  # fmt: skip
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
-"""Switches that Sionna RT's path solver calls otherwise."""
+"""Settings that have another name in Sionna RT's path solver."""
 
 MATLAB: Final = """function T = materials
-%MATERIALS Calibrated materials: a table, or a structure where there are no tables.
-%   Constants hold at {frequency:.9g} Hz; lower and upper are the ends of 95 % intervals, NaN where none is known.
+%MATERIALS Calibrated materials as a table, or as a structure in Octave.
+%   Constants apply at {frequency:.9g} Hz. lower and upper are the ends of 95 % intervals, NaN if unknown.
 %   For MATLAB's ray tracing: propagationModel("raytracing", "BuildingsMaterial", "custom", ...
 %     "BuildingsMaterialPermittivity", T.relative_permittivity(1), "BuildingsMaterialConductivity", T.conductivity(1))
 {columns}
@@ -47,17 +47,16 @@ def export(
 
     Args:
         result: The calibration.
-        folder: Folder to write into; made if absent.
-        copy_meshes: Whether meshes are copied into the folder; else the scene refers to them where they lie.
-
+        folder: Folder to write into; created if needed.
+        copy_meshes: Copy the meshes into the folder; otherwise the scene refers to the original files.
         overwrite: Replace files that Calibray did not write.
 
     Returns:
         Names of the files in the folder.
 
     Raises:
-        InputError: The folder cannot be written, a file there must not be replaced, or scene or links cannot be read
-            any more.
+        InputError: The folder cannot be written, a file in it must not be replaced, or the scene or the links cannot
+            be read any more.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)
@@ -66,8 +65,10 @@ def export(
     )
     links = survey(result)
     if links is None:
-        raise InputError(f"{study.path}: its links {study.links.file} cannot be read any more; put them back")
-    places = {
+        raise InputError(
+            f"{study.path}: its links {study.links.file} cannot be read any more; restore the file"
+        )
+    positions = {
         f"{end}_{axis}": position[:, k]
         for end, position in (("tx", links.tx), ("rx", links.rx))
         for k, axis in enumerate("xyz")
@@ -79,9 +80,9 @@ def export(
     content = {
         "load_scene.py": script.read_text(encoding="utf-8"),
         "calibration.json": _json(_calibration(result)),
-        "links.csv": result.links.assign(**places, **group).to_csv(index=False, float_format="%.9g"),
+        "links.csv": result.links.assign(**positions, **group).to_csv(index=False, float_format="%.9g"),
         "materials.csv": materials.to_csv(index=False, float_format="%.9g"),
-        "materials.json": _json({row["material"]: _known(row) for row in rows}),
+        "materials.json": _json({row["material"]: _without_unknown(row) for row in rows}),
         "materials.m": matlab(materials, study.scene.frequency),
     }
     try:
@@ -91,20 +92,20 @@ def export(
             write_text(target / name, text)
     except OSError as error:
         raise InputError(
-            f"output folder {target}: cannot be written ({error.strerror}); name another"
+            f"output folder {target}: cannot be written ({error.strerror}); choose another"
         ) from None
     return FILES
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
-    """A MATLAB function that returns materials as a table; Octave, which has none, gets a structure.
+    """Write a MATLAB function that returns materials as a table, or as a structure in Octave, which has no tables.
 
     Args:
-        materials: A row for each material.
+        materials: One row per material.
         frequency: The carrier [Hz].
 
     Returns:
-        The function's file.
+        Text of the function's file.
     """
     columns = []
     for name in materials.columns:
@@ -118,7 +119,7 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """A row for each material: its constants, with the ends of their intervals where they were calibrated."""
+    """One row per material: its constants, and interval and verdict of every calibrated one."""
     for name, material in result.materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": exported_id(name).removeprefix("mat-")}
         row |= {field: getattr(material, field) for field in FIELDS}
@@ -130,7 +131,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
             row.setdefault(f"{constant}_upper", math.nan)
             row.setdefault(f"{constant}_verdict", "")
             if owner == name:
-                row[f"{constant}_verdict"] = "not known" if interval is None else interval.label
+                row[f"{constant}_verdict"] = "unknown" if interval is None else interval.label
             if interval is not None:
                 row |= {f"{constant}_lower": interval.lower, f"{constant}_upper": interval.upper}
         if result.fit.laws:
@@ -140,7 +141,7 @@ def _rows(result: Record) -> Iterator[dict[str, Any]]:
 
 
 def _calibration(result: Record) -> dict[str, Any]:
-    """All that the script needs beside the scene and the links."""
+    """What the script needs in addition to the scene and the links."""
     study = result.study
     tx, rx = study.antenna_pair
     patterns = {
@@ -161,20 +162,20 @@ def _calibration(result: Record) -> dict[str, Any]:
         "bandwidth_hz": study.scene.bandwidth,
         "combining": study.objective.combining,
         "antennas": {"tx": asdict(tx), "rx": asdict(rx)},
-        "solver": {SOLVER.get(name, name): value for name, value in _numbered(study.trace).items()},
+        "solver": {SOLVER.get(name, name): value for name, value in _with_samples(study.trace).items()},
         "scattering_patterns": patterns,
         "offsets_db": result.nuisance.offsets_db,
     }
 
 
-def _numbered(settings: TraceSettings) -> dict[str, object]:
-    """The switches with a number of rays: Sionna RT's own solver adds none in rounds."""
+def _with_samples(settings: TraceSettings) -> dict[str, object]:
+    """The settings with a fixed number of rays, since Sionna RT's solver does not add rays in rounds."""
     record: dict[str, object] = dict(settings.record())
     return {**record, "samples": TraceSettings.samples} if settings.adaptive else record
 
 
-def _known(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without its name and without what is not known, which JSON has no number for."""
+def _without_unknown(row: dict[str, Any]) -> dict[str, Any]:
+    """A row without its name and without unknown values, since JSON has no NaN."""
     return {
         name: value
         for name, value in row.items()
@@ -187,7 +188,10 @@ def _json(content: dict[str, Any]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A text as a literal of MATLAB and Octave; characters that end a line are written out."""
-    shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
-    doubled = shown.replace("'", "''")
+    """A text as a literal of MATLAB and Octave, with unprintable characters escaped."""
+    escaped = "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode()
+        for character in text
+    )
+    doubled = escaped.replace("'", "''")
     return f"'{doubled}'"

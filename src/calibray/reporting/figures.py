@@ -1,4 +1,4 @@
-"""Figures of calibrations: the paper's, and what is left of path loss when all is fitted."""
+"""Figures of calibrations: those of the paper, and residuals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.optimizers import label
 from calibray.reporting.link_survey import Survey
-from calibray.reporting.trust_figures import examined
+from calibray.reporting.trust_figures import trust_figures
 from calibray.result.record import Record
 from calibray.support.figure_style import (
     BLUE,
@@ -31,27 +31,27 @@ from calibray.support.figure_style import (
 from calibray.support.messages import shortened
 
 SYMBOLS: Final = 60
-"""Links up to which every one has its own symbol on a line."""
+"""Most links that are drawn as symbols on a line."""
 
-SHADED: Final = 500
-"""Links up to which they stand in the order of the study's file, those held out shaded."""
+FILE_ORDER: Final = 500
+"""Most links that are drawn in the order of the study's file with held-out links shaded; more are sorted."""
 
-MANY: Final = 2000
-"""Points beyond which a figure holds them as an image."""
+RASTERIZED: Final = 2000
+"""Most points that are drawn as vectors; more are rasterized."""
 
 UNEQUAL: Final = 4
-"""How many times as many RT calls one method may spend as another before their axis is logarithmic."""
+"""Ratio between the RT calls of two methods above which their axis is logarithmic."""
 
 LONG: Final = 1000
-"""RT calls beyond which the axis of the best RMSE is logarithmic: most is gained in the first."""
+"""RT calls above which their axis is logarithmic, since the first calls improve the RMSE most."""
 
 GROUPS: Final = 24
-"""Groups that are shown, those with the most links first."""
+"""Most groups that are shown: those with the most links."""
 
 
 @styled()
 def cumulative_cost(results: Mapping[str, Record]) -> Figure:
-    """RT calls and time over iterations (the paper's figure of cumulative cost).
+    """Draw RT calls and time over iterations (the paper's figure of cumulative cost).
 
     Args:
         results: Results by method.
@@ -74,10 +74,14 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
             )
             if method == "sgwo-im":
                 calls = result.history.groupby("iteration")["call"].max().diff()
-                lean = calls[calls < calls.iloc[1]]
-                if len(lean):
+                reduced = calls[calls < calls.iloc[1]]
+                if len(reduced):
                     axes.axvline(
-                        lean.index[0] - 1, color=COLORS[method], ls="--", lw=1, label="surrogate takes over"
+                        reduced.index[0] - 1,
+                        color=COLORS[method],
+                        ls="--",
+                        lw=1,
+                        label="surrogate takes over",
                     )
         axes.legend(frameon=False)
     if _unequal(results):
@@ -87,11 +91,11 @@ def cumulative_cost(results: Mapping[str, Record]) -> Figure:
 
 @styled()
 def convergence(results: Mapping[str, Record], optimum_db: float | None = None) -> Figure:
-    """Best RMSE so far over RT calls.
+    """Draw the best RMSE so far over RT calls.
 
     Args:
         results: Results by method.
-        optimum_db: RMSE of the global optimum, drawn as a line, [dB]; None where it is not known.
+        optimum_db: RMSE of the global optimum, drawn as a line [dB]; None if unknown.
 
     Returns:
         The figure.
@@ -114,7 +118,7 @@ def convergence(results: Mapping[str, Record], optimum_db: float | None = None) 
 
 @styled()
 def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
-    """Path loss by receiver: measured, before calibration and after.
+    """Draw the path loss of every link: measured, before and after calibration.
 
     Args:
         results: Results by method, all of the same links.
@@ -123,28 +127,31 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
         The figure.
     """
     links = next(iter(results.values())).links
-    place, few, many = np.arange(1, len(links) + 1), len(links) <= SYMBOLS, len(links) > SHADED
-    # Of many links a curve can be read only in the order of what was measured.
-    order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else place - 1
-    what = "Receiver" if few else "Link, by measured path loss" if many else "Link"
-    figure, axes = plain_figure(what, "Path loss [dB]", width=10.0)
+    few, many = len(links) <= SYMBOLS, len(links) > FILE_ORDER
+    number = np.arange(1, len(links) + 1)
+    # Curves of many links are readable only if the links are sorted by measured path loss.
+    order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else number - 1
+    x_label = "Receiver" if few else "Link, by measured path loss" if many else "Link"
+    figure, axes = plain_figure(x_label, "Path loss [dB]", width=10.0)
     held_out = links["held_out"].to_numpy(bool)
     if not many and 0 < held_out.sum() < len(links):
-        for number, (start, end) in enumerate(_runs(held_out)):
-            name = None if number else "held out"
+        for run, (start, end) in enumerate(_runs(held_out)):
+            name = None if run else "held out"
             axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0, label=name)
 
     def draw(column: pd.Series, line: str, dots: str, layer: int = 2, **style: Any) -> None:
         values = column.to_numpy(float)[order]
         shown = np.where(np.isfinite(values), values, np.nan)
-        axes.plot(place, shown, line if few else dots, rasterized=len(links) > MANY, zorder=layer, **style)
+        axes.plot(
+            number, shown, line if few else dots, rasterized=len(links) > RASTERIZED, zorder=layer, **style
+        )
 
     draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
     draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
-    for number, (method, result) in enumerate(results.items()):
+    for index, (method, result) in enumerate(results.items()):
         color, size = COLORS.get(method, BLUE), 2 if many else 4
-        # Lines on top of each other are thinner, so that those below are seen.
-        width = 1.3 + 1.4 * (len(results) - 1 - number)
+        # Upper lines are thinner, so that lines below them remain visible.
+        width = 1.3 + 1.4 * (len(results) - 1 - index)
         draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=width)
     axes.set_xlim(0, len(links) + 1)
     axes.legend(frameon=False, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
@@ -153,7 +160,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
 
 @styled()
 def residual_over_distance(survey: Survey) -> Figure:
-    """What is left of each link's path loss, over the distance between its ends.
+    """Draw the residual of each link over the distance between its antennas.
 
     Args:
         survey: The links.
@@ -162,18 +169,18 @@ def residual_over_distance(survey: Survey) -> Figure:
         The figure.
     """
     figure, axes = residual_figure("Distance [m]")
-    left, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
+    residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (
-        (~held_out, BLUE, "o", "calibrated on"),
+        (~held_out, BLUE, "o", "calibration links"),
         (held_out, ORANGE, "^", "held out"),
     ):
-        shown = mask & np.isfinite(left)
+        shown = mask & np.isfinite(residuals)
         if shown.any():
             size = 40 if shown.sum() <= 100 else 16 if shown.sum() <= 1000 else 5
-            axes.scatter(survey.distance[shown], left[shown], s=size, c=color, marker=marker, alpha=0.7, lw=0,
-                         label=f"{name} ({shown.sum():,})", rasterized=len(left) > MANY)  # fmt: skip
-    known = survey.distance[np.isfinite(left)]
-    if len(known) and known.max() > 8 * known.min():
+            axes.scatter(survey.distance[shown], residuals[shown], s=size, c=color, marker=marker, alpha=0.7, lw=0,
+                         label=f"{name} ({shown.sum():,})", rasterized=len(residuals) > RASTERIZED)  # fmt: skip
+    distance = survey.distance[np.isfinite(residuals)]
+    if len(distance) and distance.max() > 8 * distance.min():
         logarithmic(axes, "x")
     axes.legend(frameon=False, loc="best")
     return figure
@@ -181,23 +188,22 @@ def residual_over_distance(survey: Survey) -> Figure:
 
 @styled()
 def residual_by_group(survey: Survey) -> Figure:
-    """What is left of the links' path loss, in each group.
+    """Draw the residuals of each group.
 
     Args:
         survey: The links, which have groups.
 
     Returns:
-        The figure: quartiles as a box, the median as a line, and all but 10 % between the whiskers.
+        The figure: quartiles as a box, the median as a line, and whiskers that contain 90 % of the links.
     """
-    left = survey.residual_db
-    frame = pd.DataFrame({"group": survey.group, "left": left}).dropna()
+    frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db}).dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])
     figure, axes = plain_figure("Calibrated - measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x", color=LINE)
     axes.axvline(0, color=INK, lw=0.8)
-    values = [frame.loc[frame["group"] == name, "left"].to_numpy() for name in names]
+    values = [frame.loc[frame["group"] == name, "residual"].to_numpy() for name in names]
     if values:
         lines = {"color": BLUE, "linewidth": 1.2}
         axes.boxplot(values, orientation="horizontal", whis=(5, 95), showfliers=False, widths=0.5, boxprops=lines,
@@ -208,12 +214,12 @@ def residual_by_group(survey: Survey) -> Figure:
     return figure
 
 
-def every(result: Record, links: Survey | None) -> dict[str, Figure]:
-    """The figures of a calibration.
+def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
+    """Draw all figures of a calibration.
 
     Args:
         result: The calibration.
-        links: Where its links stand; None where that is not known.
+        links: The links with positions; None if these are unknown.
 
     Returns:
         Figures by name.
@@ -228,7 +234,7 @@ def every(result: Record, links: Survey | None) -> dict[str, Figure]:
         figures["residual-over-distance"] = residual_over_distance(links)
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
-    return figures | examined(result)
+    return figures | trust_figures(result)
 
 
 def _unequal(results: Mapping[str, Record]) -> bool:
@@ -237,6 +243,6 @@ def _unequal(results: Mapping[str, Record]) -> bool:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Start and end of every run of links in a mask."""
-    edge = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(int(start), int(end)) for start, end in edge.reshape(-1, 2)]
+    """Start and end of every run of True in a mask."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]

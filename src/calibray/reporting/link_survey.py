@@ -1,4 +1,4 @@
-"""The links of a calibration as the report shows them: where they stand, and what is left of their path loss."""
+"""The links of a calibration as the report shows them: positions, groups and residuals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.result.record import Record
 
-ENDS = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
+POSITION_COLUMNS = tuple(f"{end}_{axis}" for end in ("tx", "rx") for axis in "xyz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Survey:
         table: The result's links.
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
-        group: Labels of the groups [L]; None without groups.
+        group: Names of the groups [L]; None without groups.
     """
 
     table: pd.DataFrame
@@ -32,7 +32,7 @@ class Survey:
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """Straight distances [L], [m]."""
+        """Distances between transmitter and receiver [L], [m]."""
         return np.linalg.norm(self.rx - self.tx, axis=1)
 
     @property
@@ -41,34 +41,33 @@ class Survey:
         return residual(self.table)
 
 
-def residual(table: pd.DataFrame, column: str = "after_db") -> NDArray[np.float64]:
-    """A model minus what was measured.
+def residual(table: pd.DataFrame) -> NDArray[np.float64]:
+    """Calibrated minus measured path loss.
 
     Args:
         table: A result's links.
-        column: The model's column.
 
     Returns:
-        Differences [L], [dB]; NaN where no path leads or nothing is known.
+        Residuals [L], [dB]; NaN for links without a path.
     """
-    difference = table[column].to_numpy(float) - table["measured_db"].to_numpy(float)
+    difference = table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return np.where(np.isfinite(difference), difference, np.nan)
 
 
 def survey(result: Record) -> Survey | None:
-    """Where the links of a calibration stand.
+    """Collect the positions of a calibration's links.
 
     Args:
-        result: The calibration. Results of the version before do not tell; for them the study's links are read.
+        result: The calibration. If its links have no positions, the study's measurements are read.
 
     Returns:
-        The links with positions; None where they are not to be had any more.
+        The links with positions; None if the measurements cannot be read or have changed.
     """
     table = result.links
-    if set(ENDS) <= set(table.columns):
-        ends = table[list(ENDS)].to_numpy(float)
+    if set(POSITION_COLUMNS) <= set(table.columns):
+        positions = table[list(POSITION_COLUMNS)].to_numpy(float)
         group = table["group"].astype(str).to_numpy(object) if "group" in table else None
-        return Survey(table, ends[:, :3], ends[:, 3:], group)
+        return Survey(table, positions[:, :3], positions[:, 3:], group)
     try:
         links = result.study.measurements()
     except InputError:

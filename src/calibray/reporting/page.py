@@ -1,7 +1,7 @@
-"""The report: one HTML file that opens from disk, loads nothing, and shows names from files as text only.
+"""The report of a calibration: one HTML file that opens from disk and loads nothing else.
 
-Texts are escaped by the template engine, data are embedded as JSON whose `<`, `>` and `&` are written as escapes, and a
-content security policy lets no script run but the page's own, which is named by its checksum.
+Names come from files and are not trusted: the template engine escapes text, `<`, `>` and `&` are escaped in embedded
+JSON, and a content security policy allows only the script whose checksum it names.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from calibray import doctor as diagnosis
+from calibray.doctor import versions
 from calibray.errors import EngineError, InputError
-from calibray.reporting import figures as drawings
 from calibray.reporting import result_tables as tables
-from calibray.reporting.diagnostics import remarkable
+from calibray.reporting.diagnostics import diagnostics_table
+from calibray.reporting.figures import result_figures
 from calibray.reporting.link_map import RAMP, WIDTH, Plan, plan, ramp, ramp_limit
 from calibray.reporting.link_survey import Survey, residual, survey
-from calibray.reporting.rays import Rays
-from calibray.reporting.scene_mesh import packed
-from calibray.reporting.value_list import values
-from calibray.reporting.wording import summary
+from calibray.reporting.summary import summary
+from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
 from calibray.result.record import Record
+from calibray.result.verdict import Verdict
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
@@ -45,28 +44,30 @@ from calibray.validation.validation import Validation
 FILE: Final = "report.html"
 FIGURES: Final = "figures"
 WORST: Final = 10
-"""Links that are listed because most is left of their path loss."""
+"""Links with the largest residuals that are listed."""
 
-ALONE: Final = 400
-"""Links up to which the map draws every one with its own outline."""
+OUTLINED: Final = 400
+"""Most links that the map draws with an outline each."""
 
 CAPTIONS: Final = {
-    "convergence": "Best RMSE after so many runs of the ray tracer over all links (RT calls).",
-    "cumulative-cost": "RT calls and time spent, over the method's iterations.",
-    "path-loss": "Path loss of every link: measured, before calibration and after; shaded where held out.",
-    "residual-over-distance": "Calibrated minus measured path loss over the distance between the antennas.",
-    "possible-values": "Draws of every parameter that explain the links, over its bounds: bars where they lie, wide "
-    "lines for the 95 % interval, dashes for the value before, a line for the calibrated one.",
-    "held-out-errors": "Share of the links held out whose error is within so many dB, by model; the best model bold.",
-    "held-out-blocks": "RMSE on each block that was held out, by model.",
-    "power": "What the links' power passes by: share of it on paths that meet a material, by kind of interaction. What "
-    "a path meets counts in full.",
-    "neighbours": "Half the mean square difference of residuals over the distance between links, both ends counted: "
-    "where it rises, neighbours share their errors.",
-    "leverage": "Residuals over leverage: near 1 a link decides something alone, and its residual tells nothing.",
-    "residual-by-depth": "Mean residual by interactions of the strongest path, with two standard errors; links in "
-    "brackets.",
-    "residual-by-group": "The same by group: median, quartiles, and whiskers around 90 % of the links.",
+    "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
+    "cumulative-cost": "RT calls and time over the iterations of the method.",
+    "path-loss": "Path loss of every link: measured, before and after calibration. Held-out links are shaded.",
+    "residual-over-distance": "Residual (calibrated minus measured path loss) over the distance between the antennas.",
+    "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
+    "calibration. Solid: calibrated value.",
+    "held-out-errors": "Share of held-out links with an error up to the value on the axis, by model. The best model is "
+    "drawn bold.",
+    "held-out-blocks": "RMSE on each held-out block, by model.",
+    "power": "Power by material and type of interaction: share of the links' power on paths that interact with the "
+    "material. A path counts for each of its interactions.",
+    "neighbours": "Semivariance of the residuals over the distance between links (both ends counted). Where it rises, "
+    "neighbouring links share part of their errors.",
+    "leverage": "Residual over leverage. A link with a leverage near 1 determines an unknown almost alone, so its "
+    "residual says nothing about its error.",
+    "residual-by-depth": "Mean residual by the number of interactions of the strongest path, with two standard errors. "
+    "Number of links in brackets.",
+    "residual-by-group": "Residual by group: median, quartiles, and whiskers that contain 90 % of the links.",
 }
 
 PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("svg", "png"))
@@ -74,14 +75,14 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 @dataclass(frozen=True)
 class Shown:
-    """What a page is made of, beside the result.
+    """What a page shows in addition to the result.
 
     Attributes:
-        links: Where the links stand; None where that is not known.
-        scene: The scene; None where it cannot be read any more.
+        links: The links with positions; None if these are unknown.
+        scene: The scene; None if it cannot be read any more.
         triangles: Its meshes.
-        rays: Paths of the links; None where there are none.
-        missing: Why something is not shown.
+        rays: Paths of the links; None without paths.
+        missing: What is not shown, and why.
     """
 
     links: Survey | None
@@ -99,12 +100,12 @@ def report(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a calibration as one HTML file that opens from disk, for people to look at.
+    """Write the report of a calibration as one HTML file that opens from disk.
 
     Args:
-        result: The calibration. Paths that it does not hold are taken from the cache, or else traced.
+        result: The calibration; paths that it does not contain come from the cache or are traced.
         file: File to write; replaced only once the new one is complete.
-        figures: Folder to write the figures into as well, each as SVG and as PNG; made if absent.
+        figures: Folder for the figures as SVG and PNG; created if needed. None writes no separate figures.
         overwrite: Replace files that Calibray did not write.
         progress: Called with the stage "tracing" after every launch.
 
@@ -112,60 +113,58 @@ def report(
         The file.
 
     Raises:
-        InputError: The file or the folder cannot be written, or a file there must not be replaced.
+        InputError: The file or the folder cannot be written, or a file in it must not be replaced.
     """
     inputs = result.study.files()
     target = check_file(file, inputs, overwrite)
     folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)
     shown = gather(result, progress)
-    drawn = drawings.every(result, shown.links)
+    drawn = result_figures(result, shown.links)
     try:
         write_text(target, page(result, shown, drawn))
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            for name, figure in drawings.every(result, shown.links).items():
+            for name, figure in result_figures(result, shown.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
     except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror}); name another file") from None
+        raise InputError(f"{target}: cannot be written ({error.strerror}); choose another file") from None
     return target
 
 
 def gather(result: Record, progress: Progress | None = None) -> Shown:
-    """Find what a page shows beside the result; what is not to be had is said, not refused.
+    """Collect what a page shows in addition to the result; what is unavailable is listed, not an error.
 
     Args:
         result: The calibration.
         progress: Called with the stage "tracing" after every launch.
 
     Returns:
-        What was found.
+        Links, scene and paths.
     """
     study, missing = result.study, []
     links = survey(result)
     if links is None:
-        missing.append(f"The links' positions: {study.links.file} cannot be read any more.")
+        missing.append(f"Positions of the links: {study.links.file} cannot be read any more.")
     scene = result.scene
     if scene is None:
         try:
             scene = read_scene(study.scene_source, study.scene.frequency, study.overrides, study.objects)
         except InputError as error:
-            missing.append(f"The scene: {error}.")
+            missing.append(f"Scene: {error}.")
     triangles = None if scene is None else read_triangles(scene)
-    found = None
+    drawn = None
     if study.engine.external:
-        missing.append(f"The paths: the engine {study.engine.name} answers path loss, not paths.")
+        missing.append(f"Paths: the engine {study.engine.name} returns path loss only.")
     else:
-        from calibray.reporting.rays import rays
-
         try:
-            found = rays(result, progress)
+            drawn = rays(result, progress)
         except (InputError, EngineError) as error:
-            missing.append(f"The paths: {error}.")
-        if found is not None and found.paths.num_links != len(result.links):
-            found = None
-            missing.append("The paths: the study's links are no longer those calibrated on.")
-    return Shown(links, scene, triangles, found, tuple(missing))
+            missing.append(f"Paths: {error}.")
+        if drawn is not None and drawn.paths.num_links != len(result.links):
+            drawn = None
+            missing.append("Paths: the links of the study have changed since the calibration.")
+    return Shown(links, scene, triangles, drawn, tuple(missing))
 
 
 def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
@@ -173,7 +172,7 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
 
     Args:
         result: The calibration.
-        shown: What it is made of beside.
+        shown: What the page shows in addition.
         figures: Figures by name.
 
     Returns:
@@ -195,9 +194,9 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
         script=Markup(script),
         checksum=b64encode(sha256(script.encode()).digest()).decode(),
         tiles=_tiles(result),
-        sentences=summary(result, None if shown.rays is None else shown.rays.meets),
-        values=values(result),
-        offsets=tables.offsets(result),
+        sentences=summary(result, None if shown.rays is None else shown.rays.links_by_material),
+        values=tables.values(result),
+        offsets=tables.nuisances(result),
         laws=_laws(result),
         figures={name: Markup(style.inline(figure, name)) for name, figure in figures.items()},
         captions=CAPTIONS,
@@ -207,10 +206,11 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
         rays=shown.rays,
         missing=shown.missing,
         triangles=shown.triangles,
+        most_triangles=TRIANGLES,
         accuracy=tables.accuracy(result),
         validation=None if result.held_out is None else Validation.of(result.held_out).summary(),
         diagnostics=(
-            replace(remarkable(result), title=""),
+            replace(diagnostics_table(result), title=""),
             tables.remarks(result),
             tables.links(result),
             tables.costs(result),
@@ -227,29 +227,28 @@ def _asset(name: str) -> str:
 
 
 def _tiles(result: Record) -> list[tuple[str, str, str]]:
-    """The figures that are asked for first: heading, value, and what to compare it with."""
+    """The key figures at the top of the page: name, value, and a comparison."""
     judged = result.holdout_rmse_db is not None
     after = result.holdout_rmse_db if judged else result.rmse_db
     before = result.accuracy.initial_holdout_rmse_db if judged else result.initial_rmse_db
-    rival = result.accuracy.log_distance_holdout_rmse_db if judged else result.fit.log_distance_rmse_db
-    told = sum(interval.verdict == "identified" for interval in result.intervals.values())
-    where = "held out" if judged else "calibrated on"
+    log_distance = result.accuracy.log_distance_holdout_rmse_db if judged else result.fit.log_distance_rmse_db
+    identified = sum(interval.verdict == Verdict.IDENTIFIED for interval in result.intervals.values())
     tiles = [
         (
-            f"RMSE, links {where}",
+            f"RMSE, {'held-out' if judged else 'calibration'} links",
             f"{after:.2f} dB",
-            f"before {before:.2f} dB, log-distance model {rival:.2f} dB",
+            f"before {before:.2f} dB, log-distance model {log_distance:.2f} dB",
         ),
         ("Links", f"{len(result.links):,}", f"{result.counts['held_out']:,} of them held out"),
         ("RT calls", f"{result.rt_calls:,}", f"at {hertz(result.study.scene.frequency)}"),
     ]
     if result.intervals:
-        tiles.append(("Values identified", f"{told} of {len(result.parameters)}", "by their verdicts"))
+        tiles.append(("Identified parameters", f"{identified} of {len(result.parameters)}", "see Values"))
     return tiles
 
 
 def _laws(result: Record) -> Table:
-    """The coefficients of ITU-R P.2040's law, where they were calibrated."""
+    """The coefficients of the power laws of ITU-R P.2040, where they were calibrated."""
     names = ("itu_a", "itu_b", "itu_c", "itu_d")
     rows = tuple(
         (material, *(f"{law[name]:.4g}" for name in names)) for material, law in result.fit.laws.items()
@@ -259,49 +258,46 @@ def _laws(result: Record) -> Table:
 
 
 def _worst(result: Record, links: Survey | None) -> Table:
-    """The links of whose path loss most is left."""
+    """The links with the largest residuals."""
+    grouped = links is not None and links.group is not None
     columns = (
         numbers("Row"),
-        *([Column("group")] if links is not None and links.group is not None else []),
+        *([Column("group")] if grouped else []),
         numbers("measured", "dB"),
         numbers("calibrated", "dB"),
-        numbers("difference", "dB"),
+        numbers("residual", "dB"),
         Column("held out"),
     )
-    left = residual(result.links)
-    order = np.argsort(-np.nan_to_num(np.abs(left), nan=-1.0), kind="stable")[:WORST]
+    residuals = residual(result.links)
+    order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]
     rows = []
-    for place in order[np.isfinite(left[order])]:
-        row = result.links.iloc[int(place)]
-        group = [str(links.group[place])] if links is not None and links.group is not None else []
-        values = (f"{row['measured_db']:.1f}", f"{row['after_db']:.1f}", f"{left[place]:+.1f}")
-        rows.append((str(row["row"]), *group, *values, "yes" if row["held_out"] else "no"))
+    for link in order[np.isfinite(residuals[order])]:
+        row = result.links.iloc[int(link)]
+        group = [str(links.group[link])] if links is not None and links.group is not None else []
+        cells = (f"{row['measured_db']:.1f}", f"{row['after_db']:.1f}", f"{residuals[link]:+.1f}")
+        rows.append((str(row["row"]), *group, *cells, "yes" if row["held_out"] else "no"))
     return Table("", columns, tuple(rows))
 
 
 def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """What the map shows of links: the end that moves as discs, the other as masts."""
-    left = links.residual_db
-    limit = ramp_limit(left)
+    """What the map shows of links: discs at the ends with more positions, triangles at the others."""
+    residuals = links.residual_db
+    limit = ramp_limit(residuals)
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
-    moving, standing = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
-    radius = 6.5 if len(left) <= ALONE else 4.0 if len(left) <= 10 * ALONE else 2.5
-    at = layout.place(moving).round(1).tolist()
+    moving, fixed = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
+    count = len(residuals)
+    position = layout.place(moving).round(1).tolist()
+    color, held_out = ramp(residuals, limit), links.table["held_out"].to_numpy(bool)
+    # The largest residuals are drawn last, on top.
+    order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
     return {
         "width": WIDTH,
-        "radius": radius,
+        "radius": 6.5 if count <= OUTLINED else 4.0 if count <= 10 * OUTLINED else 2.5,
         "limit": f"{limit:g}",
         "ramp": ", ".join(RAMP),
         "ends": ("receivers", "transmitters") if by_rx else ("transmitters", "receivers"),
-        # The largest last, in sight.
-        "links": [
-            (*at[k], color, bool(held))
-            for k, color, held in sorted(
-                zip(range(len(left)), ramp(left, limit), links.table["held_out"], strict=True),
-                key=lambda each: -1.0 if math.isnan(left[each[0]]) else abs(left[each[0]]),
-            )
-        ],
-        "masts": np.unique(layout.place(standing).round(1), axis=0).tolist(),
+        "links": [(*position[link], color[link], bool(held_out[link])) for link in order],
+        "masts": np.unique(layout.place(fixed).round(1), axis=0).tolist(),
         "bar": layout.bar * layout.scale,
     }
 
@@ -323,30 +319,31 @@ def _commands(result: Record) -> str:
 
 
 def _versions() -> Table:
-    wanted = ("python", "calibray", "sionna-rt", "mitsuba", "drjit", "jax", "numpy", "scipy")
-    known = dict(diagnosis.versions())
-    return Table("", (Column(), Column()), tuple((name, known[name]) for name in wanted if name in known))
+    names = ("python", "calibray", "sionna-rt", "mitsuba", "drjit", "jax", "numpy", "scipy")
+    installed = dict(versions())
+    rows = tuple((name, installed[name]) for name in names if name in installed)
+    return Table("", (Column(), Column()), rows)
 
 
 def _data(result: Record, shown: Shown, layout: Plan | None) -> dict[str, Any] | None:
-    """What the page's script shows; None where the links' positions are not known."""
+    """Data for the page's script; None without positions of the links."""
     links = shown.links
     if links is None or layout is None:
         return None
     names = [] if links.group is None else sorted(set(links.group.tolist()))
-    index = {name: place for place, name in enumerate(names)}
+    index = {name: number for number, name in enumerate(names)}
     materials = [] if shown.scene is None else list(shown.scene.materials)
-    left = links.residual_db
+    residuals = links.residual_db
     return {
         "links": {
             "row": links.table["row"].tolist(),
             "group": [] if links.group is None else [index[name] for name in links.group],
             **{
-                name: _tenths(links.table[f"{name}_db"].to_numpy(float))
+                name: _rounded(links.table[f"{name}_db"].to_numpy(float))
                 for name in ("measured", "before", "after")
             },
             "held": links.table["held_out"].astype(int).tolist(),
-            "color": ramp(left, ramp_limit(left)),
+            "color": ramp(residuals, ramp_limit(residuals)),
         },
         "groups": names,
         "materials": materials,
@@ -355,6 +352,6 @@ def _data(result: Record, shown: Shown, layout: Plan | None) -> dict[str, Any] |
     }
 
 
-def _tenths(column: np.ndarray) -> list[float | None]:
-    """Values to 0.01 dB; None for what is no number, which JSON does not know."""
-    return [round(value, 2) if math.isfinite(value) else None for value in column.tolist()]
+def _rounded(values: np.ndarray) -> list[float | None]:
+    """Values to 0.01 dB; None for infinity and NaN, which JSON does not have."""
+    return [round(value, 2) if math.isfinite(value) else None for value in values.tolist()]

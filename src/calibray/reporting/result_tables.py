@@ -1,22 +1,35 @@
-"""A calibration as tables."""
+"""A calibration as tables, and its calibrated values for the report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import log
+from typing import Final
 
 from calibray.fitting.nuisance import OFFSET
 from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.reporting.diagnostics import diagnostics_table
 from calibray.result import wording
 from calibray.result.record import Record
+from calibray.result.verdict import Verdict
 from calibray.result.wording import interval_text, reason_text
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.validation.validation import Validation
 
+MARKS: Final[dict[str, str]] = {
+    Verdict.IDENTIFIED: "●",
+    Verdict.WEAKLY_IDENTIFIED: "◕",
+    Verdict.AMBIGUOUS: "◑",
+    Verdict.AT_BOUND: "◐",
+    Verdict.NOT_IDENTIFIABLE: "○",
+}
+
 
 def heading(result: Record) -> str:
-    """Which study was calibrated, and with what.
+    """Study, method, engine and seed of a calibration.
 
     Args:
         result: The calibration.
@@ -31,16 +44,16 @@ def heading(result: Record) -> str:
 
 
 def summary(result: Record) -> tuple[Table | str, ...]:
-    """What a calibration found, and how far to trust it, in a few lines.
+    """What Python and notebooks show of a calibration.
 
     Args:
         result: The calibration.
 
     Returns:
-        Its heading with the RT calls spent, and its tables of parameters, offsets and accuracy.
+        The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
     """
-    every = (parameters(result), offsets(result), accuracy(result))
-    return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in every if table.rows))
+    parts = (parameters(result), nuisances(result), accuracy(result))
+    return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
 
 
 def tables(result: Record) -> tuple[Table, ...]:
@@ -50,20 +63,17 @@ def tables(result: Record) -> tuple[Table, ...]:
         result: The calibration.
 
     Returns:
-        Links, parameters and the reasons of their verdicts, nuisances if there are any, accuracy, remarks, diagnostics
-        and cost.
+        Those that have rows.
     """
-    from calibray.reporting.diagnostics import remarkable
-
-    every = (
-        links(result), parameters(result), reasons(result), offsets(result), accuracy(result), remarks(result),
-        remarkable(result), costs(result),
+    parts = (
+        links(result), parameters(result), reasons(result), nuisances(result), accuracy(result), remarks(result),
+        diagnostics_table(result), costs(result),
     )  # fmt: skip
-    return tuple(table for table in every if table.rows)
+    return tuple(table for table in parts if table.rows)
 
 
 def links(result: Record) -> Table:
-    """How many links were used, and which need a look.
+    """Numbers of links, and the rows that need a look.
 
     Args:
         result: The calibration.
@@ -73,43 +83,45 @@ def links(result: Record) -> Table:
     """
     count = result.counts
     censored = result.study.objective.no_path == "censor"
-    verdict = f"counted as lost at {result.study.objective.ceiling_db:g} dB" if censored else "left out"
+    treatment = (
+        f"counted with a path loss of {result.study.objective.ceiling_db:g} dB" if censored else "left out"
+    )
     rows = [
-        *((what, str(number), "") for what, number in result.provenance.rows.items()),
-        ("calibrated on", str(count["calibrated_on"]), ""),
+        *((cause, str(number), "") for cause, number in result.provenance.rows.items()),
+        ("calibration links", str(count["calibrated_on"]), ""),
         ("held out", str(count["held_out"]), ""),
-        *suspects(count["rows_without_path"], f", {verdict}", result.provenance.enclosed),
+        *suspicious_rows(count["rows_without_path"], f", {treatment}", result.provenance.enclosed),
     ]
     return Table("Links", (Column(), numbers(), Column()), tuple(rows))
 
 
-def suspects(
-    without_path: Sequence[int], verdict: str, enclosed: EnclosedAntennas | None
+def suspicious_rows(
+    without_path: Sequence[int], treatment: str, enclosed: EnclosedAntennas | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Rows of a table of links: those that need a look.
+    """Lines about links that need a look, for a table of links.
 
     Args:
-        without_path: Lines of the links without a path.
-        verdict: What becomes of these.
-        enclosed: Antennas inside closed bodies; None where nothing was looked for.
+        without_path: Rows of the links without a path.
+        treatment: What the calibration does with them; appended to the row numbers.
+        enclosed: Antennas inside closed bodies; None if this was not checked.
 
     Yields:
-        What is counted, how many there are, and which with what to do.
+        What is counted, the number, and the rows with a remedy.
     """
-    lost = rows_text(without_path)
-    yield "without a path", str(len(without_path)), lost + verdict if lost else ""
+    text = rows_text(without_path)
+    yield "without a path", str(len(without_path)), text + treatment if text else ""
     if enclosed is None:
         return
     for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
         if enclosed.indoors:
-            remedy = "as most are: taken for an indoor scene"
+            remedy = "as most are: assumed to be an indoor scene"
         else:
             remedy = f"{rows_text(rows)}: check the positions"
         yield f"{end} inside a building", str(len(rows)), remedy if rows else ""
 
 
 def parameters(result: Record) -> Table:
-    """What every parameter was and became, and how far to trust it.
+    """Values before and after calibration, with intervals and verdicts.
 
     Args:
         result: The calibration.
@@ -119,17 +131,16 @@ def parameters(result: Record) -> Table:
     """
     rows = []
     for name, after in result.parameters.items():
-        unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
-        label = Column(name, "" if unit == "1" else unit).heading
+        heading = Column(name, _unit(name)).heading
         before, interval = result.fit.initial_parameters[name], result.intervals.get(name)
-        ends = (interval_text(interval), interval.label) if interval else ("-", "not known")
-        rows.append((label, f"{before:.4g}", f"{after:.4g}", *ends))
+        certainty = (interval_text(interval), interval.label) if interval else ("-", "unknown")
+        rows.append((heading, f"{before:.4g}", f"{after:.4g}", *certainty))
     columns = (Column(), numbers("before"), numbers("after"), numbers("95 % interval"), Column("verdict"))
     return Table("Parameters", columns, tuple(rows))
 
 
 def reasons(result: Record) -> Table:
-    """Why every verdict is what it is; no rows where none is known.
+    """The reason of every verdict that has one.
 
     Args:
         result: The calibration.
@@ -140,7 +151,7 @@ def reasons(result: Record) -> Table:
     rows = [
         (name, reason_text(interval.reason)) for name, interval in result.intervals.items() if interval.reason
     ]
-    return Table("Why", (Column(), Column()), tuple(rows))
+    return Table("Reasons", (Column(), Column()), tuple(rows))
 
 
 def remarks(result: Record) -> Table:
@@ -157,26 +168,26 @@ def remarks(result: Record) -> Table:
     return Table("Remarks", (Column(),), tuple((sentence,) for sentence in sentences))
 
 
-def offsets(result: Record) -> Table:
-    """The offset of every group and the coefficients of further nuisances; no rows where there are none.
+def nuisances(result: Record) -> Table:
+    """Offsets and the coefficients of further nuisances, by group.
 
     Args:
         result: The calibration.
 
     Returns:
-        The table.
+        The table; without rows if the study declares no nuisance.
     """
     nuisance = result.nuisance
-    further = {name: values for name, values in nuisance.coefficients.items() if name != OFFSET}
+    others = _nuisances_besides_offset(result)
     rows = [(group or "all links", f"{value:+.2f}") for group, value in nuisance.offsets_db.items()]
     rows += [(group or "all links", "no link with a path") for group in nuisance.groups_without_path]
-    for name, values in further.items():
+    for name, values in others.items():
         rows += [(f"{name}, {group}" if group else name, f"{value:+.3g}") for group, value in values.items()]
-    return Table("Nuisances" if further else "Offsets", (Column(), numbers(unit="dB")), tuple(rows))
+    return Table("Nuisances" if others else "Offsets", (Column(), numbers(unit="dB")), tuple(rows))
 
 
 def accuracy(result: Record) -> Table:
-    """RMSE before and after, with rivals beside.
+    """RMSE before and after calibration, and that of the baselines.
 
     Args:
         result: The calibration.
@@ -184,18 +195,22 @@ def accuracy(result: Record) -> Table:
     Returns:
         The table.
     """
-    rows = [
-        ("before", result.initial_rmse_db, result.accuracy.initial_holdout_rmse_db),
-        ("offset only", result.fit.nuisance_only_rmse_db, result.accuracy.nuisance_only_holdout_rmse_db),
-        ("after", result.rmse_db, result.holdout_rmse_db),
-        ("log-distance model", result.fit.log_distance_rmse_db, result.accuracy.log_distance_holdout_rmse_db),
-    ]
-    shown = tuple((name, decibels(fit), decibels(held)) for name, fit, held in rows if fit is not None)
-    return Table("RMSE [dB]", (Column(), numbers("calibrated on"), numbers("held out")), shown)
+    fit, held_out = result.fit, result.accuracy
+    nuisances_only = "nuisances only" if _nuisances_besides_offset(result) else "offset only"
+    rows = (
+        ("before", fit.initial_rmse_db, held_out.initial_holdout_rmse_db),
+        (nuisances_only, fit.nuisance_only_rmse_db, held_out.nuisance_only_holdout_rmse_db),
+        ("after", fit.rmse_db, held_out.holdout_rmse_db),
+        ("log-distance model", fit.log_distance_rmse_db, held_out.log_distance_holdout_rmse_db),
+    )
+    cells = tuple(
+        (name, decibels(fitted), decibels(held)) for name, fitted, held in rows if fitted is not None
+    )
+    return Table("RMSE [dB]", (Column(), numbers("calibration links"), numbers("held out")), cells)
 
 
 def costs(result: Record) -> Table:
-    """RT calls and time.
+    """RT calls, replays and time.
 
     Args:
         result: The calibration.
@@ -203,17 +218,109 @@ def costs(result: Record) -> Table:
     Returns:
         The table.
     """
-    rows = [("RT calls", f"{result.rt_calls:,}")]
-    if result.cost.ledger_hits:
-        rows.append(("answered by the ledger", f"{result.cost.ledger_hits:,}"))
-    if result.cost.cheap_replays:
-        took = f"{result.cost.cheap_replays:,} in {result.cost.cheap_seconds:.1f} s"
-        rows.append(("replays as cheap model", took))
+    cost = result.cost
+    rows = [("RT calls", f"{cost.rt_calls:,}")]
+    if cost.ledger_hits:
+        rows.append(("answered by the ledger", f"{cost.ledger_hits:,}"))
+    if cost.cheap_replays:
+        rows.append(("replays of the cheap model", f"{cost.cheap_replays:,} in {cost.cheap_seconds:.1f} s"))
     if result.fit.retrace_gap_db is not None:
-        rows.append(("change on tracing again", f"{result.fit.retrace_gap_db:.2f} dB"))
-    if result.cost.uncertainty_replays:
-        took = f"{result.cost.uncertainty_replays:,} in {result.cost.uncertainty_seconds:.1f} s"
-        rows.append(("replays for intervals", took))
-    rows.append(("tracing", f"{result.cost.trace_seconds:.1f} s"))
-    rows.append(("calibrating", f"{result.cost.seconds:.1f} s"))
+        rows.append(("largest change when traced again", f"{result.fit.retrace_gap_db:.2f} dB"))
+    if cost.uncertainty_replays:
+        replays = f"{cost.uncertainty_replays:,} in {cost.uncertainty_seconds:.1f} s"
+        rows.append(("replays for intervals", replays))
+    rows.append(("tracing", f"{cost.trace_seconds:.1f} s"))
+    rows.append(("calibrating", f"{cost.seconds:.1f} s"))
     return Table("Cost", (Column(), numbers()), tuple(rows))
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter as the report shows it: text, and positions on a bar over its bounds.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit; empty without one.
+        before: Its value before calibration.
+        after: Its calibrated value.
+        interval: Its 95 % interval; empty if unknown.
+        verdict: What the links say about it.
+        bounds: Its bounds, lower and upper.
+        scale: "linear" or "log".
+        positions: Positions of the values "before" and "after" on the bar, 0 to 1.
+        pieces: Ends of every piece of the interval on the bar, 0 to 1.
+        reason: The reason of the verdict; empty if unknown.
+        approximate: Whether the interval comes from an emulator of the engine.
+    """
+
+    name: str
+    unit: str
+    before: str
+    after: str
+    interval: str
+    verdict: str
+    bounds: tuple[str, str]
+    scale: str
+    positions: dict[str, float]
+    pieces: tuple[tuple[float, float], ...] = ()
+    reason: str = ""
+    approximate: bool = False
+
+    @property
+    def mark(self) -> str:
+        """A symbol of the verdict."""
+        return MARKS.get(self.verdict, "")
+
+
+def values(result: Record) -> list[Value]:
+    """The parameters of a calibration as the report shows them.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        One entry per parameter, in the study's order.
+    """
+    entries = []
+    for name, after in result.parameters.items():
+        section, interval = result.study.parameters[name], result.intervals.get(name)
+        before, position = result.fit.initial_parameters[name], _bar(*section.bounds, section.scale)
+        pieces = () if interval is None else interval.pieces or ((interval.lower, interval.upper),)
+        entries.append(
+            Value(
+                name,
+                _unit(name),
+                f"{before:.4g}",
+                f"{after:.4g}",
+                "" if interval is None else interval_text(interval),
+                "unknown" if interval is None else interval.verdict,
+                (f"{section.bounds[0]:.4g}", f"{section.bounds[1]:.4g}"),
+                section.scale,
+                {"before": position(before), "after": position(after)},
+                tuple((position(low), position(high)) for low, high in pieces),
+                "" if interval is None else reason_text(interval.reason),
+                interval is not None and interval.approximate,
+            )
+        )
+    return entries
+
+
+def _nuisances_besides_offset(result: Record) -> dict[str, dict[str, float]]:
+    return {name: values for name, values in result.nuisance.coefficients.items() if name != OFFSET}
+
+
+def _unit(name: str) -> str:
+    unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
+    return "" if unit == "1" else unit
+
+
+def _bar(lower: float, upper: float, scale: str) -> Callable[[float], float]:
+    """Position of a value between its bounds, 0 to 1."""
+
+    def position(value: float) -> float:
+        value = min(max(value, lower), upper)
+        if scale == "log":
+            return log(value / lower) / log(upper / lower)
+        return (value - lower) / (upper - lower)
+
+    return position

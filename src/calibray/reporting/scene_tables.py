@@ -1,34 +1,29 @@
-"""Scenes as tables: what was made and assumed, and what is wrong with one."""
+"""Scenes and drafted studies as tables: contents, assumptions and findings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from calibray.errors import InputError
 from calibray.scenes.authoring import MadeScene
 from calibray.scenes.checks import Finding, SceneCheck
 from calibray.study.draft import Draft
-from calibray.support.output_files import check_file, replacing
 from calibray.tables import Column, Table, numbers
 
-LISTED: Final = 12  # names that are told before the rest is only counted
+LISTED: Final = 12
+"""Names and findings that are listed before the rest is only counted."""
 
-_GUESSES: Final = {
+_HEIGHT_SOURCES: Final = {
     "levels": "height from the number of storeys",
-    "default": "height not given, default taken",
+    "default": "no height given, default used",
 }
 
 
-def made(scene: MadeScene) -> Table:
-    """What was made and assumed.
+def contents(scene: MadeScene) -> Table:
+    """The contents of a new scene, and the assumptions made.
 
     Args:
-        scene: What `calibray.scenes.authoring` returned.
+        scene: The scene.
 
     Returns:
         A table of two columns without headings.
@@ -39,7 +34,7 @@ def made(scene: MadeScene) -> Table:
         ("extent", f"{east - west:.0f} m x {north - south:.0f} m, {bottom:.1f} m to {top:.1f} m high"),
         ("triangles", ", ".join(f"{name} {count}" for name, count in scene.triangles.items())),
         *((name, str(count)) for name, count in scene.counts.items()),
-        *((_GUESSES[source], _listed(names)) for source, names in scene.guessed.items()),
+        *((_HEIGHT_SOURCES[source], _listed(names)) for source, names in scene.guessed.items()),
     ]
     if scene.frame is not None:
         rows.append(("origin", _origin(scene)))
@@ -54,53 +49,53 @@ def _origin(scene: MadeScene) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    told = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
-    return f"{len(names)} buildings: {told}"
+    first = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
+    return f"{len(names)} buildings: {first}"
 
 
-def diagnosed(found: SceneCheck) -> list[Table]:
-    """What a scene is like and what is wrong with it.
+def findings(check: SceneCheck) -> list[Table]:
+    """The size of a scene and its defects.
 
     Args:
-        found: What `calibray.scenes.checks.check_scene` found.
+        check: The check of the scene.
 
     Returns:
-        Two tables: size and verdict, then the findings, the worst first, like ones together.
+        A table of size and verdict, and a table of the findings in the order of the check, if there are any.
     """
-    west, south, bottom, east, north, top = found.bounds
-    errors = sum(finding.severity == "error" for finding in found.findings)
-    warnings = sum(finding.severity == "warning" for finding in found.findings)
-    verdict = "cannot be used as it is" if errors else "can be used, with care" if warnings else "can be used"
+    west, south, bottom, east, north, top = check.bounds
+    errors = sum(finding.severity == "error" for finding in check.findings)
+    warnings = sum(finding.severity == "warning" for finding in check.findings)
+    verdict = "cannot be used" if errors else "can be used, see the warnings" if warnings else "can be used"
     size = Table(
         "",
         (Column(), Column()),
         (
-            ("scene", found.source),
+            ("scene", check.source),
             ("extent", f"{east - west:.4g} m x {north - south:.4g} m x {top - bottom:.4g} m"),
             ("from", f"({west:.4g}, {south:.4g}, {bottom:.4g}) to ({east:.4g}, {north:.4g}, {top:.4g})"),
-            ("objects", str(len(found.objects))),
-            ("triangles", str(found.faces)),
+            ("objects", str(len(check.objects))),
+            ("triangles", str(check.faces)),
             ("verdict", verdict),
         ),
     )
     rows = [
         (finding.severity, finding.subject or "scene", finding.problem, finding.remedy)
-        for finding in found.findings[:LISTED]
+        for finding in check.findings[:LISTED]
     ]
-    if len(found.findings) > LISTED:
-        rows.append(("", "", f"and {len(found.findings) - LISTED} more", ""))
-    columns = (Column(), Column("where"), Column("what"), Column("what to do"))
+    if len(check.findings) > LISTED:
+        rows.append(("", "", f"... and {len(check.findings) - LISTED} more", ""))
+    columns = (Column(), Column("where"), Column("problem"), Column("remedy"))
     return [size, Table("Findings", columns, tuple(rows))] if rows else [size]
 
 
-def objects(found: SceneCheck) -> Table:
-    """The meshes of a scene, counted.
+def objects(check: SceneCheck) -> Table:
+    """The objects of a scene, with the numbers of their faces and of defects.
 
     Args:
-        found: What `calibray.scenes.checks.check_scene` found.
+        check: The check of the scene.
 
     Returns:
-        One row a mesh.
+        One row per object.
     """
     columns = (
         Column("object"), Column("material"), numbers("faces"), numbers("open edges"), numbers("unwelded edges"),
@@ -111,65 +106,33 @@ def objects(found: SceneCheck) -> Table:
             item.name, item.material, str(item.faces), str(item.open_edges), str(item.unwelded_edges),
             str(item.flipped_faces), str(item.empty_faces), str(item.repeated_faces),
         )
-        for item in found.objects
+        for item in check.objects
     )  # fmt: skip
     return Table("Objects", columns, tuple(rows))
 
 
-def assumed(found: Draft) -> Table:
-    """What was assumed of a drafted study.
+def assumptions(draft: Draft) -> Table:
+    """The assumptions of a drafted study.
 
     Args:
-        found: The draft.
+        draft: The draft.
 
     Returns:
-        One row an assumption, with its reason.
+        One row per assumption, with its reason.
     """
-    rows = tuple((each.what, each.value, each.reason) for each in found.assumptions)
-    return Table("Assumed", (Column(), Column(), Column("because")), rows)
+    rows = tuple((entry.what, entry.value, entry.reason) for entry in draft.assumptions)
+    return Table("Assumptions", (Column(), Column(), Column("reason")), rows)
 
 
-def warned(findings: Sequence[Finding]) -> str:
-    """Suspicions about links, a line each.
+def warning_lines(findings: Sequence[Finding]) -> str:
+    """Findings about links as warnings.
 
     Args:
-        findings: What `calibray.study.link_checks.examine` found.
+        findings: The findings.
 
     Returns:
-        The lines; empty if there are none.
+        A line each; empty without findings.
     """
-    return "\n".join(f"Warning: {each.subject}: {each.problem}; {each.remedy}" for each in findings)
-
-
-PICTURES: Final = (".png", ".svg", ".pdf")
-
-
-def save_positions(
-    file: Path,
-    source: str | Path,
-    tx: ArrayLike,
-    rx: ArrayLike,
-    inputs: Iterable[Path] = (),
-    overwrite: bool = False,
-) -> None:
-    """Draw antennas over a scene seen from above, into a file.
-
-    Args:
-        file: The picture, .png, .svg or .pdf.
-        source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        tx: Transmitters [n, 3], [m].
-        rx: Receivers [m, 3], [m].
-        inputs: Files that are never replaced.
-        overwrite: Replace a file that Calibray did not write.
-
-    Raises:
-        InputError: The file has another ending, or must not be replaced; or the scene cannot be read.
-    """
-    from calibray.reporting.position_plot import draw_positions
-
-    if file.suffix.lower() not in PICTURES:
-        raise InputError(f"{file}: cannot draw a {file.suffix or 'nameless'} file; use {', '.join(PICTURES)}")
-    check_file(file, inputs, overwrite)
-    figure = draw_positions(source, np.unique(tx, axis=0), rx)
-    with replacing(file) as partial:
-        figure.savefig(partial, format=file.suffix[1:].lower(), dpi=150)
+    return "\n".join(
+        f"Warning: {finding.subject}: {finding.problem}; {finding.remedy}" for finding in findings
+    )

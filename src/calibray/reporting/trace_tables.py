@@ -1,4 +1,4 @@
-"""A trace, and the check that it sent out enough rays, as tables."""
+"""A trace, and the check that it has enough rays, as tables."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.paths import Paths
-from calibray.reporting.result_tables import suspects
+from calibray.reporting.result_tables import suspicious_rows
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import LISTED, rows_text
 from calibray.tracing.convergence import Convergence
 from calibray.tracing.positions import EnclosedAntennas
 
 VISIBLE_DB: Final = 0.005
-"""Change [dB] that is not 0 when shown to 0.01 dB."""
+"""Change [dB] that is not 0 when rounded to 0.01 dB."""
 
 
-def found(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
-    """What a trace found.
+def overview(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | None) -> Table:
+    """Numbers of links, paths and interactions, and the links that need a look.
 
     Args:
-        paths: What was traced.
-        row: Line of every link in the source file [L].
-        enclosed: Antennas inside closed bodies; None where nothing was looked for.
+        paths: The traced paths.
+        row: Row of every link in the source file [L].
+        enclosed: Antennas inside closed bodies; None if this was not checked.
 
     Returns:
         The table.
@@ -35,50 +35,48 @@ def found(paths: Paths, row: NDArray[np.int64], enclosed: EnclosedAntennas | Non
         ("links", f"{paths.num_links:,}", ""),
         ("paths", f"{paths.num_paths:,}", ""),
         ("interactions", f"{paths.num_interactions:,}", ""),
-        *suspects(row[~reached].tolist(), "", enclosed),
+        *suspicious_rows(row[~reached].tolist(), "", enclosed),
     ]
     return Table("Trace", (Column(), numbers(), Column()), tuple(rows))
 
 
 def convergence(change: Convergence, row: NDArray[np.int64], tolerance_db: float) -> tuple[Table | str, ...]:
-    """What tracing again with more samples changed.
+    """How path loss changed when the scene was traced again with more samples.
 
     Args:
         change: The changes.
-        row: Line of every link in the source file [L].
-        tolerance_db: Change of a link's path loss that is let stand [dB].
+        row: Row of every link in the source file [L].
+        tolerance_db: Largest change of a link's path loss that is acceptable [dB].
 
     Returns:
-        An overview, the links that changed most if any did, and a verdict.
+        A summary, the links that changed most if any did, and a verdict.
     """
-    most = _most_changed(change, row)
+    most_changed = _most_changed(change, row)
     verdict = _verdict(change, len(row), tolerance_db)
-    return (_overview(change, row), *([most] if most.rows else []), verdict)
+    return (_summary(change, row), *([most_changed] if most_changed.rows else []), verdict)
 
 
-def rounds(settings: Mapping[str, object], tolerance_db: float) -> str:
-    """What the last round of a trace changed whose rays were added in rounds.
+def last_round(settings: Mapping[str, object], tolerance_db: float) -> str:
+    """How path loss changed in the last round of a trace whose rays are added in rounds.
 
     Args:
         settings: How the paths were traced (`Paths.settings`).
-        tolerance_db: Change of a link's path loss that is let stand [dB].
+        tolerance_db: Largest change of a link's path loss that is acceptable [dB].
 
     Returns:
         The verdict.
     """
     rays, change = int(str(settings["rays"])), float(str(settings["last_round_db"]))
     if not rays:
-        return "Converged: only direct paths were looked for, and no ray is needed for them."
-    told = f"{rays:,} rays a position were sent out; the later half of them changed"
+        return "Converged: only direct paths were searched, and these need no rays."
+    text = f"{rays:,} rays per position; the second half of them changed"
+    tolerance = f"(fidelity.tolerance_db = {tolerance_db:g})"
     if change <= tolerance_db:
-        least = f"{max(change, 0.01):.2f}"
-        return (
-            f"Converged: {told} no link by more than {least} dB (fidelity.tolerance_db = {tolerance_db:g})."
-        )
-    return f"Not converged: {told} a link by {change:.2f} dB (fidelity.tolerance_db = {tolerance_db:g})."
+        return f"Converged: {text} no link by more than {max(change, 0.01):.2f} dB {tolerance}."
+    return f"Not converged: {text} a link by {change:.2f} dB {tolerance}."
 
 
-def _overview(change: Convergence, row: NDArray[np.int64]) -> Table:
+def _summary(change: Convergence, row: NDArray[np.int64]) -> Table:
     rows = (
         ("median", f"{change.quantile(0.5):.2f} dB", ""),
         ("95 % of the links", f"{change.quantile(0.95):.2f} dB", ""),

@@ -1,4 +1,4 @@
-"""Figures of how far a calibration can be trusted: values that the links leave possible, validation, diagnostics."""
+"""Figures that show how far to trust a calibration: posterior, validation and diagnostics."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from calibray.support.figure_style import (
 from calibray.support.messages import shortened
 from calibray.validation.validation import Validation
 
-SHOWN: Final = 12
-"""Parameters that are shown, those that the links tell least first."""
+PARAMETERS: Final = 12
+"""Most parameters that are shown, the least certain first."""
 
 BARS: Final = 36
-"""Bars over the range of a parameter."""
+"""Bars of the histogram over a parameter's bounds."""
 
 ROWS: Final = 14
-"""Rows of a figure of bars."""
+"""Most rows of the figure of power."""
 
 
-def examined(result: Record) -> dict[str, Figure]:
-    """The figures that there is something to show in.
+def trust_figures(result: Record) -> dict[str, Figure]:
+    """Draw the figures for which the calibration has data.
 
     Args:
         result: The calibration.
@@ -67,7 +67,7 @@ def examined(result: Record) -> dict[str, Figure]:
 
 @styled()
 def possible_values(result: Record) -> Figure:
-    """Draws of every parameter over its range, with the pieces of its interval.
+    """Draw the posterior of every parameter over its bounds, with its 95 % interval.
 
     Args:
         result: The calibration, with draws of every parameter.
@@ -75,19 +75,19 @@ def possible_values(result: Record) -> Figure:
     Returns:
         The figure.
     """
-    names = sorted(result.parameters, key=lambda name: -_share(result, name))[:SHOWN]
+    names = sorted(result.parameters, key=lambda name: -_spread(result, name))[:PARAMETERS]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(10.0 if columns > 1 else 6.4, 0.5 + 1.9 * rows), dpi=150, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, name in zip(panels, names, strict=False):
-        _possible(axes, result, name)
+        _draw_posterior(axes, result, name)
     for axes in panels[len(names) :]:
         axes.set_axis_off()
     return figure
 
 
-def _possible(axes: Axes, result: Record, name: str) -> None:
+def _draw_posterior(axes: Axes, result: Record, name: str) -> None:
     section, interval = result.study.parameters[name], result.intervals.get(name)
     lower, upper = map(float, section.bounds)
     log = section.scale == "log"
@@ -107,18 +107,17 @@ def _possible(axes: Axes, result: Record, name: str) -> None:
         axes.set_title(interval.verdict, fontsize=9, color=FAINT, loc="right")
 
 
-def _share(result: Record, name: str) -> float:
-    """Share of a parameter's range that its draws spread over."""
+def _spread(result: Record, name: str) -> float:
+    """Standard deviation of a parameter's draws, as a share of its range."""
     section = result.study.parameters[name]
     scale = np.log if section.scale == "log" else np.asarray
-    return float(
-        np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(np.array(section.bounds, dtype=float)))
-    )
+    bounds = np.array(section.bounds, dtype=float)
+    return float(np.std(scale(result.uncertainty.draws[name])) / np.ptp(scale(bounds)))
 
 
 @styled()
 def held_out_errors(validation: Validation) -> Figure:
-    """Share of the links held out whose error is within so many dB, by model.
+    """Draw the distribution of absolute errors on held-out links, by model.
 
     Args:
         validation: The validation.
@@ -126,7 +125,7 @@ def held_out_errors(validation: Validation) -> Figure:
     Returns:
         The figure.
     """
-    figure, axes = plain_figure("Error of a link held out [dB]", "Share of links within it")
+    figure, axes = plain_figure("Absolute error of held-out links [dB]", "Share of links up to this error")
     judged, reach = validation.block >= 0, 0.0
     for name, color in _colors(validation):
         error = np.sort(np.abs(validation.errors[name][judged]))
@@ -141,7 +140,7 @@ def held_out_errors(validation: Validation) -> Figure:
 
 @styled()
 def held_out_blocks(validation: Validation) -> Figure:
-    """RMSE of every model on every block.
+    """Draw the RMSE of every model on every block.
 
     Args:
         validation: The validation.
@@ -150,7 +149,7 @@ def held_out_blocks(validation: Validation) -> Figure:
         The figure.
     """
     count = len(validation.labels)
-    figure, axes = plain_figure("Block", "RMSE held out [dB]")
+    figure, axes = plain_figure("Block", "Held-out RMSE [dB]")
     for name, color in _colors(validation):
         values = [_rmse(validation.errors[name][validation.block == number]) for number in range(count)]
         best = name == validation.best
@@ -164,7 +163,7 @@ def held_out_blocks(validation: Validation) -> Figure:
 
 
 def _colors(validation: Validation) -> list[tuple[str, str]]:
-    """Models with the colour of each; the calibrated ones have those of the page."""
+    """Models with their colours; calibrated models have the main colours of the page."""
     calibrated = iter((BLUE, ORANGE, GREEN))
     others = iter((FAINT, *PALETTE, *PALETTE))
     return [
@@ -179,7 +178,7 @@ def _rmse(error: NDArray[np.float64]) -> float:
 
 @styled()
 def power(table: pd.DataFrame) -> Figure:
-    """Share of the links' power by what its paths meet.
+    """Draw power by material and type of interaction.
 
     Args:
         table: The diagnostics' table "power".
@@ -189,7 +188,7 @@ def power(table: pd.DataFrame) -> Figure:
     """
     shown = table.head(ROWS)
     names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
-    figure, axes = plain_figure("Share of a link's power, on the mean [%]", "", height=1.2 + 0.3 * len(shown))
+    figure, axes = plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x", color=LINE)
     axes.barh(range(len(shown)), 100 * shown["share"], color=BLUE, height=0.6)
@@ -200,7 +199,7 @@ def power(table: pd.DataFrame) -> Figure:
 
 @styled()
 def neighbours(table: pd.DataFrame) -> Figure:
-    """Semivariance of residuals over the distance between links.
+    """Draw the semivariance of residuals over the distance between links.
 
     Args:
         table: The diagnostics' table "neighbours".
@@ -216,7 +215,7 @@ def neighbours(table: pd.DataFrame) -> Figure:
 
 @styled()
 def leverage(table: pd.DataFrame) -> Figure:
-    """Residual of every link over its leverage.
+    """Draw the residual of every link over its leverage.
 
     Args:
         table: The diagnostics' table "leverage".
@@ -234,7 +233,7 @@ def leverage(table: pd.DataFrame) -> Figure:
 
 @styled()
 def by_depth(table: pd.DataFrame) -> Figure:
-    """Mean residual by the number of interactions of the strongest path, with its standard error.
+    """Draw the mean residual by the number of interactions of the strongest path, with two standard errors.
 
     Args:
         table: The diagnostics' table "depth".

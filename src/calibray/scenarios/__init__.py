@@ -1,15 +1,14 @@
-"""The embedded demo: a coastal high-rise district like the paper's, and a measuring campaign simulated in it.
+"""The demo: a coastal high-rise district like that of the paper, and a simulated measurement campaign.
 
-`district` builds streets and buildings, `world` plants the truth, `sounder` measures a link, and `campaign`
-writes all of it down; `python -m calibray.scenarios FOLDER` does so anew. The outcome is packaged in
-`coastal_district/`.
+`district` builds streets and buildings, `world` plants the true constants, `sounder` measures a link, and `campaign`
+writes the files. `python -m calibray.scenarios FOLDER` generates them again; `coastal_district/` contains them.
 """
 
 from pathlib import Path
 
 
 def demo_study_path() -> Path:
-    """The study file of the demo district, packaged beside its scene, its links and its truth.
+    """The study file of the demo district, in the folder of its scene, its links and the truth.
 
     Returns:
         Path of `study.toml`.

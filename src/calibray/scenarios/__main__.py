@@ -1,4 +1,4 @@
-"""Write the demo district anew: `python -m calibray.scenarios FOLDER`."""
+"""Generate the demo district: `python -m calibray.scenarios FOLDER`."""
 
 import sys
 from pathlib import Path

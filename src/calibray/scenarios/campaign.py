@@ -1,4 +1,4 @@
-"""The simulated measurement campaign: the true world traced, sounded, and written down as a survey is."""
+"""The simulated measurement campaign: tracing and sounding the true world, and writing the files of a study."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
-from calibray.scenarios.district import lamp_places, scene_objects
+from calibray.scenarios.district import lamp_positions, scene_objects
 from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
 from calibray.scenes import write_scene
@@ -29,14 +29,14 @@ MODEL_MATERIALS: Final = {
     "soil": {"relative_permittivity": 2.25, "conductivity": 0.05, "thickness": 2.0},
     "asphalt": {"relative_permittivity": 4.83, "conductivity": 0.075, "thickness": 0.5},
 }
-"""The materials of the scene that is calibrated: four for the whole district, none of which scatters."""
+"""The materials of the scene that is calibrated: four for the whole district, without scattering."""
 
 
 def generate(folder: Path, seed: int = SEED) -> None:
     """Write the scene to calibrate, the study file, the measured links and the truth.
 
     Args:
-        folder: Where to write; made if it does not exist.
+        folder: Folder to write into; created if needed.
         seed: Seed of the world and of the measurement.
     """
     truth = world(seed)
@@ -46,11 +46,11 @@ def generate(folder: Path, seed: int = SEED) -> None:
 
 
 def write_model(folder: Path, truth: World) -> None:
-    """Write what needs no tracer: the scene to calibrate, the study file and the truth.
+    """Write the scene to calibrate, the study file and the truth, which need no tracing.
 
     Args:
-        folder: Where to write; made if it does not exist.
-        truth: The world whose buildings the scene shows.
+        folder: Folder to write into; created if needed.
+        truth: The world whose buildings the scene contains.
     """
     study = demo_study_path().read_bytes()
     write_scene(folder / "scene", scene_objects(truth.buildings), MODEL_MATERIALS)
@@ -61,8 +61,8 @@ def write_model(folder: Path, truth: World) -> None:
 def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
     """Measure all links in the true world.
 
-    Specular paths and paths with a diffuse reflection are traced apart: the former are few and must all be
-    found, of the latter a sample will do.
+    Specular paths and paths with a diffuse reflection are traced separately: all of the few specular paths are needed,
+    but only a sample of the diffuse ones.
 
     Args:
         truth: The world.
@@ -82,9 +82,9 @@ def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
     link, power, delay, diffuse = np.concatenate([specular, mixed[:, mixed[3] > 0]], axis=1)
     sounded = []
     for index in range(len(truth.tx)):
-        at = link == index
+        mask = link == index
         rng = np.random.Generator(np.random.PCG64([seed, 2, index]))
-        sounded.append(sounded_path_loss(power[at], delay[at], diffuse[at] > 0, rng))
+        sounded.append(sounded_path_loss(power[mask], delay[mask], diffuse[mask] > 0, rng))
     return np.array(sounded)
 
 
@@ -99,23 +99,23 @@ def links_csv(truth: World, path_loss: NDArray[np.float64]) -> str:
         Text of the CSV file.
     """
     lines = ["id,tx,rx,tx_x_m,tx_y_m,tx_z_m,rx_x_m,rx_y_m,rx_z_m,path_loss_db,path_loss_std_db"]
-    places = list(dict.fromkeys(map(tuple, truth.tx_recorded)))
+    transmitters = list(dict.fromkeys(map(tuple, truth.tx_recorded)))
     for k, (tx, rx, values) in enumerate(
         zip(truth.tx_recorded, truth.rx_recorded, path_loss, strict=True), start=1
     ):
         numbers = ",".join(f"{number:.2f}" for number in (*tx, *rx, *values))
-        lines.append(f"{k},TX{places.index(tuple(tx)) + 1},RX{k},{numbers}")
+        lines.append(f"{k},TX{transmitters.index(tuple(tx)) + 1},RX{k},{numbers}")
     return "\n".join([*lines, ""])
 
 
 def truth_json(truth: World) -> str:
-    """What a calibration cannot know, to be kept beside the links.
+    """The planted truth, which a calibration does not know.
 
     Args:
         truth: The world.
 
     Returns:
-        Text of the JSON file: materials, buildings, links and lamp posts, one to a line.
+        Text of the JSON file: materials, buildings, links and lamp posts, one per line.
     """
     content = {
         "materials": {
@@ -148,7 +148,7 @@ def truth_json(truth: World) -> str:
                 zip(truth.tx, truth.rx, truth.tx_recorded, truth.rx_recorded, strict=True), start=1
             )
         },
-        "lamp_posts_m": {str(k): place.tolist() for k, place in enumerate(lamp_places(), start=1)},
+        "lamp_posts_m": {str(k): position.tolist() for k, position in enumerate(lamp_positions(), start=1)},
     }
     return "{\n" + ",\n".join(f"{json.dumps(key)}: {_table(rows)}" for key, rows in content.items()) + "\n}\n"
 

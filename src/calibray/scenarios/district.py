@@ -1,12 +1,12 @@
-"""The coastal high-rise district: streets, buildings and ground of the paper's measurement area, drawn anew.
+"""The coastal high-rise district: streets, buildings and ground like those of the paper's measurement area.
 
 The real district (Golden Beach, Huangdao, Qingdao; section III of the paper) covers 2.1 km x 1.7 km; its
 buildings are 60 m to 70 m high, of concrete with glass windows, on soil and asphalt. Its map is not
-published. This one has the same extent, heights and materials; all else comes from a seeded generator. The
-sea lies in the south.
+published. This district has the same extent, heights and materials; a seeded generator draws the rest. The
+sea is in the south.
 
-All coordinates are multiples of 1/64 m. They are exact in 32-bit floats, so that all panels of a wall lie
-in exactly one plane, as the tracer's image method wants them.
+All coordinates are multiples of 1/64 m. These are exact in 32-bit floats, so all panels of a wall lie in exactly one
+plane, as the image method of the ray tracer requires.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ AVENUES: Final = (-905.0, -650.0, -385.0, -120.0, 150.0, 420.0, 665.0, 915.0)
 STREETS: Final = (-690.0, -455.0, -215.0, 30.0, 265.0, 500.0, 735.0)
 """Centre lines of the streets that run east, y [m]; the first is the coast road."""
 STREET_HALF_WIDTH: Final = 17.0  # [m], from the centre line to the building line
-ROADWAY_HALF_WIDTH: Final = 7.0  # [m], from the centre line to the kerb; the verge beyond is soil
+ROADWAY_HALF_WIDTH: Final = (
+    7.0  # [m], from the centre line to the kerb; the ground between kerb and building is soil
+)
 PARKS: Final = frozenset({(2, 4), (5, 2), (7, 5)})
 """Blocks without buildings, column and row."""
 HEIGHTS: Final = (60.0, 70.0)  # [m]
 BAND: Final = 1.5  # [m], height of the concrete above the topmost windows
-MODULE: Final = 22.0  # [m], length of a window bay and a pier together, about
+MODULE: Final = 22.0  # [m], approximate length of a window bay and a pier together
 LAMP_SPACING: Final = 45.0  # [m]
 LAMP_HEIGHT: Final = 10.0  # [m]
 LAMP_HALF_WIDTH: Final = 0.125  # [m]
@@ -41,7 +43,7 @@ LAMP_HALF_WIDTH: Final = 0.125  # [m]
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the streets of a district run, and how high it is built; the paper's area unless told otherwise.
+    """Streets and building heights of a district; the defaults are those of the paper's area.
 
     Attributes:
         avenues: Centre lines of the streets that run north, x, ascending [m].
@@ -49,7 +51,7 @@ class Layout:
         extent: East-west and north-south [m].
         parks: Blocks without buildings, column and row.
         heights: Lowest and highest building [m].
-        beach: Whether the southernmost row of blocks is left free.
+        beach: Whether the southernmost row of blocks has no buildings.
     """
 
     avenues: tuple[float, ...] = AVENUES
@@ -66,7 +68,7 @@ GOLDEN_BEACH: Final = Layout()
 
 @dataclass(frozen=True)
 class Building:
-    """One building, a prism with window bays from the ground up to a concrete band.
+    """A building: a prism with window bays from the ground to a concrete band below the roof.
 
     Attributes:
         name: "b000", "b001", ...
@@ -85,7 +87,7 @@ def district(seed: int = SEED, layout: Layout = GOLDEN_BEACH) -> tuple[Building,
     """Draw the buildings of the district.
 
     Args:
-        seed: Seed of the generator; other seeds give other buildings along the same streets.
+        seed: Seed of the generator; it changes the buildings but not the streets.
         layout: The streets.
 
     Returns:
@@ -118,7 +120,7 @@ def scene_objects(
     glass: Callable[[Building], str] = lambda building: "glass",
     layout: Layout = GOLDEN_BEACH,
 ) -> list[MeshObject]:
-    """The district as objects of a scene, one for each material.
+    """The district as objects of a scene, one per material.
 
     Args:
         buildings: The buildings.
@@ -148,8 +150,8 @@ def scene_objects(
 def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
     """The surface of a building, split by material.
 
-    A wall is cut into piers (concrete) and bays (glass) by turns, with a pier at either end: corners, band
-    and roof are connected concrete, so that a tracer finds the wedges to diffract at.
+    A wall consists of alternating piers (concrete) and bays (glass), with a pier at both ends. Corners, band and roof
+    are connected concrete, so that the ray tracer finds the wedges for diffraction.
 
     Args:
         building: The building.
@@ -161,10 +163,10 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
     outline, is_window = _outline(building)
     rings = _rings(outline, (0.0, building.height - BAND, building.height))
     count = len(outline)
-    here, there = np.arange(count), np.roll(np.arange(count), -1)
+    start, end = np.arange(count), np.roll(np.arange(count), -1)
     apex = [*_snapped(outline.mean(axis=0)), building.height]
-    walls = _quads(here, there, count)
-    roof = np.column_stack([here + 2 * count, there + 2 * count, np.full(count, 3 * count)])
+    walls = _quads(start, end, count)
+    roof = np.column_stack([start + 2 * count, end + 2 * count, np.full(count, 3 * count)])
     concrete = [walls[~is_window].reshape(-1, 3), walls.reshape(-1, 3) + count, roof]
     return (
         join_meshes([Mesh(np.vstack([rings, apex]), np.concatenate(concrete))]),
@@ -172,21 +174,21 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
     )
 
 
-def lamp_places() -> NDArray[np.float64]:
-    """Where lamp posts stand: along the kerbs of all streets, on alternating sides, none on a crossing.
+def lamp_positions() -> NDArray[np.float64]:
+    """Positions of the lamp posts: along the kerbs of all streets, on alternating sides, none on a crossing.
 
     Returns:
         Positions in the plan [n, 2], [m].
     """
     kerb = ROADWAY_HALF_WIDTH + 0.5
-    places = []
+    positions = []
     for lines, across, length in ((AVENUES, STREETS, EXTENT[1]), (STREETS, AVENUES, EXTENT[0])):
         along = np.arange(-length / 2 + LAMP_SPACING / 2, length / 2, LAMP_SPACING)
         along = along[np.abs(along[:, None] - np.array(across)).min(axis=1) > STREET_HALF_WIDTH]
         for line in lines:
             side = line + kerb * (-1.0) ** np.arange(len(along))
-            places.append(np.column_stack([side, along] if lines is AVENUES else [along, side]))
-    return np.concatenate(places)
+            positions.append(np.column_stack([side, along] if lines is AVENUES else [along, side]))
+    return np.concatenate(positions)
 
 
 def lamp_posts() -> Mesh:
@@ -195,22 +197,24 @@ def lamp_posts() -> Mesh:
     Returns:
         Their surfaces above the ground.
     """
-    here = np.arange(4)
-    sides = _quads(here, np.roll(here, -1), 4).reshape(-1, 3)
+    corner = np.arange(4)
+    sides = _quads(corner, np.roll(corner, -1), 4).reshape(-1, 3)
     faces = np.concatenate([sides, [[4, 5, 6], [4, 6, 7]]])
     corners = LAMP_HALF_WIDTH * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    return join_meshes(Mesh(_rings(place + corners, (0.0, LAMP_HEIGHT)), faces) for place in lamp_places())
+    return join_meshes(
+        Mesh(_rings(position + corners, (0.0, LAMP_HEIGHT)), faces) for position in lamp_positions()
+    )
 
 
 def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points of the plan lie within a building.
+    """Test whether points in plan are inside a building.
 
     Args:
         building: The building.
         points: Positions in the plan [n, 2], [m].
 
     Returns:
-        True where a point lies inside the footprint or on its outline [n].
+        True for points inside the footprint or on its outline [n].
     """
     edge = np.roll(building.footprint, -1, axis=0) - building.footprint
     to_point = np.asarray(points)[:, None, :] - building.footprint
@@ -224,15 +228,14 @@ def _between(lines: Sequence[float], length: float) -> list[tuple[float, float]]
 
 
 def _edges(lines: Sequence[float], half_width: float, length: float) -> list[float]:
-    """Both edges of every street, and the borders of the district before and behind them [m]."""
+    """The border of the district, both edges of every street, and the opposite border [m]."""
     return [-length / 2, *(line + side for line in lines for side in (-half_width, half_width)), length / 2]
 
 
 def _block(bounds: tuple[float, float, float, float], rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """Footprints of the buildings of a block (west, south, east, north), with the block's corners cut off.
 
-    The cut corners, as Chinese and Spanish cities have them, are what mirrors waves into the streets that
-    cross.
+    The cut corners, common in Chinese and Spanish cities, reflect waves into crossing streets.
     """
     west, south, east, north = bounds
     footprints = []
@@ -242,7 +245,7 @@ def _block(bounds: tuple[float, float, float, float], rng: np.random.Generator) 
             cut = _snapped(rng.uniform(8.0, 14.0))
             x = x_low + setback[0] * from_street, x_high - setback[2] * to_street
             y = y_low + setback[1] * up_from_street, y_high - setback[3] * up_to_street
-            corners = (  # counter-clockwise: is it the block's corner, and the steps to the ends of its cut
+            corners = (  # counter-clockwise: position, whether the block ends here, steps to both ends of the cut
                 ((x[0], y[0]), from_street and up_from_street, ((0.0, 1.0), (1.0, 0.0))),
                 ((x[1], y[0]), to_street and up_from_street, ((-1.0, 0.0), (0.0, 1.0))),
                 ((x[1], y[1]), to_street and up_to_street, ((0.0, -1.0), (-1.0, 0.0))),
@@ -285,10 +288,10 @@ def _rings(outline: NDArray[np.float64], levels: Sequence[float]) -> NDArray[np.
     return np.concatenate([np.column_stack([outline, np.full(len(outline), level)]) for level in levels])
 
 
-def _quads(here: NDArray[np.int64], there: NDArray[np.int64], rise: int) -> NDArray[np.int64]:
-    """Two triangles for every panel between one ring of vertices and the next above it [n, 2, 3]."""
-    first = np.column_stack([here, there, there + rise])
-    second = np.column_stack([here, there + rise, here + rise])
+def _quads(start: NDArray[np.int64], end: NDArray[np.int64], rise: int) -> NDArray[np.int64]:
+    """Two triangles per panel between a ring of vertices and the next one above it [n, 2, 3]."""
+    first = np.column_stack([start, end, end + rise])
+    second = np.column_stack([start, end + rise, start + rise])
     return np.stack([first, second], axis=1)
 
 

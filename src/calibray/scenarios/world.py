@@ -1,8 +1,8 @@
-"""The planted truth behind the simulated campaign: what stands in the district, and where the antennas stood.
+"""The planted truth of the simulated campaign: materials of the district and true positions of the antennas.
 
-The world is richer than the model that is calibrated. Every building has its own concrete and glass,
-surfaces scatter diffusely, lamp posts line the streets, and the recorded positions are off by about a
-metre. A calibration therefore finds means over the buildings at best, and leaves residuals.
+The world is richer than the model that is calibrated. Every building has its own concrete and glass, surfaces scatter
+diffusely, lamp posts stand along the streets, and the recorded positions have errors of about a metre. A calibration
+can therefore find at best the means over the buildings, and residuals remain.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ FREQUENCY: Final = 4e9  # [Hz]
 ANTENNA_HEIGHT: Final = 4.0  # [m]
 POSITION_ERROR: Final = 0.8  # [m], standard deviation of recorded positions, in x and in y
 LEVELS: Final = np.linspace(-2.0, 2.0, 8)
-"""The permittivities that buildings have, in standard deviations from the mean: two materials for each of 196
-buildings would slow the tracer down."""
+"""Permittivities of buildings, in standard deviations from the mean. They are quantized, because two materials for each
+of 196 buildings would slow the ray tracer down."""
 
 TRANSMITTERS: Final = ((-381.5, 140.0), (153.5, -330.0))
-"""Where the transmitter was planned to stand, x and y [m]."""
+"""Planned positions of the transmitter, x and y [m]."""
 
 RECEIVERS: Final = (
     ((-380, 185), (-414, 262), (-466, 262), (-313, 261), (-380, 489), (-452, 495), (-483, 497), (-568, 498),
@@ -35,13 +35,13 @@ RECEIVERS: Final = (
     ((155, -274), (110, -220), (59, -220), (25, -218), (348, 26), (417, 28), (484, 26), (535, 27), (424, -54),
      (423, 65), (299, -457), (10, -458), (-8, -457)),
 )  # fmt: skip
-"""Where the receiver was planned to stop for either place of the transmitter, x and y [m]: 27 and 13 stops,
-as in the paper, with stretches of high loss at 10 to 16 and 25 to 27."""
+"""Planned positions of the receiver for each transmitter, x and y [m]: 27 and 13 as in the paper, with high loss at
+positions 10 to 16 and 25 to 27."""
 
 
 @dataclass(frozen=True)
 class Planted:
-    """Constants of a material of the true world.
+    """Constants of a material in the true world.
 
     Attributes:
         relative_permittivity: Mean over the buildings [1].
@@ -58,10 +58,10 @@ class Planted:
     scattering_coefficient: float
 
     def constants(self, relative_permittivity: float) -> dict[str, float]:
-        """The constants as a scene file takes them.
+        """The constants for a scene file.
 
         Args:
-            relative_permittivity: The permittivity in place of the mean [1].
+            relative_permittivity: The permittivity of one building, instead of the mean [1].
 
         Returns:
             Constants by name.
@@ -79,9 +79,9 @@ PLANTED: Final = {
     "glass": Planted(4.65, 0.7, 0.022, 0.022, 0.15),
     "soil": Planted(4.2, 0.0, 0.05, 2.0, 0.2),
     "asphalt": Planted(4.83, 0.0, 0.075, 0.5, 0.1),
-    "steel": Planted(1.0, 0.0, 1e7, 0.01, 1.0),  # thin posts scatter all around, nothing like a mirror
+    "steel": Planted(1.0, 0.0, 1e7, 0.01, 1.0),  # thin posts scatter in all directions
 }
-"""The materials of the true world; the means of concrete, glass and soil are about what the paper found."""
+"""The materials of the true world; the means of concrete, glass and soil are close to those of the paper."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class World:
         permittivity: Relative permittivity of each building's concrete and glass [buildings, 2], [1].
         tx_recorded: Transmitter of every link as recorded [L, 3], [m].
         rx_recorded: Receiver of every link as recorded [L, 3], [m].
-        tx: Where the transmitter of every link stood [L, 3], [m].
-        rx: Where its receiver stood [L, 3], [m].
+        tx: True position of the transmitter of every link [L, 3], [m].
+        rx: True position of the receiver of every link [L, 3], [m].
     """
 
     buildings: tuple[Building, ...]
@@ -118,22 +118,21 @@ class World:
 
     def materials(self) -> dict[str, dict[str, float]]:
         """Constants of the materials of `scene_objects`, by name."""
-        found = {
+        constants = {
             name: PLANTED[name].constants(PLANTED[name].relative_permittivity)
             for name in ("soil", "asphalt", "steel")
         }
         for column, name in enumerate(("concrete", "glass")):
             for level, value in zip(self.level[:, column], self.permittivity[:, column], strict=True):
-                found[f"{name}_{level}"] = PLANTED[name].constants(float(value))
-        return found
+                constants[f"{name}_{level}"] = PLANTED[name].constants(float(value))
+        return constants
 
 
 def world(seed: int = SEED) -> World:
     """Plant a world.
 
     Args:
-        seed: Seed of the permittivities and of the position errors; streets and buildings do not depend on
-            it.
+        seed: Seed of the permittivities and the position errors, but not of streets and buildings.
 
     Returns:
         The world.
@@ -146,11 +145,15 @@ def world(seed: int = SEED) -> World:
         drawn = rng.standard_normal(len(buildings))
         level[:, column] = np.abs(drawn[:, None] - LEVELS).argmin(axis=1)
         permittivity[:, column] = planted.relative_permittivity + planted.spread * LEVELS[level[:, column]]
-    stops = [len(places) for places in RECEIVERS]
-    tx = np.repeat([[*place, ANTENNA_HEIGHT] for place in TRANSMITTERS], stops, axis=0)
-    rx = np.array([[*place, ANTENNA_HEIGHT] for places in RECEIVERS for place in places], dtype=float)
-    rx[:, :2] = np.round(rx[:, :2] + rng.uniform(-0.5, 0.5, (len(rx), 2)), 2)  # nobody stops on a full metre
-    tx_error = np.repeat(rng.standard_normal((len(stops), 2)), stops, axis=0)
+    links = [len(receivers) for receivers in RECEIVERS]
+    tx = np.repeat([[*position, ANTENNA_HEIGHT] for position in TRANSMITTERS], links, axis=0)
+    rx = np.array(
+        [[*position, ANTENNA_HEIGHT] for receivers in RECEIVERS for position in receivers], dtype=float
+    )
+    rx[:, :2] = np.round(
+        rx[:, :2] + rng.uniform(-0.5, 0.5, (len(rx), 2)), 2
+    )  # real positions are not on whole metres
+    tx_error = np.repeat(rng.standard_normal((len(links), 2)), links, axis=0)
     rx_error = rng.standard_normal((len(rx), 2))
     return World(
         buildings=buildings,
@@ -158,11 +161,11 @@ def world(seed: int = SEED) -> World:
         permittivity=np.round(permittivity, 3),
         tx_recorded=tx,
         rx_recorded=rx,
-        tx=_moved(tx, tx_error),
-        rx=_moved(rx, rx_error),
+        tx=_true_positions(tx, tx_error),
+        rx=_true_positions(rx, rx_error),
     )
 
 
-def _moved(recorded: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """True positions [L, 3], [m], of recorded ones and standard normal errors in the plan [L, 2]."""
+def _true_positions(recorded: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """True positions [L, 3], [m], from recorded ones and standard normal errors in plan [L, 2]."""
     return recorded - np.pad(np.round(POSITION_ERROR * error, 3), [(0, 0), (0, 1)])

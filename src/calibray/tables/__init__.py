@@ -1,4 +1,4 @@
-"""Tables as data, and how they are written: as text, as HTML, as Markdown, or at a glance."""
+"""Tables as data, and their rendering as text, HTML and Markdown."""
 
 from calibray.tables.table import Column, Table, numbers
 

@@ -1,4 +1,4 @@
-"""What a record shows of itself where Python or a notebook prints it: what matters, on one screen."""
+"""Short forms of records for the Python prompt and notebooks, and of names and frequencies in sentences."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from calibray.tables import text as plain
 from calibray.tables.table import Table
 
 ROWS: Final = 10
-"""Rows of a table before the rest is only counted."""
+"""Most rows of a table; the rest is only counted."""
 
 CHARACTERS: Final = 60
-"""Characters of a cell or a name before it is cut short."""
+"""Most characters of a cell or a name; longer ones are cut."""
 
 SENTENCE: Final = 200
-"""Characters of a sentence before it is cut short."""
+"""Most characters of a sentence; longer ones are cut."""
 
 
 def text(*parts: Table | str) -> str:
-    """What `__repr__` answers.
+    """Plain text for `__repr__`.
 
     Args:
         parts: Tables and sentences, from top to bottom.
 
     Returns:
-        Plain text: long tables and cells cut short, characters that steer a terminal written out.
+        Text with long tables and cells cut, and control characters escaped.
     """
     return plain.render(*_fitted(parts))
 
 
 def html(*parts: Table | str) -> str:
-    """What `_repr_html_` answers.
+    """HTML for `_repr_html_`.
 
     Args:
         parts: Tables and sentences, from top to bottom.
 
     Returns:
-        A fragment of HTML, cut short likewise, every text escaped.
+        A fragment of HTML with long tables and cells cut, and all text escaped.
     """
     return markup.render(*_fitted(parts))
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """Names, one by one while they are few.
+    """List names, the first ones if there are many.
 
     Args:
         names: The names.
-        count: How many are named.
+        count: Most names that are listed.
 
     Returns:
-        Them with commas between.
+        The names with commas between them.
 
     Example:
         >>> named(["east", "west"])
@@ -60,13 +60,13 @@ def named(names: Iterable[str], count: int = 4) -> str:
         >>> named(f"mast {k}" for k in range(500))
         'mast 0, mast 1, mast 2, mast 3 and 496 more'
     """
-    known = [_short(name, CHARACTERS) for name in names]
-    more = f" and {len(known) - count:,} more" if len(known) > count else ""
-    return ", ".join(known[:count]) + more
+    short = [_short(name, CHARACTERS) for name in names]
+    more = f" and {len(short) - count:,} more" if len(short) > count else ""
+    return ", ".join(short[:count]) + more
 
 
 def hertz(frequency: float) -> str:
-    """A frequency in GHz or MHz.
+    """Format a frequency in GHz or MHz.
 
     Args:
         frequency: The frequency [Hz].
@@ -86,17 +86,20 @@ def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
         if isinstance(part, str):
             yield _short(part, SENTENCE)
         else:
-            shown = part.head(ROWS)
+            table = part.head(ROWS)
             yield replace(
-                shown,
+                table,
                 columns=tuple(
-                    replace(column, name=_short(column.name, CHARACTERS)) for column in shown.columns
+                    replace(column, name=_short(column.name, CHARACTERS)) for column in table.columns
                 ),
-                rows=tuple(tuple(_short(cell, CHARACTERS) for cell in row) for row in shown.rows),
+                rows=tuple(tuple(_short(cell, CHARACTERS) for cell in row) for row in table.rows),
             )
 
 
-def _short(words: str, length: int) -> str:
-    """Words on one line of limited length, line breaks and escape characters written out."""
-    cut = words if len(words) <= length else f"{words[: length - 3]}..."
-    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in cut)
+def _short(text: str, length: int) -> str:
+    """Text on one line of limited length, with line breaks and control characters escaped."""
+    cut = text if len(text) <= length else f"{text[: length - 3]}..."
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode()
+        for character in cut
+    )

@@ -1,4 +1,4 @@
-"""Tables as HTML, every text escaped: names come from files."""
+"""Tables as HTML; all text is escaped, since names come from files."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from calibray.tables.table import Table
 
 
 def render(*parts: Table | str) -> str:
-    """Tables and sentences as a fragment of HTML.
+    """Render tables and sentences as a fragment of HTML.
 
     Args:
-        parts: What to show, from top to bottom; an empty string is left out.
+        parts: Tables and sentences, from top to bottom; empty strings are left out.
 
     Returns:
-        Elements `p` and `table`, without scripts or anything to be loaded.
+        Elements `p` and `table`, without scripts and links.
 
     Example:
         >>> render("a < b")

@@ -10,13 +10,13 @@ _RULES = {"left": "---", "right": "---:"}
 
 
 def render(table: Table) -> str:
-    """A table in Markdown; a title that would stand above is left to the page.
+    """Render a table in Markdown, without a title above it.
 
     Args:
         table: The table.
 
     Returns:
-        Its lines, without a line break at the end.
+        Lines of text, without a line break at the end.
     """
     lines = [table.headings, [_RULES[column.align] for column in table.columns], *table.rows]
     return "\n".join(_line(line) for line in lines)

@@ -1,4 +1,4 @@
-"""Tables as data: what is said, apart from how it is laid out."""
+"""Tables as data, independent of their layout."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: What its cells are; empty where rows name themselves.
-        unit: Unit of all its cells; empty if they have none, or each its own.
-        align: Where cells stand: words "left", numbers "right".
+        name: Meaning of its cells; empty for the column that names the rows.
+        unit: Unit of all its cells; empty if they have none or different ones.
+        align: "left" for text, "right" for numbers.
 
     Example:
         >>> Column("time", "s").heading
@@ -26,7 +26,7 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """Its name with its unit in brackets."""
+        """The name with the unit in brackets."""
         return " ".join(part for part in (self.name, self.unit and f"[{self.unit}]") if part)
 
 
@@ -34,7 +34,7 @@ def numbers(name: str = "", unit: str = "") -> Column:
     """A column of numbers, aligned to the right.
 
     Args:
-        name: What they are.
+        name: Meaning of the numbers.
         unit: Their unit.
 
     Returns:
@@ -45,12 +45,12 @@ def numbers(name: str = "", unit: str = "") -> Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose cells are text already.
+    """A table with cells of text.
 
     Attributes:
-        title: What it shows; empty where its columns say that.
+        title: Its title; may be empty.
         columns: Its columns.
-        rows: The cells of every row, one for each column.
+        rows: The cells of every row, one per column.
 
     Raises:
         ValueError: A row has more or fewer cells than there are columns.
@@ -69,27 +69,27 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"table {self.title!r}: a row of {len(row)} cells, must be {len(self.columns)}: {row}"
+                    f"table {self.title!r}: a row has {len(row)} cells, must be {len(self.columns)}: {row}"
                 )
 
     @property
     def titled(self) -> bool:
-        """Whether the title stands above; else it stands over the first column, where that has no heading."""
+        """Whether the title is above the table; otherwise it is the heading of the first column."""
         return bool(self.title) and bool(self.columns[0].heading)
 
     @property
     def headed(self) -> bool:
-        """Whether anything stands over the columns."""
+        """Whether the table has a row of headings."""
         return bool(self.title) or any(column.heading for column in self.columns)
 
     @property
     def headings(self) -> tuple[str, ...]:
-        """What stands over each column."""
+        """The heading of each column."""
         first = self.columns[0].heading or self.title
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first rows, and a last one that tells how many are left out.
+        """The first rows, and a last one with the number of rows that are left out.
 
         Args:
             count: Rows to keep, at least 1.

@@ -14,17 +14,17 @@ from rich.text import Text
 from calibray.tables.table import Table
 
 LISTED: Final = 12
-"""Rows of a file that are named one by one before the rest is only counted."""
+"""Most rows of a file that are listed; the rest is only counted."""
 
 WIDEST: Final = 100_000
-"""Characters in a line: output is for files and pipes as much as for a screen, so no cell is ever cut short."""
+"""Characters per line: large, so that no cell is cut; output also goes to files and pipes."""
 
 
 def render(*parts: Table | str) -> str:
-    """Tables and sentences as plain text, an empty line between them.
+    """Render tables and sentences as plain text, with an empty line between them.
 
     Args:
-        parts: What to show, from top to bottom; an empty string is left out.
+        parts: Tables and sentences, from top to bottom; empty strings are left out.
 
     Returns:
         Lines of text, without a line break at the end.
@@ -42,13 +42,13 @@ def render(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """Rows of a file, named one by one while they are few.
+    """List rows of a file, the first ones if there are many.
 
     Args:
-        rows: Lines of the file.
+        rows: Numbers of the rows.
 
     Returns:
-        Them as words, empty if there is none.
+        The rows as text; empty without rows.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -58,19 +58,19 @@ def rows_text(rows: Sequence[int]) -> str:
     """
     if not rows:
         return ""
-    named = ", ".join(map(str, rows[:LISTED]))
+    first = ", ".join(map(str, rows[:LISTED]))
     more = f" and {len(rows) - LISTED} more" if len(rows) > LISTED else ""
-    return f"row{'s' if len(rows) > 1 else ''} {named}{more}"
+    return f"row{'s' if len(rows) > 1 else ''} {first}{more}"
 
 
 def decibels(value: float | None) -> str:
-    """A value in decibels as tables show it.
+    """Format a value in decibels for tables.
 
     Args:
-        value: The value [dB], or None if there is none.
+        value: The value [dB]; None if unknown.
 
     Returns:
-        Two decimals, or a dash.
+        Two decimals, or a dash if unknown.
     """
     return "-" if value is None else f"{value:.2f}"
 

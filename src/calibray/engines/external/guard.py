@@ -22,7 +22,8 @@ import time
 from contextlib import suppress
 
 # Without `site`, the guard starts in half the time; LIBRARIES is the folder that Calibray has psutil from.
-sys.path.append(sys.argv[1])
+if __name__ == "__main__":
+    sys.path.append(sys.argv[1])
 
 import psutil
 

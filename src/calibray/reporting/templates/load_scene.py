@@ -1,9 +1,9 @@
-"""Load the calibrated scene in plain Sionna RT, and compare its path loss with what was reported, link by link.
+"""Load the calibrated scene in plain Sionna RT, and compare its path loss with the reported one, link by link.
 
 Usage: python load_scene.py [ROW ...]
 
-ROW is a link's line in the table of links that was calibrated on; without any, all links are computed, one receiver at
-a time. Needs Sionna RT and the files beside this one; Calibray is not needed.
+ROW is the row of a link in the measured table; without any, all links are computed, one receiver at a time. Needs
+Sionna RT and the other files of this folder; Calibray is not needed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def load() -> rt.Scene:
     scene = rt.load_scene(str(FOLDER / "scene.xml"))
     scene.frequency = CALIBRATION["frequency_hz"]
     for name, pattern in CALIBRATION["scattering_patterns"].items():
-        # Scene files know the Lambertian pattern alone.
+        # Scene files can only contain the Lambertian pattern.
         scene.radio_materials[name].scattering_pattern = scattering_pattern_registry.get(pattern.pop("name"))(
             **pattern
         )
@@ -34,7 +34,7 @@ def load() -> rt.Scene:
         antenna = CALIBRATION["antennas"][end]
         if antenna["pattern"].lower().endswith(".csv"):
             sys.exit(
-                f"The {end} antenna's gain was a table ({antenna['pattern']}): register it as a pattern first."
+                f"The gain of the {end} antenna is a table ({antenna['pattern']}): register it as a pattern first."
             )
         array = rt.PlanarArray(
             num_rows=1, num_cols=1, pattern=antenna["pattern"], polarization=antenna["polarization"]
@@ -44,7 +44,7 @@ def load() -> rt.Scene:
 
 
 def path_loss(scene: rt.Scene, tx: list[float], rx: list[float]) -> float:
-    """Path loss [dB] between two points [m], without offset; infinite if no path leads there."""
+    """Path loss [dB] between two points [m], without offset; infinite without a path."""
     for name in list(scene.transmitters) + list(scene.receivers):
         scene.remove(name)
     antennas = CALIBRATION["antennas"]
@@ -57,7 +57,7 @@ def path_loss(scene: rt.Scene, tx: list[float], rx: list[float]) -> float:
 
 
 def received(gain: np.ndarray, delay: np.ndarray) -> float:
-    """Power gain of path gains [receive ports, transmit ports, paths] with delays [s], as the study combines them."""
+    """Power gain of path gains [receive ports, transmit ports, paths] with delays [s], combined as in the study."""
     if CALIBRATION["combining"] == "power" or not len(delay):
         return float((np.abs(gain) ** 2).sum() / gain.shape[1])
     offset, weight = np.zeros(1), np.ones(1)
@@ -80,15 +80,15 @@ def main() -> None:
         if wanted and link["row"] not in wanted:
             continue
         if float(link.get("frequency") or CALIBRATION["frequency_hz"]) != CALIBRATION["frequency_hz"]:
-            print(f"{link['row']}: at another carrier than the scene's, left out", file=sys.stderr)
+            print(f"{link['row']}: left out, since its carrier is not that of the scene", file=sys.stderr)
             continue
         tx, rx = ([float(link[f"{end}_{axis}"]) for axis in "xyz"] for end in ("tx", "rx"))
         group = link.get("group") or ""
-        found = path_loss(scene, tx, rx) + CALIBRATION["offsets_db"].get(group, 0.0)
+        computed = path_loss(scene, tx, rx) + CALIBRATION["offsets_db"].get(group, 0.0)
         reported = float(link["after_db"] or "inf")
-        print(f"{link['row']},{reported:.4f},{found:.4f}")
+        print(f"{link['row']},{reported:.4f},{computed:.4f}")
         if np.isfinite(reported):
-            largest = max(largest, abs(found - reported))
+            largest = max(largest, abs(computed - reported))
     print(f"largest difference: {largest:.4f} dB", file=sys.stderr)
 
 

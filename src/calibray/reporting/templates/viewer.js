@@ -1,5 +1,5 @@
-// The page's own script: a list of links, the map, and the scene in 3-D, which all show the link that is selected.
-// Names reach the page as text only (textContent), never as markup.
+// Script of the report: the list of links, the map and the 3-D scene, which all show the selected link.
+// Names come from files, so they are inserted as text only (textContent), never as markup.
 "use strict";
 (() => {
   const byId = (id) => document.getElementById(id);
@@ -17,14 +17,14 @@
     if (parent) parent.append(element);
     return element;
   };
-  // Without the sign of a zero.
+  // Adding 0 removes the sign of a negative zero.
   const fixed = (value) => (Math.round(10 * value) / 10 + 0).toFixed(1);
   const decibel = (value) => (value === null ? "no path" : `${fixed(value)} dB`);
   const signed = (value) => (value === null ? "no path" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
   const links = data.links, count = links.row.length;
   const residual = links.after.map((after, i) => (after === null ? null : after - links.measured[i]));
   const tx = decode(data.solid.tx, Uint16Array), rx = decode(data.solid.rx, Uint16Array);
-  // The end that moves from link to link is the one that stands for it.
+  // The end with more positions represents the link: receivers, or transmitters if there are more of these.
   const places = (ends) => new Set(Array.from({ length: count }, (_, i) => ends.slice(3 * i, 3 * i + 3).join())).size;
   const moving = places(tx) > places(rx) ? tx : rx, standing = moving === tx ? rx : tx;
   const metres = (ends, i) => [0, 1, 2].map((k) => data.solid.low[k] + data.solid.step * ends[3 * i + k]);
@@ -62,7 +62,7 @@
   const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
-  // From weak to strong, each end in sight on its ground.
+  // From weak to strong; both ends contrast with the background of the theme.
   const POWER = { light: ["#5b3f99", "#26748e", "#1f9d6b", "#c48a00"], dark: ["#7a6fd0", "#35a3b8", "#5fd08a", "#fde06a"] };
   const RANGE = 30;
   const power = (share) => {
@@ -97,8 +97,8 @@
     make("h3", title(i), box);
     const terms = make("dl", undefined, box);
     for (const [name, value] of facts) { make("dt", name, terms); make("dd", value, terms); }
-    byId("map-said").textContent = `${title(i)}: measured ${decibel(links.measured[i])}, calibrated ${decibel(links.after[i])}, ` +
-      `difference ${signed(residual[i])}${links.held[i] ? ", held out" : ""}.`;
+    byId("map-text").textContent = `${title(i)}: measured ${decibel(links.measured[i])}, calibrated ${decibel(links.after[i])}, ` +
+      `residual ${signed(residual[i])}${links.held[i] ? ", held out" : ""}.`;
   };
   const tabulate = () => {
     const body = byId("paths");
@@ -192,7 +192,7 @@
       "layout(location=0) in vec3 p; uniform mat4 m; uniform vec3 eye; out vec3 from; void main() { from = p - eye; gl_Position = m * vec4(p, 1.0); }",
       `in vec3 from; uniform vec3 color, fog; uniform float far, cut; out vec4 o;
        void main() {
-         // A building between the eye and what is looked at is left out.
+         // Leave out buildings between the camera and the point that it looks at.
          if (1.0 / gl_FragCoord.w < cut) discard;
          vec3 n = normalize(cross(dFdx(from), dFdy(from)));
          float light = 0.62 + 0.30 * abs(n.z) + 0.14 * abs(dot(n, normalize(vec3(0.8, 0.45, 0.0))));
@@ -229,7 +229,7 @@
     const mesh = data.solid.mesh;
     const land = mesh && { vertex: buffer(gl.ARRAY_BUFFER, decode(mesh.vertex, Uint16Array)), face: buffer(gl.ELEMENT_ARRAY_BUFFER, decode(mesh.face, Uint32Array)) };
 
-    // Positions are steps of the grid throughout; so is what the camera works in.
+    // All positions, the camera's included, are in steps of the grid.
     const span = (ends) => [0, 1, 2].map((k) => {
       let low = Infinity, high = -Infinity;
       for (let i = k; i < 3 * count; i += 3) { low = Math.min(low, ends[i]); high = Math.max(high, ends[i]); }
@@ -237,7 +237,7 @@
     });
     const [one, two] = [span(tx), span(rx)], range = one.map(([a, b], k) => [Math.min(a, two[k][0]), Math.max(b, two[k][1])]);
     const extent = Math.max(range[0][1] - range[0][0], range[1][1] - range[1][0], 30 / data.solid.step);
-    // At first one looks along the links, down a street if they stand in one.
+    // The initial view looks along the principal axis of the links, for instance down a street.
     const along = () => {
       const mean = [0, 1].map((k) => { let sum = 0; for (let i = k; i < 3 * count; i += 3) sum += moving[i]; return sum / count; });
       let xx = 0, xy = 0, yy = 0;
@@ -278,7 +278,7 @@
       const box = canvas.getBoundingClientRect(), m = matrix();
       return nearest(event.clientX - box.left, event.clientY - box.top, (i) => onScreen(m, moving[3 * i], moving[3 * i + 1], moving[3 * i + 2]), 22);
     };
-    // Tints of materials: neighbours on the wheel, close to the page's own grey.
+    // Tints of materials: similar hues, close to the grey of the page.
     const tint = (k) => {
       const base = rgb(style("--building")), turn = 2.4 * k;
       return k < 0 ? rgb(style("--ground")) : base.map((x, c) => x + 0.05 * Math.cos(turn + 2.1 * c));
@@ -290,7 +290,7 @@
     };
     const stream = gl.createBuffer();
     const upload = (values) => { gl.bindBuffer(gl.ARRAY_BUFFER, stream); gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW); };
-    // The links' points never change but with the theme.
+    // The points of the links change with the theme only.
     let points = null;
     const makePoints = () => {
       const far = count > 2000 ? 3 : 8, values = [], seen = new Set();
@@ -320,7 +320,7 @@
     const segments = () => {
       const values = [], add = (a, b, color, alpha) => values.push(...a, ...b, ...color, alpha);
       const strongest = chosen.paths.length ? chosen.paths[0].gain : 0;
-      // The strongest last, over the others.
+      // The strongest path is drawn last, over the others.
       chosen.paths.map((path, k) => [path, k]).reverse().forEach(([path, k]) => {
         const alpha = chosen.path < 0 ? 1 : chosen.path === k ? 1 : 0.12;
         const color = power(1 + (path.gain - strongest) / RANGE);
@@ -387,7 +387,7 @@
       }
       gl.depthMask(false);
       const lines = segments(), number = lines.length / 10;
-      // What is behind a building first, faintly.
+      // First, faintly, also what buildings hide; then the visible parts.
       gl.disable(gl.DEPTH_TEST);
       drawDots(m, points.values, points.count, ratio, 0.22);
       if (number) { upload(lines); drawTubes(m, number, ratio, 0.4); }
@@ -401,11 +401,11 @@
         upload(Float32Array.from(ring));
         drawDots(m, null, 2, ratio, 1);
       }
-      // For whoever waits for the picture.
+      // Tests wait for this counter.
       document.documentElement.dataset.drawn = Number(document.documentElement.dataset.drawn || 0) + 1;
     };
 
-    // Hands and keys
+    // Pointer and keyboard
     const held = new Map();
     let moved = 0, spread = 0;
     const turn = (x, y) => {
@@ -462,7 +462,7 @@
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, release);
     canvas.addEventListener("pointerleave", () => { tip.hidden = true; });
     canvas.addEventListener("wheel", (event) => {
-      // Only once it was clicked, or the page could not be scrolled past it.
+      // Zoom only after a click on the scene; otherwise the page could not be scrolled past it.
       if (document.activeElement !== canvas && !event.ctrlKey) return;
       event.preventDefault();
       zoom(Math.exp(0.0012 * event.deltaY));

@@ -1,4 +1,4 @@
-"""From a finished search to its result: accuracy next to its baselines, intervals, and a row for every link."""
+"""Make the result of a finished run: accuracy next to baselines, intervals, and a row for every link."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from calibray.validation.held_out_statistics import compare
 from calibray.validation.validation import Validation
 
 FEWEST_HELD_OUT: Final = 8
-"""Held-out links from which a standard deviation of residuals is computed; with fewer, the fit's is used."""
+"""Held-out links from which a standard deviation of residuals is computed; with fewer, that of the fit is used."""
 
-FAINT: Final = "expected too near the noise floor, left out"
-"""How links are counted that the model expects near the noise floor."""
+FAINT: Final = "predicted too near the noise floor, left out"
+"""Cause, in the counts of rows, for links that the model predicts near the noise floor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,39 +64,47 @@ class Timing:
     """Time that parts of a calibration took [s].
 
     Attributes:
-        search: The method.
-        trace: Tracing and loading before.
+        search: Search by the method, without tracing.
+        trace: Tracing and loading before the search.
     """
 
     search: float
     trace: float
 
 
-def outcome(
-    problem: Problem,
-    trail: Trail,
-    gap: NDArray[np.float64] | None,
-    certainty: Certainty,
-    validation: Validation | None,
-    enclosed: EnclosedAntennas | None,
-    timing: Timing,
-    cheap: CheapReplay,
-) -> Result:
-    """Assemble the result.
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished search.
+
+    Attributes:
+        problem: The problem, on the last trace.
+        trail: The search.
+        retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
+        cheap: The cheap model, if the method had one.
+        enclosed: Antennas inside closed bodies; None where this was not checked.
+        timing: Time of its parts.
+    """
+
+    problem: Problem
+    trail: Trail
+    retrace_gap_db: NDArray[np.float64] | None
+    cheap: CheapReplay
+    enclosed: EnclosedAntennas | None
+    timing: Timing
+
+
+def make_result(run: Run, certainty: Certainty, validation: Validation | None) -> Result:
+    """Make the result of a finished run.
 
     Args:
-        problem: The problem, on the last trace.
-        trail: Its search.
-        gap: Change of every link's path loss on tracing again [links], [dB]; None where nothing was checked.
-        certainty: How far the values can be trusted.
-        validation: Held-out errors, where blocks were held out in turn.
-        enclosed: Antennas inside closed bodies; None where this was not checked.
-        timing: Time that was spent.
-        cheap: The cheap model that the method had, if any.
+        run: The finished search.
+        certainty: Intervals, verdicts and draws.
+        validation: Held-out errors, if blocks were held out in turn.
 
     Returns:
         The result.
     """
+    problem, trail, gap_db, cheap = run.problem, run.trail, run.retrace_gap_db, run.cheap
     setup, objective, parameters = problem.setup, problem.objective, problem.parameters
     study, links = setup.study, setup.links
     calibrated, counted = trail.best_modelled, objective.weight > 0
@@ -108,7 +116,7 @@ def outcome(
         with_nuisance,
         log_distance(links, objective, study.scene.frequency),
     )
-    paths = _traced(problem)
+    paths = _replayed_paths(problem)
     diagnostics = diagnose_links(problem, trail.best, paths)
     table = pd.DataFrame(
         {
@@ -119,7 +127,7 @@ def outcome(
             "log_distance_db": models.log_distance,
             "has_path": np.isfinite(problem.before) & np.isfinite(calibrated),
             "held_out": setup.held_out,
-            "retrace_gap_db": np.nan if gap is None else gap,
+            "retrace_gap_db": np.nan if gap_db is None else gap_db,
             **({} if problem.faint is None else {"faint": problem.faint}),
             **({} if links.censored is None else {"censored": links.censored}),
             **_positions(links),
@@ -145,7 +153,7 @@ def outcome(
             initial_rmse_db=_rmse(problem, models.initial, counted),
             nuisance_only_rmse_db=_rmse(problem, nuisance_only, counted) if fitted else None,
             log_distance_rmse_db=_rmse(problem, models.log_distance, counted),
-            retrace_gap_db=largest_gap(gap, counted),
+            retrace_gap_db=largest_gap(gap_db, counted),
             laws=parameters.law_coefficients(trail.best),
             power_shares=diagnostics.power_shares,
         ),
@@ -159,7 +167,7 @@ def outcome(
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *certainty.remarks,
-                *_unjudged(study, accuracy),
+                *_not_judged(study, accuracy),
             ),
         ),
         nuisance=_nuisance(problem, coefficients[0]),
@@ -167,14 +175,14 @@ def outcome(
         cost=Cost(
             rt_calls=trail.rt_calls,
             ledger_hits=trail.ledger_hits,
-            seconds=timing.search,
-            trace_seconds=timing.trace,
+            seconds=run.timing.search,
+            trace_seconds=run.timing.trace,
             uncertainty_replays=certainty.calls,
             uncertainty_seconds=certainty.seconds,
             cheap_replays=0 if cheap.model is None else cheap.model.calls,
             cheap_seconds=0.0 if cheap.model is None else cheap.model.seconds,
         ),
-        provenance=Provenance(setup.files, links.prepared | _faint(problem), enclosed),
+        provenance=Provenance(setup.files, links.prepared | _faint_rows(problem), run.enclosed),
         links=table,
         history=trail.history(),
         held_out=validation,
@@ -209,11 +217,11 @@ def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accura
         judgement = compare(errors, others, links.rx[judged])
         # No link has a residual in all models.
         judgement = judgement if judgement.links else None
-    size, basis = None, "too few links"
+    residual_db, basis = None, "too few links"
     if len(errors) >= FEWEST_HELD_OUT:
-        size, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
+        residual_db, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
     elif problem.freedom >= 1:
-        size = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
+        residual_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
         basis = f"{objective.num_counted} calibration links"
 
     def rmse(model: NDArray[np.float64]) -> float | None:
@@ -225,7 +233,7 @@ def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accura
         nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
         log_distance_holdout_rmse_db=rmse(models.log_distance),
         judgement=judgement,
-        residual_db=size,
+        residual_db=residual_db,
         residual_basis=basis,
     )
 
@@ -244,33 +252,34 @@ def _on_blocks(validation: Validation, initial_db: float | None, fitted: bool) -
     )
 
 
-def _unjudged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
-    """A remark where no link judges the calibration, though replay could hold blocks out at little cost."""
-    unjudged = accuracy.judgement is None and study.engine.name == "replay"
-    return (Remark(RemarkKind.NOT_JUDGED),) if unjudged else ()
+def _not_judged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
+    """A remark if no link was held out, although replay could hold blocks out at little cost."""
+    if accuracy.judgement is None and study.engine.name == "replay":
+        return (Remark(RemarkKind.NOT_JUDGED),)
+    return ()
 
 
-def _faint(problem: Problem) -> dict[str, int]:
-    """Number of links above the noise floor that are left out, since the model expects them near it."""
+def _faint_rows(problem: Problem) -> dict[str, int]:
+    """Number of links above the noise floor that are left out because the model predicts them near it."""
     faint, censored = problem.faint, problem.setup.links.censored
     count = 0 if faint is None else int((faint if censored is None else faint & ~censored).sum())
     return {FAINT: count} if count else {}
 
 
 def _residual_field(problem: Problem, table: pd.DataFrame) -> ResidualField | None:
-    """The correlated part of the prediction model's residuals; None where they show none."""
+    """The correlated part of the prediction model's residuals; None where they are uncorrelated."""
     links, noise = problem.setup.links, problem.setup.study.noise
     if links.frequency is not None or noise.range_m == 0 or noise.kind == HEAVY:
         return None
-    reached, errors = calibration_residuals(table)
-    correlation = shared_errors(errors, np.hstack([links.tx, links.rx])[reached])
+    rows, residuals = calibration_residuals(table)
+    correlation = shared_errors(residuals, np.hstack([links.tx, links.rx])[rows])
     if correlation is None:
         return None
     return ResidualField(correlation.range_m, correlation.shared_db, correlation.own_db)
 
 
 def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
-    """Coefficients by term and group; groups of the offset without a path are named."""
+    """Coefficients by term and group, and the groups whose offset no calibration link determines."""
     objective = problem.objective
     by_term: dict[str, dict[str, float]] = {}
     without_path: list[str] = []
@@ -279,16 +288,16 @@ def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
         last = first + len(term.labels)
         determined = objective.determined[first:last]
         values = zip(term.labels, coefficients[first:last].tolist(), determined, strict=True)
-        by_term[term.name] = {label: value for label, value, known in values if known}
+        by_term[term.name] = {label: value for label, value, is_determined in values if is_determined}
         if term.name == OFFSET:
-            without_path += [label for label, known in zip(term.labels, determined, strict=True) if not known]
+            without_path += [label for label in term.labels if label not in by_term[term.name]]
         first = last
     centres = {term.name: term.centre for term in objective.nuisance.terms if term.centre}
     return Nuisance(by_term, centres, tuple(without_path))
 
 
 def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
-    """Positions of the links' ends, their group and carrier, as columns."""
+    """Positions of both ends of the links [m], their group and carrier [Hz], as columns."""
     ends = {
         f"{end}_{axis}": position[:, k]
         for end, position in (("tx", links.tx), ("rx", links.rx))
@@ -300,21 +309,21 @@ def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
 
 
 def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Path gain or received power, with the sign of the measurement; nothing where path loss was measured."""
+    """Columns in the measured quantity, path gain or received power; none where path loss was measured."""
     quantity, column = study.links.quantity, study.links.value
     if quantity == "path_loss" or column not in links.frame:
         return {}
-    # Path gain is 0 dB minus path loss, received power the transmitted power minus path loss.
+    # The reference is 0 dB for path gain, and the transmitted power for received power.
     reference = links.frame[column].to_numpy(float) + links.path_loss_db
     unit = "dbm" if quantity == "received_power" else "db"
     return {
-        f"{when}_{quantity}_{unit}": reference - table[f"{when}_db"].to_numpy()
-        for when in ("measured", "before", "after")
+        f"{name}_{quantity}_{unit}": reference - table[f"{name}_db"].to_numpy()
+        for name in ("measured", "before", "after")
     }
 
 
-def _traced(problem: Problem) -> Paths | None:
-    """The paths that were replayed, where they are in memory uncompressed."""
+def _replayed_paths(problem: Problem) -> Paths | None:
+    """The replayed paths, if they are in memory and uncompressed."""
     section = problem.setup.study.engine
-    whole = isinstance(section, ReplaySection) and section.compress_db is None
-    return problem.engine.paths if whole and isinstance(problem.engine, Replay) else None
+    uncompressed = isinstance(section, ReplaySection) and section.compress_db is None
+    return problem.engine.paths if uncompressed and isinstance(problem.engine, Replay) else None

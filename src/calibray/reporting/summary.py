@@ -1,0 +1,230 @@
+"""The summary of a report: questions about a calibration, with answers computed from its record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from calibray.optimizers.methods import label
+from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.result.record import Record
+from calibray.result.verdict import Verdict
+from calibray.result.wording import NOT_JUDGED, block_sentence, judgement_text
+from calibray.tables.display import hertz, named
+from calibray.tables.text import rows_text
+from calibray.validation.validation import Validation
+
+Kind = Literal["plain", "good", "caution"]
+
+RARE: Final = 0.05
+"""Share of the links below which more links that interact with a material are advised."""
+
+LISTED_VALUES: Final = 6
+"""Identified values that are listed one by one."""
+
+MEANINGS: Final = {
+    Verdict.WEAKLY_IDENTIFIED: "weakly identified: each interval covers much of its range",
+    Verdict.AMBIGUOUS: "ambiguous: several separate ranges fit the links",
+    Verdict.AT_BOUND: "at a bound: the best value may lie beyond it, or the model lacks something",
+    Verdict.NOT_IDENTIFIABLE: "not identifiable: any value within the interval fits the links about as well",
+}
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """One statement of the summary.
+
+    Attributes:
+        heading: The question that it answers; empty if it continues the answer of the sentence before.
+        text: The answer.
+        kind: Whether it is plain, good news, or calls for caution.
+    """
+
+    heading: str
+    text: str
+    kind: Kind = "plain"
+
+
+def summary(result: Record, links_by_material: Mapping[str, int] | None = None) -> tuple[Sentence, ...]:
+    """Summarize a calibration in a few sentences.
+
+    Args:
+        result: The calibration.
+        links_by_material: Number of links with at least one path that interacts with the material, by material; None
+            without paths.
+
+    Returns:
+        What was calibrated, how well it fits, whether it helped on held-out links, how certain the values are, what to
+        measure next, and warnings.
+    """
+    return (
+        _scope(result),
+        _fit(result),
+        _held_out_accuracy(result),
+        *_certainty(result),
+        *_advice(result, links_by_material),
+        *_cautions(result),
+    )
+
+
+def _scope(result: Record) -> Sentence:
+    study, count = result.study, len(result.parameters)
+    materials = list(dict.fromkeys(name.rpartition(".")[0] for name in result.parameters))
+    constants = "1 constant" if count == 1 else f"{count} constants"
+    return Sentence(
+        "What was calibrated?",
+        f"{constants} of {_list(materials)} at {hertz(study.scene.frequency)}, on "
+        f"{result.counts['calibrated_on']:,} links, by {label(study.method.name)} with the engine "
+        f"{study.engine.name}: {result.rt_calls:,} RT calls in {_seconds(result.cost.seconds)}, after "
+        f"{_seconds(result.cost.trace_seconds)} of tracing and loading.",
+    )
+
+
+def _fit(result: Record) -> Sentence:
+    text = (
+        f"On the calibration links, the RMSE is {result.rmse_db:.2f} dB after calibration and "
+        f"{result.initial_rmse_db:.2f} dB before."
+    )
+    if result.fit.nuisance_only_rmse_db is not None:
+        text += (
+            f" The initial materials with fitted offsets or other nuisances give "
+            f"{result.fit.nuisance_only_rmse_db:.2f} dB."
+        )
+    return Sentence("How well does it fit?", text)
+
+
+def _held_out_accuracy(result: Record) -> Sentence:
+    heading = "Did calibration help on held-out links?"
+    judgement, text = result.accuracy.judgement, ""
+    if result.held_out is not None:
+        validation = Validation.of(result.held_out)
+        judgement = validation.judgement
+        best_db = validation.table["rmse_db"].min()
+        text = f"{block_sentence(validation)} The best model is {validation.best!r} with {best_db:.2f} dB."
+    if judgement is None:
+        return Sentence(heading, NOT_JUDGED, "caution")
+    return Sentence(
+        heading, f"{judgement_text(judgement)} {text}".strip(), "good" if judgement.helped else "caution"
+    )
+
+
+def _certainty(result: Record) -> Iterator[Sentence]:
+    heading = "How certain are the values?"
+    if not result.intervals:
+        yield Sentence(
+            heading,
+            f"Unknown: the engine {result.study.engine.name} gives no derivatives, so there are no intervals. "
+            "The values fit best among those that were tried; the true ones may be far away.",
+            "caution",
+        )
+        return
+    identified = _by_verdict(result, Verdict.IDENTIFIED)
+    if identified:
+        values = [
+            f"{name} {_value(result, name)} ({_number(result.intervals[name].lower)} to "
+            f"{_number(result.intervals[name].upper)})"
+            for name in identified[:LISTED_VALUES]
+        ]
+        rest = len(identified) - LISTED_VALUES
+        more = f" and {rest} more" if rest > 0 else ""
+        yield Sentence(
+            heading,
+            f"The links identify {len(identified)} of {len(result.intervals)} parameters: {'; '.join(values)}{more}.",
+            "good",
+        )
+    else:
+        yield Sentence(heading, "No parameter is identified.", "caution")
+    for verdict, meaning in MEANINGS.items():
+        if names := _by_verdict(result, verdict):
+            verb = "is" if len(names) == 1 else "are"
+            yield Sentence("", f"{_list(names)} {verb} {meaning}.", "caution")
+
+
+def _advice(result: Record, links_by_material: Mapping[str, int] | None) -> Iterator[Sentence]:
+    heading = "What to measure next?"
+    unidentified = _by_verdict(result, Verdict.NOT_IDENTIFIABLE)
+    materials = list(dict.fromkeys(name.rpartition(".")[0] for name in unidentified))
+    sentences = []
+    if result.uncertainty.draws and (unidentified or _by_verdict(result, Verdict.AMBIGUOUS)):
+        sentences.append(
+            "calibray suggest DIR CANDIDATES ranks candidate positions by how much a measurement there is expected to "
+            "narrow the intervals."
+        )
+    if materials and links_by_material is None:
+        sentences.append(f"Links whose strongest paths interact with {_list(materials)}.")
+    elif links_by_material is not None:
+        total = max(len(result.links), 1)
+        sentences += [f"{name}: {_coverage(links_by_material.get(name, 0), total)}." for name in materials]
+    yield from _headed(heading, sentences, "plain")
+
+
+def _coverage(count: int, total: int) -> str:
+    """Advice about a material that is not identifiable, from the links with paths that interact with it."""
+    if count == 0:
+        return (
+            "no path of any link interacts with it, so these links cannot identify it; measure where paths do"
+        )
+    if count < RARE * total:
+        return f"only {count:,} of {total:,} links have paths that interact with it; measure more such links"
+    return (
+        f"{count:,} of {total:,} links have paths that interact with it, but these paths are too weak, or other "
+        "unknowns compensate; measure where such a path is the strongest"
+    )
+
+
+def _cautions(result: Record) -> Iterator[Sentence]:
+    sentences = []
+    without_path = result.counts["rows_without_path"]
+    if without_path:
+        sentences.append(
+            f"{len(without_path):,} of {len(result.links):,} links have no path ({rows_text(without_path)})."
+        )
+    enclosed = result.provenance.enclosed
+    if enclosed is not None and not enclosed.indoors:
+        for end, rows in (("transmitter", enclosed.tx), ("receiver", enclosed.rx)):
+            if rows:
+                sentences.append(
+                    f"The {end} is inside a building in {rows_text(list(rows))}: check the positions."
+                )
+    gap, tolerance = result.fit.retrace_gap_db, result.study.fidelity.tolerance_db
+    if gap is not None and gap > tolerance:
+        sentences.append(
+            f"When the scene is traced again with the calibrated materials, a link changes by up to {gap:.2f} dB, more "
+            f"than the tolerance of {tolerance:g} dB (fidelity.tolerance_db)."
+        )
+    if result.nuisance.groups_without_path:
+        sentences.append(
+            f"No calibration link of {named(result.nuisance.groups_without_path)} has a path, so the offset there is "
+            "unknown."
+        )
+    yield from _headed("What calls for caution?", sentences, "caution")
+
+
+def _headed(heading: str, sentences: Sequence[str], kind: Kind) -> Iterator[Sentence]:
+    for number, text in enumerate(sentences):
+        yield Sentence("" if number else heading, text, kind)
+
+
+def _by_verdict(result: Record, verdict: Verdict) -> list[str]:
+    return [name for name, interval in result.intervals.items() if interval.verdict == verdict]
+
+
+def _value(result: Record, name: str) -> str:
+    unit = PARAMETER_BOUNDS[name.rpartition(".")[2]].unit
+    return _number(result.parameters[name]) + ("" if unit == "1" else f" {unit}")
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _list(names: Sequence[str]) -> str:
+    """Names with "and" before the last; only the first eight if there are more."""
+    if len(names) > 8:
+        return named(names, 8)
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2g} s" if value < 100 else f"{value / 60:.0f} min"

@@ -1,0 +1,207 @@
+"""Data of the report's 3-D viewer: the scene and the strongest paths of every link, packed as text.
+
+Positions are whole steps of a grid over the scene, 65,536 in each direction: 3 cm in a scene of 2 km.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.fields import path_gains
+from calibray.paths import Paths, take
+from calibray.reporting.link_survey import Survey
+from calibray.result.record import Record
+from calibray.scenes import Triangles
+from calibray.study import Setup
+from calibray.support.progress import Progress
+
+PER_LINK: Final = 12
+"""Most paths per link that are shown."""
+
+INTERACTIONS: Final = 400_000
+"""Most interactions that are shown in all; in larger scenes, fewer paths per link are shown."""
+
+TRIANGLES: Final = 250_000
+"""Most triangles that are drawn, the largest first."""
+
+STEPS: Final = 65_535
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Paths to be drawn.
+
+    Attributes:
+        paths: The strongest paths of every link, strongest first.
+        vertex: Their points of interaction [I, 3], [m].
+        gain_db: Their power gain with the calibrated materials, without nuisances [P], [dB].
+        per_link: Most paths per link.
+        traced: Number of traced paths.
+        links_by_material: Number of links with at least one traced path that interacts with the material, by material.
+    """
+
+    paths: Paths
+    vertex: NDArray[np.float32] | NDArray[np.float64]
+    gain_db: NDArray[np.float64]
+    per_link: int
+    traced: int
+    links_by_material: dict[str, int]
+
+
+def rays(result: Record, progress: Progress | None = None) -> Rays:
+    """Find the strongest paths of every link.
+
+    Args:
+        result: The calibration; paths that it does not contain come from the cache or are traced.
+        progress: Called with the stage "tracing" after every launch.
+
+    Returns:
+        The paths.
+
+    Raises:
+        InputError: The scene or the links of the study cannot be used any more.
+        EngineError: The ray tracer failed.
+    """
+    paths = result.paths
+    if paths is None:
+        paths = Setup.open(result.study).trace(progress=progress)
+    return strongest(paths, result)
+
+
+def strongest(paths: Paths, result: Record) -> Rays:
+    """Select the strongest paths of every link.
+
+    Args:
+        paths: All traced paths.
+        result: The calibration whose materials the paths are evaluated with.
+
+    Returns:
+        The paths that are shown.
+    """
+    gain = path_gains(paths, result.materials).reshape(paths.num_paths, -1)
+    # Summed over receive ports and averaged over transmit ports, as in path loss.
+    power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
+    gain_db = 10 * np.log10(np.maximum(power, 1e-40))
+    order = np.lexsort((-gain_db, paths.link))
+    link = paths.link[order]
+    rank = np.arange(len(link)) - np.searchsorted(link, link)
+    # Interactions in all if every link keeps its 1, 2, ... strongest paths.
+    interactions = np.cumsum(
+        np.bincount(rank[rank < PER_LINK], np.diff(paths.first)[order][rank < PER_LINK], PER_LINK)
+    )
+    per_link = int(np.clip(np.searchsorted(interactions, INTERACTIONS, side="right"), 1, PER_LINK))
+    chosen = order[rank < per_link]
+    link_and_material = np.stack([np.repeat(paths.link, np.diff(paths.first)), paths.material], axis=1)
+    links = np.bincount(np.unique(link_and_material, axis=0)[:, 1], minlength=len(paths.materials))
+    shown = take(paths, chosen)
+    return Rays(
+        shown,
+        shown.vertex,
+        gain_db[chosen],
+        per_link,
+        paths.num_paths,
+        dict(zip(paths.materials, links.tolist(), strict=True)),
+    )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid that positions are rounded to.
+
+    Attributes:
+        low: Its lower corner [3], [m].
+        step: Its spacing [m], the same in all directions.
+    """
+
+    low: NDArray[np.float64]
+    step: float
+
+    @classmethod
+    def over(cls, *points: NDArray[np.float64]) -> Grid:
+        """The smallest grid that contains all points [n, 3], [m]."""
+        positions = np.concatenate([part.reshape(-1, 3) for part in points])
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        return cls(low, float(max((high - low).max(), 1.0) / STEPS))
+
+    def steps(self, points: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Positions as whole numbers of steps [n, 3]."""
+        return np.clip(np.rint((points - self.low) / self.step), 0, STEPS).astype(np.uint16)
+
+
+def packed(
+    survey: Survey, triangles: Triangles | None, rays: Rays | None, materials: list[str]
+) -> dict[str, Any]:
+    """Pack what the viewer draws.
+
+    Args:
+        survey: The links.
+        triangles: The scene; None where it cannot be read.
+        rays: The paths; None without paths.
+        materials: Names of the scene's materials, in the scene's order.
+
+    Returns:
+        Plain values; arrays are base64 of little-endian whole numbers.
+    """
+    points = [survey.tx, survey.rx]
+    if triangles is not None and len(triangles.face):
+        points.append(triangles.vertex)
+    if rays is not None:
+        points.append(rays.vertex.astype(float))
+    grid = Grid.over(*points)
+    return {
+        "low": grid.low.tolist(),
+        "step": grid.step,
+        "tx": _text(grid.steps(survey.tx)),
+        "rx": _text(grid.steps(survey.rx)),
+        "mesh": None if triangles is None else _mesh(triangles, grid, materials),
+        "paths": None if rays is None else _paths(rays, grid),
+    }
+
+
+def _mesh(triangles: Triangles, grid: Grid, materials: list[str]) -> dict[str, Any]:
+    """The triangles, ground first, then by material; vertices on the same grid point are merged."""
+    area = np.linalg.norm(triangles.normal, axis=1)
+    kept = np.sort(np.argsort(-area, kind="stable")[:TRIANGLES])
+    part = np.where(triangles.ground[kept], 0, 1 + triangles.material[kept])
+    order = kept[np.argsort(part, kind="stable")]
+    corners = grid.steps(triangles.vertex)[triangles.face[order]].reshape(-1, 3)
+    vertex, index = np.unique(corners, axis=0, return_inverse=True)
+    sizes = np.bincount(part, minlength=1 + len(materials))
+    return {
+        "vertex": _text(vertex),
+        "face": _text(index.astype(np.uint32)),
+        "parts": [
+            {"name": name, "count": int(size), "ground": not number}
+            for number, (name, size) in enumerate(zip(["ground", *materials], sizes, strict=True))
+            if size
+        ],
+        "drawn": len(kept),
+        "all": len(triangles.face),
+        "left_out": len(triangles.left_out),
+    }
+
+
+def _paths(rays: Rays, grid: Grid) -> dict[str, Any]:
+    paths = rays.paths
+    counts = np.bincount(paths.link, minlength=paths.num_links)
+    return {
+        "count": _text(counts.astype(np.uint8)),
+        "depth": _text(np.diff(paths.first).astype(np.uint8)),
+        # In hundredths of a decibel below 0 dB.
+        "loss": _text(np.clip(np.rint(-100 * rays.gain_db), 0, STEPS).astype(np.uint16)),
+        "kind": _text(paths.kind.astype(np.uint8)),
+        "material": _text(paths.material.astype(np.uint16)),
+        "materials": list(paths.materials),
+        "vertex": _text(grid.steps(rays.vertex.astype(float))),
+        "per_link": rays.per_link,
+        "traced": rays.traced,
+    }
+
+
+def _text(values: NDArray[np.integer]) -> str:
+    return b64encode(np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<")).tobytes()).decode()

@@ -1,0 +1,79 @@
+"""Tables rendered as text, HTML and Markdown."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from calibray.tables import Column, Table, html, markdown, numbers
+from calibray.tables.text import render, rows_text
+from html_cells import Cells
+
+HOSTILE = '<script>alert("x")</script>&amp;'
+RMSE = Table("RMSE [dB]", (Column("links"), numbers("after", "dB")), (("held out", "0.89"), ("all", "0.55")))
+
+
+def test_text_is_aligned_and_without_markup():
+    names = ("[red]walls[/red]", ":warning:", "壁")
+    table = Table("", (Column("Name"), numbers(unit="dB")), tuple((name, "-10.0") for name in names))
+    assert render(table).splitlines()[2:] == [
+        "[red]walls[/red]   -10.0",
+        ":warning:          -10.0",
+        "壁                 -10.0",
+    ]
+
+
+def test_long_cells_are_not_cut():
+    table = Table("", (Column("message"), Column()), (("x" * 3000, "y"),))
+    assert render(table).splitlines()[-1] == "x" * 3000 + "   y"
+
+
+def test_the_title_is_the_first_heading_or_above_the_table():
+    over = Table("Cost", (Column(), numbers("time", "s")), (("tracing", "0.3"),))
+    above = Table("Cost", (Column("what"), numbers("time", "s")), (("tracing", "0.3"),))
+    assert render(over).splitlines()[0] == "Cost      time [s]"
+    assert render(above).splitlines()[:2] == ["Cost", "what      time [s]"]
+    assert render("before", over).startswith("before\n\nCost ")
+
+
+def test_a_row_with_a_wrong_number_of_cells_is_refused():
+    with pytest.raises(ValueError, match="a row has 1 cells, must be 2"):
+        Table("Cost", (Column(), numbers()), (("tracing",),))
+
+
+def test_only_the_first_rows_are_listed():
+    assert rows_text([]) == ""
+    assert rows_text([7]) == "row 7"
+    assert rows_text(range(1, 15)).endswith("11, 12 and 2 more")
+
+
+def test_html_contains_the_text_of_the_table():
+    cells = Cells(html.render("study.toml", RMSE))
+    headings = [column.heading for column in RMSE.columns]
+    assert cells.words == ["study.toml", RMSE.title, *headings, *(cell for row in RMSE.rows for cell in row)]
+    assert cells.tags == {"p", "table", "caption", "thead", "tbody", "tr", "th", "td"}
+
+
+def test_html_escapes_all_text():
+    table = Table(HOSTILE, (Column(HOSTILE, HOSTILE),), ((HOSTILE,),))
+    fragment = html.render(HOSTILE, table)
+    assert "<script" not in fragment
+    assert Cells(fragment).words == [HOSTILE, HOSTILE, f"{HOSTILE} [{HOSTILE}]", HOSTILE]
+
+
+def test_markdown_escapes_column_separators():
+    table = Table("", (Column("a"), Column("b")), (("x|y", "z"),))
+    assert markdown.render(table).splitlines()[-1] == r"| x\|y | z |"
+
+
+def test_tables_import_no_pandas():
+    code = """
+import importlib, sys
+for name in ("display", "html", "markdown", "text"):
+    importlib.import_module(f"calibray.tables.{name}")
+print("pandas" in sys.modules)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (run.stdout, run.stderr) == ("False\n", "")
