@@ -1,4 +1,4 @@
-"""Reports of any size, made up: links and buildings on a grid of streets, paths from a formula; nothing is traced."""
+"""Synthetic reports of any size: links and buildings on a grid of streets, paths from a formula, no tracing."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import shown
 from calibray.calibration.result import Result
 from calibray.paths import Kind, Paths
 from calibray.reporting.link_survey import survey
-from calibray.reporting.page import Shown
+from calibray.reporting.page import PageData
 from calibray.reporting.viewer import strongest
 from calibray.scenes import Scene, Triangles
 from changed import changed
 
 BLOCK = 40.0
-"""Distance of the streets [m]."""
+"""Distance between streets [m]."""
 
 _FACES = np.array(
     [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
@@ -28,8 +28,8 @@ _FACES = np.array(
 def made_up(
     links: int, buildings: int, paths: int = 20, names: tuple[str, str] = ("brick", "concrete"),
     groups: tuple[str, ...] = ("north", "south"), seed: int = 0,
-) -> tuple[Result, Shown]:  # fmt: skip
-    """A calibration and what its report shows.
+) -> tuple[Result, PageData]:  # fmt: skip
+    """Make a calibration and the data of its report.
 
     Args:
         links: Number of links.
@@ -37,7 +37,7 @@ def made_up(
         paths: Paths of a link.
         names: Names of two materials.
         groups: Names of the groups.
-        seed: Seed of all that is random.
+        seed: Seed of the random numbers.
 
     Returns:
         The calibration, and its links, scene and paths.
@@ -66,7 +66,7 @@ def made_up(
     traced = _paths(tx, rx, paths, {**result.materials}, random)
     result = replace(result, paths=traced)
     scene = Scene("made up", result.study.path, materials, (), "<scene/>")
-    return result, Shown(survey(result), scene, triangles, strongest(traced, result))
+    return result, PageData(survey(result), scene, triangles, strongest(traced, result))
 
 
 def _town(buildings: int, random: np.random.Generator) -> Triangles:

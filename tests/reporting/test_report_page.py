@@ -317,7 +317,7 @@ def test_the_map_shows_footprints_at_their_positions(tmp_path, result):
     ]
     corners = [[(0, 0), (20, 0), (20, 10), (0, 10)], [(30, 0), (35, 0), (35, 5), (30, 5)]]
     expected = [
-        {tuple(point) for point in shown.place(np.array(corner)).round(1).tolist()} for corner in corners
+        {tuple(point) for point in shown.project(np.array(corner)).round(1).tolist()} for corner in corners
     ]
     assert sorted(map(sorted, outlines)) == sorted(map(sorted, expected))
 

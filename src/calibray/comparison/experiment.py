@@ -147,7 +147,7 @@ def trust(result: Result) -> Table:
         (name, f"{result.parameters[name]:.2f}", interval_text(interval), interval.label)
         for name, interval in result.intervals.items()
     )
-    return Table("How far to trust auto's answer", columns, rows)
+    return Table("Intervals and verdicts of auto", columns, rows)
 
 
 def _paper(method: str, *keys: str) -> tuple[str, ...]:

@@ -98,7 +98,7 @@ def export(
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
-    """Write a MATLAB function that returns materials as a table, or as a structure in Octave, which has no tables.
+    """Write a MATLAB function that returns the materials as a table, or as a structure in Octave.
 
     Args:
         materials: One row per material.

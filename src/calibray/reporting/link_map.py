@@ -49,7 +49,7 @@ class Plan:
     buildings: str
     bar: float
 
-    def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert positions to the map.
 
         Args:
@@ -135,6 +135,6 @@ def _buildings(triangles: Triangles, layout: Plan) -> str:
     loops = footprints(triangles, layout.west, south, layout.west + WIDTH / layout.scale, layout.north)
     outlines: dict[frozenset[tuple[float, ...]], list[list[float]]] = {}
     for loop in loops:
-        line = layout.place(loop).round(1)
+        line = layout.project(loop).round(1)
         outlines.setdefault(frozenset(map(tuple, line.tolist())), line.tolist())
     return "".join(f"M{'L'.join(f'{x:g},{y:g}' for x, y in line)}Z" for line in outlines.values())

@@ -74,7 +74,7 @@ PICTURES: Final = tuple(f"{name}.{suffix}" for name in CAPTIONS for suffix in ("
 
 
 @dataclass(frozen=True)
-class Shown:
+class PageData:
     """What a page shows in addition to the result.
 
     Attributes:
@@ -118,13 +118,13 @@ def report(
     inputs = result.study.files()
     target = check_file(file, inputs, overwrite)
     folder = None if figures is None else check_outputs(figures, PICTURES, inputs, overwrite)
-    shown = gather(result, progress)
-    drawn = result_figures(result, shown.links)
+    data = collect(result, progress)
+    drawn = result_figures(result, data.links)
     try:
-        write_text(target, page(result, shown, drawn))
+        write_text(target, page(result, data, drawn))
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            for name, figure in result_figures(result, shown.links).items():
+            for name, figure in result_figures(result, data.links).items():
                 for suffix in ("svg", "png"):
                     style.write(figure, folder / f"{name}.{suffix}")
     except OSError as error:
@@ -132,7 +132,7 @@ def report(
     return target
 
 
-def gather(result: Record, progress: Progress | None = None) -> Shown:
+def collect(result: Record, progress: Progress | None = None) -> PageData:
     """Collect what a page shows in addition to the result; what is unavailable is listed, not an error.
 
     Args:
@@ -164,15 +164,15 @@ def gather(result: Record, progress: Progress | None = None) -> Shown:
         if drawn is not None and drawn.paths.num_links != len(result.links):
             drawn = None
             missing.append("Paths: the links of the study have changed since the calibration.")
-    return Shown(links, scene, triangles, drawn, tuple(missing))
+    return PageData(links, scene, triangles, drawn, tuple(missing))
 
 
-def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
+def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
     """The report as text.
 
     Args:
         result: The calibration.
-        shown: What the page shows in addition.
+        data: What the page shows in addition to the result.
         figures: Figures by name.
 
     Returns:
@@ -186,7 +186,7 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
         lstrip_blocks=True,
     )
     script = _asset("viewer.js")
-    layout = None if shown.links is None else plan(shown.links, shown.triangles)
+    layout = None if data.links is None else plan(data.links, data.triangles)
     return environment.get_template("report.html.jinja").render(
         name=result.study.path.stem,
         heading=tables.heading(result),
@@ -194,18 +194,18 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
         script=Markup(script),
         checksum=b64encode(sha256(script.encode()).digest()).decode(),
         tiles=_tiles(result),
-        sentences=summary(result, None if shown.rays is None else shown.rays.links_by_material),
+        sentences=summary(result, None if data.rays is None else data.rays.links_by_material),
         values=tables.values(result),
         offsets=tables.nuisances(result),
         laws=_laws(result),
         figures={name: Markup(style.inline(figure, name)) for name, figure in figures.items()},
         captions=CAPTIONS,
-        worst=_worst(result, shown.links),
+        worst=_worst(result, data.links),
         map=layout,
-        marks=None if shown.links is None or layout is None else _marks(shown.links, layout),
-        rays=shown.rays,
-        missing=shown.missing,
-        triangles=shown.triangles,
+        marks=None if data.links is None or layout is None else _marks(data.links, layout),
+        rays=data.rays,
+        missing=data.missing,
+        triangles=data.triangles,
         most_triangles=TRIANGLES,
         accuracy=tables.accuracy(result),
         validation=None if result.held_out is None else Validation.of(result.held_out).summary(),
@@ -218,7 +218,7 @@ def page(result: Record, shown: Shown, figures: Mapping[str, Figure]) -> str:
         study=json.dumps(result.study.content(), indent=2, ensure_ascii=False),
         commands=_commands(result),
         versions=_versions(),
-        data=_data(result, shown, layout),
+        data=_script_data(result, data, layout),
     )
 
 
@@ -286,7 +286,7 @@ def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
     by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
     moving, fixed = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
     count = len(residuals)
-    position = layout.place(moving).round(1).tolist()
+    position = layout.project(moving).round(1).tolist()
     color, held_out = ramp(residuals, limit), links.table["held_out"].to_numpy(bool)
     # The largest residuals are drawn last, on top.
     order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
@@ -297,7 +297,7 @@ def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
         "ramp": ", ".join(RAMP),
         "ends": ("receivers", "transmitters") if by_rx else ("transmitters", "receivers"),
         "links": [(*position[link], color[link], bool(held_out[link])) for link in order],
-        "masts": np.unique(layout.place(fixed).round(1), axis=0).tolist(),
+        "masts": np.unique(layout.project(fixed).round(1), axis=0).tolist(),
         "bar": layout.bar * layout.scale,
     }
 
@@ -325,14 +325,14 @@ def _versions() -> Table:
     return Table("", (Column(), Column()), rows)
 
 
-def _data(result: Record, shown: Shown, layout: Plan | None) -> dict[str, Any] | None:
+def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[str, Any] | None:
     """Data for the page's script; None without positions of the links."""
-    links = shown.links
+    links = data.links
     if links is None or layout is None:
         return None
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
-    materials = [] if shown.scene is None else list(shown.scene.materials)
+    materials = [] if data.scene is None else list(data.scene.materials)
     residuals = links.residual_db
     return {
         "links": {
@@ -348,7 +348,7 @@ def _data(result: Record, shown: Shown, layout: Plan | None) -> dict[str, Any] |
         "groups": names,
         "materials": materials,
         "map": {"west": layout.west, "north": layout.north, "scale": layout.scale},
-        "solid": packed(links, shown.triangles, shown.rays, materials),
+        "solid": packed(links, data.triangles, data.rays, materials),
     }
 
 
