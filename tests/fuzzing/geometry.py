@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -37,6 +38,11 @@ def _traced(study: Path, whole: bool) -> Callable[[], list[float]]:
         return np.asarray(path_loss(setup.tracer.trace(setup.links))).tolist()
 
     return act
+
+
+def _inserted(element: str, where: str, text: str) -> str:
+    """A scene with an element before the first end of another one."""
+    return text.replace(where, element + where, 1)
 
 
 DOCUMENTS: tuple[Callable[[str], str], ...] = (
@@ -106,6 +112,21 @@ DOCUMENTS: tuple[Callable[[str], str], ...] = (
         1,
     ),
     lambda t: t.replace('"wood"', '"wood\0"'),
+    *(
+        functools.partial(_inserted, f'<{tag} type="{kind}">{body}</{tag}>', where)
+        for tag, kind in (
+            ("texture", "bitmap"),
+            ("texture", "x"),
+            ("emitter", "area"),
+            ("medium", "homogeneous"),
+            ("volume", "gridvolume"),
+            ("sensor", "thinlens"),
+            ("shape", "merge"),
+            ("spectrum", "x"),
+        )
+        for body in ("", '<string name="filename" value="links.csv"/>', '<ref id="mat-walls"/>')
+        for where in ("</scene>", "</shape>", "</bsdf>")
+    ),
 )
 _TAGS = (
     "shape",

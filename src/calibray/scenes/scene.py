@@ -29,9 +29,9 @@ from calibray.materials import (
     itu_material,
 )
 from calibray.parameters.laws import frequency_independent_law
-from calibray.scenes.scene_file import check_files, parse, scene_path
+from calibray.scenes.scene_file import keep_traced_elements, parse, scene_path
 from calibray.scenes.shapes import SurfaceSize, local_origin, read_surface, write_local_shape
-from calibray.support.messages import did_you_mean
+from calibray.support.messages import did_you_mean, shortened
 
 DEFAULT_THICKNESS: Final = 0.1
 """Sionna's thickness of a material that states none [m]."""
@@ -115,9 +115,8 @@ def read_scene(
     overrides, split = dict(overrides or {}), dict(split or {})
     path = scene_path(str(source))
     root = parse(path, str(source))
-    definitions = {
-        _material_name(bsdf): bsdf for bsdf in [*root.findall("bsdf"), *root.findall("shape/bsdf")]
-    }
+    keep_traced_elements(root, path)
+    definitions = _definitions(root, path)
     objects: list[SceneObject] = []
     materials: dict[str, Material] = {}
     laws: dict[str, ItuLaw] = {}
@@ -154,7 +153,6 @@ def read_scene(
         check_material_name(name, {**materials, **dict.fromkeys(originals.values())}, f"[materials] {name}")
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
-    check_files(root, path)
     for number, material in enumerate(materials.values()):
         root.insert(number, material_element(f"{TRACED}{number}", material))
     xml = ElementTree.tostring(root, encoding="unicode")
@@ -212,6 +210,21 @@ def is_itu_name(name: str) -> bool:
         True for an ITU name, with or without the prefix `itu_`.
     """
     return name in ITU_NAMES or name.startswith(("itu_", "itu-"))
+
+
+def _definitions(root: ElementTree.Element, path: Path) -> dict[str, ElementTree.Element]:
+    """The materials that a scene defines, by name."""
+    definitions: dict[str, ElementTree.Element] = {}
+    for bsdf in [*root.findall("bsdf"), *root.findall("shape/bsdf")]:
+        name = _material_name(bsdf)
+        first = definitions.setdefault(name, bsdf)
+        if ElementTree.canonicalize(ElementTree.tostring(first), strip_text=True) != ElementTree.canonicalize(
+            ElementTree.tostring(bsdf), strip_text=True
+        ):
+            raise InputError(
+                f"{path}: material {shortened(repr(name))} is defined twice, with different constants; rename one"
+            )
+    return definitions
 
 
 def _material_name(bsdf: ElementTree.Element) -> str:

@@ -28,6 +28,37 @@ SHAPES: Final = ("cube", "obj", "ply", "rectangle", "serialized")
 MAX_DEPTH: Final = 64
 """Largest depth of nested elements in a scene file."""
 
+_NOT_RADIO: Final = frozenset(
+    {
+        "default",
+        "emitter",
+        "film",
+        "integrator",
+        "medium",
+        "phase",
+        "sampler",
+        "sensor",
+        "spectrum",
+        "texture",
+    }
+)
+"""Elements of Mitsuba's scenes without effect on radio waves."""
+
+_PROPERTIES: Final[Mapping[str, tuple[str, ...]]] = {
+    "boolean": (
+        "face_normals",
+        "flip_normals",
+        "flip_tex_coords",
+        "faceNormals",
+        "flipNormals",
+        "flipTexCoords",
+    ),
+    "integer": ("shape_index", "shapeIndex"),
+    "string": ("filename",),
+    "transform": ("to_world", "toWorld"),
+}
+"""Properties of shapes by element, in the spelling of Mitsuba 3 and of earlier versions."""
+
 _FRAME_COMMENT: Final = "calibray frame "
 
 
@@ -218,25 +249,56 @@ def _check_transform(shape: ElementTree.Element, path: Path) -> None:
             )
 
 
-def check_files(root: ElementTree.Element, path: Path) -> None:
-    """Refuse scenes in several files, and textures or emitters whose files are missing.
+def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
+    """Reduce a scene to the elements that a trace needs, so that Mitsuba sees no others.
+
+    Mitsuba would load textures, emitters and sensors, and end the process on some that are malformed. They have no
+    effect on radio waves and are dropped.
 
     Args:
-        root: The scene without its materials.
+        root: The scene; changed.
         path: The scene's file.
 
     Raises:
-        InputError: The scene includes another file, or a file is missing.
+        InputError: The scene includes another file, or has an element, a property or a parameter that Calibray does not
+            know.
     """
     if root.find(".//include") is not None:
         raise InputError(f"{path}: <include> is not supported; export the scene into one file")
-    for element in root.iter():
-        filename = mesh_filename(element)
-        if element.tag != "shape" and filename is not None and not exists(path.parent / filename):
-            raise InputError(
-                f"{path}: file {shortened(filename, 200)!r} of a {element.tag} does not exist; copy it next to the "
-                f"scene, or remove the {element.tag}, which has no effect on radio waves"
-            )
+    _drop(root)
+    for element in root:
+        if element.tag not in ("bsdf", "shape"):
+            raise InputError(_unknown(element, "the scene", path))
+    for shape in root.findall("shape"):
+        owner = f"shape {shortened(repr(shape.get('id')))}"
+        _drop(shape)
+        for child in shape:
+            if child.get("name", "") not in _PROPERTIES.get(child.tag, ()) and child.tag not in (
+                "bsdf",
+                "ref",
+            ):
+                raise InputError(_unknown(child, owner, path))
+        for element in shape.iter():
+            for key, value in element.attrib.items():
+                if "$" in value:
+                    raise InputError(
+                        f"{path}: {key} = {shortened(repr(value))} in {owner} is a parameter of the scene, which "
+                        "Calibray does not fill in; write the value"
+                    )
+
+
+def _drop(element: ElementTree.Element) -> None:
+    for child in list(element):
+        if child.tag in _NOT_RADIO:
+            element.remove(child)
+
+
+def _unknown(element: ElementTree.Element, owner: str, path: Path) -> str:
+    name = "" if element.get("name") is None else f" name={shortened(repr(element.get('name')))}"
+    return (
+        f"{path}: <{shortened(element.tag)}{name}> in {owner} is not an element of a radio scene; remove it, or export "
+        "the scene again"
+    )
 
 
 def write_scene(
