@@ -194,7 +194,7 @@ def test_positions_of_a_result_that_are_no_numbers(tmp_path):
         (tmp_path / file.name).write_bytes(file.read_bytes())
     links = pd.read_csv(tmp_path / "links.csv")
     links.assign(rx_z="{'x': 1}").to_csv(tmp_path / "links.csv", index=False)
-    with pytest.raises(InputError, match=r"links\.csv: column 'rx_z' holds something else"):
+    with pytest.raises(InputError, match=r"links\.csv: column 'rx_z' has values of the wrong type"):
         Result.load(tmp_path)
 
 

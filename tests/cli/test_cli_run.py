@@ -212,7 +212,7 @@ def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
         (("trace", "{study}", "-o", "{folder}/absent/paths.h5"), "there is no folder"),
         (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
         (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
-        (("predict", "{folder}", "{file}"), "is no result of `calibray run`"),
+        (("predict", "{folder}", "{file}"), "is not a result of `calibray run`"),
         (("predict", "{result}", "{file}"), "has a column 'path_loss_db' already; rename or remove it"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
         (("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"), "tables end in .csv or .parquet"),

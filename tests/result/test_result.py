@@ -145,11 +145,11 @@ def test_a_crash_while_saving_leaves_the_older_files(result, folder, monkeypatch
 
 
 def test_only_folders_with_a_result_are_loaded(folder, tmp_path):
-    with pytest.raises(InputError, match="is no result of `calibray run`"):
+    with pytest.raises(InputError, match="is not a result of `calibray run`"):
         Result.load(tmp_path)
     text = (folder / "result.json").read_text()
     (folder / "result.json").write_text(text[:100])
-    with pytest.raises(InputError, match="is no result"):
+    with pytest.raises(InputError, match="is not a result"):
         Result.load(folder)
     (folder / "result.json").write_text(text.replace('"version": 1,', '"version": 99,', 1))
     with pytest.raises(InputError, match="version 99, need 1; run the study again"):
@@ -176,7 +176,7 @@ def edited(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fit__materials": {}}, "materials: 'concrete' is calibrated and missing"),
+        ({"fit__materials": {}}, "materials: 'concrete' is missing"),
         ({"nuisance__coefficients": {}}, "nuisance.coefficients: are not those"),
         ({"fit__rmse_db": float("nan")}, r"rmse_db = nan: must be a finite number"),
         ({"fit__rmse_db": "1.5"}, r"rmse_db = '1.5': must be a number"),
@@ -190,7 +190,7 @@ def edited(folder, **changes):
         ),
         ({"fit__materials__marble__thickness": -1.0}, "thickness"),
         ({"fit__materials__marble__thickness": float("inf")}, "thickness"),
-        ({"nuisance__coefficients__offset__west": 1e9}, "offset: 1e\\+09 dB is beyond -500 to 500"),
+        ({"nuisance__coefficients__offset__west": 1e9}, "offset: 1e\\+09 dB is outside -500 to 500"),
         ({"nuisance__coefficients__offset__west": None}, "offset.west = None: must be a number"),
         (
             {
@@ -228,8 +228,8 @@ def test_a_damaged_result_is_refused(folder, changes, message):
     ("name", "old", "new", "message"),
     [
         ("result-links.csv", "measured_db", "measured", "no column 'measured_db'"),
-        ("result-links.csv", "True", "maybe", "column 'has_path' holds something else"),
-        ("result-history.csv", "\n1,", "\nx,", "column 'call' holds something else"),
+        ("result-links.csv", "True", "maybe", "column 'has_path' has values of the wrong type"),
+        ("result-history.csv", "\n1,", "\nx,", "column 'call' has values of the wrong type"),
         ("result-history.csv", "\n1,1,", "\n1,1,,,\n1,1,", "not finite|something else"),
     ],
 )

@@ -162,7 +162,7 @@ def test_pieces_outside_the_judged_set_are_reported():
     assert "also includes" not in reason_text(alone.reason)
 
 
-@pytest.mark.parametrize(("slope", "words"), [(20.0, "other unknowns compensate"), (0.5, "too little")])
+@pytest.mark.parametrize(("slope", "words"), [(20.0, "other unknowns can compensate"), (0.5, "too little")])
 def test_reasons_for_an_unidentifiable_parameter_with_effect(slope, words):
     """No trade-off; links change by the given decibels over the range, with errors of 2 dB."""
     found = sample(

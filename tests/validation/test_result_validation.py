@@ -48,12 +48,12 @@ def test_a_validation_is_read_back(validation, tmp_path):
     ("change", "words"),
     [
         (lambda content: content.update(version=9), "version 9"),
-        (lambda content: content["links"]["block"].pop(), "block is not of the result's 60 links"),
+        (lambda content: content["links"]["block"].pop(), "block must have the result's 60 links"),
         (lambda content: content["links"].update(block=[7] * LINKS), "blocks or positions"),
         (lambda content: content["links"]["errors_db"][Model.CALIBRATED].__setitem__(20, None), "is missing"),
-        (lambda content: content["links"].update(errors_db={}), "is no validation"),
-        (lambda content: content.pop("links"), "is no validation"),
-        (lambda content: content.update(links=[]), "is no validation"),
+        (lambda content: content["links"].update(errors_db={}), "is not a validation"),
+        (lambda content: content.pop("links"), "is not a validation"),
+        (lambda content: content.update(links=[]), "is not a validation"),
     ],
 )
 def test_a_damaged_validation_is_refused(validation, tmp_path, change, words):

@@ -1,4 +1,4 @@
-"""The result of a calibration: its record, and what can be done with it."""
+"""The result of a calibration: its record, and methods to store, show, predict, suggest and export."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers
     from calibray.prediction.coverage_map import CoverageMap
 
-# What traces or evaluates paths is imported by the verbs that need it, so that a stored result is shown without it.
+# Methods that trace or evaluate paths import what they need themselves, so that a stored result is shown quickly.
 
 
 @final
@@ -44,13 +44,13 @@ class Result(Record):
 
         Args:
             folder: The folder.
-            allow_changed_inputs: Read it although its files changed since they were written.
+            allow_changed_inputs: Read it although its files were changed after they were written.
 
         Returns:
             The result.
 
         Raises:
-            InputError: The folder holds no result, one of another version, or one that was damaged or edited.
+            InputError: The folder has no result, or one of another version, or one that was damaged or edited.
         """
         return cls(**files.read(folder, allow_changed_inputs=allow_changed_inputs))
 
@@ -105,7 +105,7 @@ class Result(Record):
             allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
         Returns:
-            Path loss with nuisances [links], [dB]; +inf where no path leads.
+            Path loss with nuisances [links], [dB]; +inf for a link without a path.
 
         Raises:
             InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of
@@ -127,14 +127,13 @@ class Result(Record):
 
         Args:
             links: The links, or a table, as for `predict`; groups need not have been measured.
-            level: Probability that a measurement lies within.
+            level: Probability that the interval contains a measurement.
             progress: Called with the stage "tracing" after every launch.
             allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
         Returns:
-            One row per link: path_loss_db, lower_db, upper_db [dB], basis (what the interval was computed from), the
-            three in the measured quantity where that is not path loss, and remark, on a position where no antenna
-            should be.
+            One row per link: path_loss_db, lower_db, upper_db [dB]; basis, the source of the interval; the three in
+            the measured quantity if that is not path loss; and remark, on a position where no antenna should be.
 
         Raises:
             InputError: What `predict` refuses except unknown groups, the level is not between 0 and 1, or the

@@ -1,4 +1,4 @@
-"""The record of a finished calibration: sections of plain data, their files, and their wording. It calls nothing."""
+"""The record of a finished calibration: sections of plain data, their files, and their wording."""
 
 from calibray.result.files import FILES
 from calibray.result.held_out import HeldOutErrors, Judgement

@@ -35,14 +35,14 @@ VERSION: Final = 1
 """The version of `result.json` that is written and read."""
 
 FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result-scene.xml")
-"""What a result is written to; users have files called links.csv and scene.xml themselves."""
+"""Files of a result. The prefix keeps them apart from users' own links.csv and scene.xml."""
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
 VALIDATION_FILE: Final = "result-validation.json"
 
 
 class LinkCounts(Section):
-    """Numbers of links, for readers of the file; see `Record.counts`."""
+    """Numbers of links, for readers of the file; see `Record.counts`. They are not read back."""
 
     calibrated_on: Count
     held_out: Count
@@ -108,7 +108,7 @@ def write(
 ) -> None:
     """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
 
-    Each file is written next to its place and then moved there, so that none is ever half-written.
+    Each file is written under a temporary name and then renamed, so that none is ever half-written.
 
     Args:
         record: The result.
@@ -130,7 +130,7 @@ def write(
         export_scene(scene, record.materials, target / SCENE_FILE)
         write_text(target / LINKS_FILE, record.links.to_csv(index=False, float_format="%.10g"))
         write_text(target / HISTORY_FILE, record.history.to_csv(index=False, float_format="%.9g"))
-        # A validation of an earlier calibration must not stay.
+        # A validation of an earlier calibration does not belong to this result.
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
             write_validation(record.held_out, target, validation or {})
@@ -146,7 +146,7 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
 
     Args:
         folder: The folder.
-        allow_changed_inputs: Read it although its files changed since they were written.
+        allow_changed_inputs: Read it although its files were changed after they were written.
 
     Returns:
         The fields of a `Record`.
@@ -171,19 +171,19 @@ def _read_stored(source: Path) -> tuple[Stored, Study]:
         values = json.loads(source.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{source}: is no result of `calibray run` ({error}); name its --out folder"
+            f"{source}: is not a result of `calibray run` ({error}); give its --out folder"
         ) from None
     if not isinstance(values, dict):
-        raise InputError(f"{source}: holds no table; run the study again")
+        raise InputError(f"{source}: must contain a JSON object; run the study again")
     if values.get("version") != VERSION:
         raise InputError(
             f"{source}: has version {shortened(repr(values.get('version')))}, need {VERSION}; run the study again"
         )
     try:
-        # From JSON, lists pass for tuples and nothing else is converted.
+        # In JSON mode Pydantic accepts lists as tuples and converts nothing else.
         stored = Stored.model_validate_json(json.dumps(values))
     except RecursionError:
-        raise InputError(f"{source}: is nested too deep; run the study again") from None
+        raise InputError(f"{source}: is nested too deeply; run the study again") from None
     except ValidationError as error:
         refusal = explain(error, Stored, values, str(source))
         raise refusal from None
@@ -197,19 +197,20 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
     names, fit = list(study.parameters), stored.fit
     for key, values in (("parameters", fit.parameters), ("initial_parameters", fit.initial_parameters)):
         if sorted(values) != sorted(names):
-            odd = sorted(set(names) ^ set(values))[0]
+            different = sorted(set(names) ^ set(values))[0]
             raise InputError(
-                f"{source}: fit.{key}: {shortened(repr(odd))} is missing or not among the study's parameters; run "
+                f"{source}: fit.{key}: {shortened(repr(different))} is missing or not a parameter of the study; run "
                 "the study again"
             )
     for name in names:
         material, _, constant = name.rpartition(".")
         if material not in fit.materials:
             raise InputError(
-                f"{source}: fit.materials: {shortened(repr(material))} is calibrated and missing; run the study again"
+                f"{source}: fit.materials: {shortened(repr(material))} is missing, although it is calibrated; run the "
+                "study again"
             )
         value, calibrated = getattr(fit.materials[material], constant, None), fit.parameters[name]
-        # A coefficient of a law is no constant of the material itself.
+        # A coefficient of a law is not a constant of the material, so that `value` is None for it.
         if value is not None and abs(value - calibrated) > 1e-9 * max(abs(value), 1e-300):
             raise InputError(
                 f"{source}: fit.materials.{material}.{constant} = {value:g}, but fit.parameters has {calibrated:g}; "
@@ -218,17 +219,22 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
     uncertainty, nuisance = stored.uncertainty, stored.nuisance
     if unknown := sorted(set(uncertainty.intervals) - set(names)):
         raise InputError(
-            f"{source}: uncertainty.intervals: {shortened(repr(unknown[0]))} is no parameter of the study"
+            f"{source}: uncertainty.intervals: {shortened(repr(unknown[0]))} is not a parameter of the study; run the "
+            "study again"
         )
     lengths = {len(values) for values in uncertainty.draws.values()}
     if len(lengths) > 1 or (uncertainty.draws and not set(names) <= set(uncertainty.draws)):
-        raise InputError(f"{source}: uncertainty.draws: are not one of each parameter; run the study again")
+        raise InputError(
+            f"{source}: uncertainty.draws: must have the same number of draws for every parameter; run the study again"
+        )
     offset = {"offset"} if study.offset is not None else set()
     if set(nuisance.coefficients) != set(study.nuisance) | offset:
-        raise InputError(f"{source}: nuisance.coefficients: are not those of the study; run the study again")
-    if wild := [value for value in nuisance.offsets_db.values() if abs(value) > 500]:
         raise InputError(
-            f"{source}: nuisance.coefficients.offset: {wild[0]:g} dB is beyond -500 to 500; run the study again"
+            f"{source}: nuisance.coefficients: must have the terms of the study; run the study again"
+        )
+    if excessive := [value for value in nuisance.offsets_db.values() if abs(value) > 500]:
+        raise InputError(
+            f"{source}: nuisance.coefficients.offset: {excessive[0]:g} dB is outside -500 to 500; run the study again"
         )
 
 
@@ -238,7 +244,7 @@ def write_validation(held_out: HeldOutErrors, folder: Path, figures: dict[str, A
     Args:
         held_out: The errors.
         folder: The folder.
-        figures: What follows from them, for readers of the file.
+        figures: The figures of the validation, for readers of the file.
     """
     values = {
         "version": VERSION,
@@ -255,7 +261,7 @@ def write_validation(held_out: HeldOutErrors, folder: Path, figures: dict[str, A
 
 
 def _rounded(values: NDArray[np.float64]) -> list[float | None]:
-    """Values to 0.0001 dB; None for what is not finite, which JSON does not know."""
+    """Values rounded to 0.0001 dB; None for non-finite values, which JSON cannot express."""
     return [round(value, 4) if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -281,7 +287,7 @@ def read_validation(folder: Path, links: int) -> HeldOutErrors | None:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{file}: is no validation of `calibray validate` ({error}); validate again"
+            f"{file}: is not a validation of `calibray validate` ({error}); validate again"
         ) from None
 
 
@@ -300,16 +306,16 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
     lengths = {"block": len(block), "position": len(position)}
     lengths |= {name: len(errors) for name, errors in held_out.errors.items()}
     if wrong := [name for name, length in lengths.items() if length != links]:
-        raise InputError(f"{file}: {wrong[0]} is not of the result's {links} links; validate again")
+        raise InputError(f"{file}: {wrong[0]} must have the result's {links} links; validate again")
     judged = block >= 0
     if position.shape != (links, 3) or not judged.any() or block.max() >= len(held_out.labels):
-        raise InputError(f"{file}: blocks or positions are not those of a validation; validate again")
+        raise InputError(f"{file}: blocks or positions are invalid; validate again")
     if not all(np.isfinite(errors[judged]).all() for errors in held_out.errors.values()):
         raise InputError(f"{file}: an error of a judged link is missing; validate again")
     if not {Model.INITIAL, Model.CALIBRATED} <= set(held_out.errors):
         raise InputError(
-            f"{file}: is no validation of `calibray validate` (a model is missing); validate again"
+            f"{file}: is not a validation of `calibray validate` (a model is missing); validate again"
         )
     if not 0 < held_out.level < 1:
-        raise InputError(f"{file}: level = {held_out.level:g} is not between 0 and 1; validate again")
+        raise InputError(f"{file}: level = {held_out.level:g}: must be between 0 and 1; validate again")
     return held_out

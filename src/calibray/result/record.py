@@ -1,4 +1,4 @@
-"""The record of a finished calibration, in sections; `calibration.result.Result` adds the verbs."""
+"""The record of a finished calibration in sections; `calibration.result.Result` adds the methods."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Fit:
         materials: All materials of the scene at its carrier, with the calibrated values.
         laws: Coefficients itu_a to itu_d of ITU-R P.2040 by material, where one of them is a parameter.
         rmse_db: RMSE over the calibration links (paper eq. 1) [dB].
-        initial_rmse_db: The same with the initial materials and no nuisance [dB].
-        nuisance_only_rmse_db: The same with the initial materials and fitted nuisances [dB]; None without nuisances.
+        initial_rmse_db: RMSE with the initial materials and no nuisance [dB].
+        nuisance_only_rmse_db: RMSE with the initial materials and fitted nuisances [dB]; None without nuisances.
         log_distance_rmse_db: RMSE of a log-distance model fitted to the calibration links [dB].
         retrace_gap_db: Largest change of a calibration link's path loss when the scene is traced again with the
             calibrated materials [dB]; None where the paths do not depend on the materials.
@@ -63,8 +63,8 @@ class Accuracy:
 
     Attributes:
         holdout_rmse_db: RMSE of the calibrated model [dB].
-        initial_holdout_rmse_db: The same with the initial materials and no nuisance [dB].
-        nuisance_only_holdout_rmse_db: The same with the initial materials and fitted nuisances [dB].
+        initial_holdout_rmse_db: RMSE with the initial materials and no nuisance [dB].
+        nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model [dB].
         judgement: The calibrated model compared with its best baseline.
         residual_db: Standard deviation of a link's residual that predictions assume [dB]; None where unknown.
@@ -124,11 +124,11 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What predictions use.
+    """The model that predictions use.
 
     Attributes:
         model: The model that validation chose; None without validation, where the calibrated model is used.
-        residual_field: The correlated part of the residuals; None where they show none.
+        residual_field: The correlated part of the residuals; None where they are uncorrelated.
     """
 
     model: PredictionModel | None = None
@@ -143,7 +143,7 @@ class Cost:
         rt_calls: RT calls of the method, those answered by the ledger included.
         ledger_hits: RT calls that the ledger answered.
         seconds: Time of the method, without tracing [s].
-        trace_seconds: Time of tracing and loading before [s].
+        trace_seconds: Time of tracing and loading before the search [s].
         uncertainty_replays: Replays for intervals and draws.
         uncertainty_seconds: Their time [s].
         cheap_replays: Replays of the cheap model; none of them is an RT call.
@@ -162,7 +162,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What the result was made from.
+    """The inputs of the calibration.
 
     Attributes:
         files: SHA-256 of every file of the scene and the antennas, by path; empty where unknown.
@@ -177,7 +177,7 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record:
-    """A finished calibration, without verbs: abstract, `calibration.result.Result` is the final class.
+    """The data of a finished calibration: abstract; `calibration.result.Result` is the final class.
 
     Attributes:
         study: The study, with the method, seed and engine that ran.
@@ -185,9 +185,9 @@ class Record:
         accuracy: Accuracy on held-out links.
         uncertainty: Intervals, draws, warnings.
         nuisance: Coefficients of the nuisances.
-        prediction: What predictions use.
+        prediction: The model that predictions use.
         cost: RT calls, replays and time.
-        provenance: What the result was made from.
+        provenance: The inputs of the calibration.
         links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
             has_path, held_out, change on tracing again [dB]; positions tx_x to rx_z [m]; where they apply: group,
             frequency [Hz], path loss with the nuisances alone and of the prediction model [dB], the values in the
@@ -234,7 +234,7 @@ class Record:
 
     @property
     def initial_rmse_db(self) -> float:
-        """The same with the initial materials and no nuisance [dB]."""
+        """RMSE over the calibration links with the initial materials and no nuisance [dB]."""
         return self.fit.initial_rmse_db
 
     @property
@@ -249,7 +249,7 @@ class Record:
 
     @property
     def counts(self) -> dict[str, Any]:
-        """Numbers of links, and the rows that need a look.
+        """Numbers of links, and rows with possible problems.
 
         Held-out links count only where the hold-out RMSE includes them.
         """

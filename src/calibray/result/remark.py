@@ -1,4 +1,4 @@
-"""Remarks: warnings and advice about a calibration, as data. `wording` makes sentences of them."""
+"""Remarks: warnings and advice about a calibration, as data. `wording` turns them into sentences."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class RemarkKind(StrEnum):
-    """What a remark says; the comments name the values of each."""
+    """Kinds of remarks; the comments name the values of each."""
 
     CORRELATED_NOISE = "correlated noise"  # weight, gaussian_weight
     HEAVY_TAILS = "heavy tails"  # weight, gaussian_weight
@@ -24,7 +24,7 @@ class RemarkKind(StrEnum):
 
 
 Value = float | int | bool | str | list[str] | list[float] | list[list[float]]
-"""What JSON can hold of a remark."""
+"""Types of a remark's values, all of which JSON can express."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Remark:
     """One warning or piece of advice.
 
     Attributes:
-        kind: What it says.
+        kind: The kind of remark.
         values: Its numbers and names; see `RemarkKind`.
     """
 

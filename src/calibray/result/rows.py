@@ -17,7 +17,7 @@ LINKS: Final = {
 }  # fmt: skip
 HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f", "seconds": "f"}
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
-"""The columns of each file, and the kinds of their numbers."""
+"""Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
 
 OPTIONAL: Final = ("leverage", "depth", "chosen_db")
 """Columns of numbers that are optional."""
@@ -32,44 +32,38 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
     Args:
         folder: The result's folder.
         name: The file's name.
-        columns: The columns that it must have, and the kinds of their values: "i", "f" or "b".
+        columns: The required columns and the kinds of their values: "i", "f" or "b".
 
     Returns:
-        Its rows; further columns as they are.
+        The rows, with any further columns unchanged.
 
     Raises:
-        InputError: The file does not exist, or lacks a column, or holds something else in it.
+        InputError: The file does not exist, lacks a column, or has invalid values in one.
     """
     file = folder / name
     if not exists(file):
-        raise InputError(f"{file}: is no file; name the --out folder of `calibray run`")
+        raise InputError(f"{file}: does not exist; give the --out folder of `calibray run`")
     try:
-        # A group may be called 7, or NA.
+        # Group labels such as 7 or NA must stay text.
         table = pd.read_csv(file, converters={"group": str})
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{file}: is no table of `calibray run` ({str(error).splitlines()[0]}); name its --out folder"
+            f"{file}: is not a table of `calibray run` ({str(error).splitlines()[0]}); give its --out folder"
         ) from None
     for column, kind in columns.items():
         if column not in table:
             raise InputError(f"{file}: has no column {column!r}; run the study again")
-        found = table[column].dtype.kind
-        # Whole numbers pass for numbers; a table without rows tells no kinds.
-        if len(table) and found != kind and not (kind == "f" and found == "i"):
-            raise InputError(
-                f"{file}: column {column!r} holds something else than it should; run the study again"
-            )
+        actual = table[column].dtype.kind
+        # Whole numbers are valid floats. A table without rows has no kinds.
+        if len(table) and actual != kind and not (kind == "f" and actual == "i"):
+            raise InputError(f"{file}: column {column!r} has values of the wrong type; run the study again")
         if kind == "f":
             table[column] = table[column].astype(float)
         if column in FINITE and not np.isfinite(table[column]).all():
-            raise InputError(
-                f"{file}: column {column!r} holds a value that is not finite; run the study again"
-            )
+            raise InputError(f"{file}: column {column!r} has a value that is not finite; run the study again")
     if not len(table):
         raise InputError(f"{file}: has no rows; run the study again")
-    places = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
-    if strange := [column for column in places if table[column].dtype.kind not in "if"]:
-        raise InputError(
-            f"{file}: column {strange[0]!r} holds something else than it should; run the study again"
-        )
-    return table.astype(dict.fromkeys(places, float))
+    numeric = [column for column in table if str(column)[:3] in ("tx_", "rx_") or column in OPTIONAL]
+    if invalid := [column for column in numeric if table[column].dtype.kind not in "if"]:
+        raise InputError(f"{file}: column {invalid[0]!r} has values of the wrong type; run the study again")
+    return table.astype(dict.fromkeys(numeric, float))

@@ -1,4 +1,4 @@
-"""Verdicts: what the measurements say about one parameter, as data. `wording` makes sentences of them."""
+"""Verdicts: what the measurements say about one parameter, as data. `wording` turns them into sentences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Verdict(StrEnum):
 
 
 class ReasonKind(StrEnum):
-    """Why a verdict is what it is; the comments name the values of each."""
+    """Reasons for a verdict; the comments name the values of each."""
 
     WIDTH = "width"  # share of the range; ranges outside the judged set: lower, upper, weight
     SEEN_BUILDINGS = "seen buildings"  # share of the range for the buildings that were measured
@@ -35,18 +35,18 @@ class ReasonKind(StrEnum):
     TOO_FEW_DRAWS = "too few draws"  # share of the range that the draws cannot rule out
     TOO_FEW_CALLS = "too few calls"  # calls
     NO_NOISE = "no noise"
-    TOO_MANY_LINKS = "too many links"  # limit; the interval is that of the curvature
-    TOO_EXPENSIVE = "too expensive"  # the interval is that of the curvature
+    TOO_MANY_LINKS = "too many links"  # limit; the interval follows from the curvature
+    TOO_EXPENSIVE = "too expensive"  # the interval follows from the curvature
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a verdict is what it is.
+    """The reason for a verdict.
 
     Attributes:
-        kind: The reason.
+        kind: The kind of reason.
         values: Its numbers and names; see `ReasonKind`.
-        ranges: Ranges or modes that it speaks of, with their weights last.
+        ranges: Ranges or modes that the reason names, each with its weight last.
     """
 
     kind: ReasonKind
@@ -64,7 +64,7 @@ class Interval:
         upper: Upper end, of the highest piece.
         verdict: What the links say about the parameter.
         pieces: Lower and upper end of every piece, ascending, where the interval was computed from draws.
-        reason: Why the verdict is what it is.
+        reason: The reason for the verdict.
         approximate: Whether an emulator replaced an engine that gives no derivatives.
     """
 
@@ -78,7 +78,7 @@ class Interval:
 
     @property
     def label(self) -> str:
-        """The verdict as it is shown."""
+        """The verdict as displayed."""
         return f"{self.verdict}, approximate" if self.approximate else str(self.verdict)
 
     def contains(self, value: float, slack: float = 0.0) -> bool:

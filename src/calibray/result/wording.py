@@ -1,4 +1,4 @@
-"""The sentences of a result, for terminal, page and JSON. Statistics return data; only this module makes text of it."""
+"""The sentences of a result, for terminal, page and JSON. Statistics return data; this module turns it into text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import Interval, Reason, ReasonKind
 
 MOST_ODDS: Final = 1000.0
-"""Odds beyond which the number itself is not reported."""
+"""Largest odds that are reported as a number."""
 
 SHOWN_PIECES: Final = 3
 """Most pieces of an interval that are listed one by one."""
@@ -65,8 +65,8 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.WIDTH: _width,
     ReasonKind.SEPARATE_RANGES: _separate,
     ReasonKind.SEEN_BUILDINGS: lambda values, _: (
-        f"for the buildings that were measured it is known to {values['share']:.0%} of the range; other buildings of "
-        "this material may differ"
+        f"for the measured buildings the value is known to {values['share']:.0%} of the range; other buildings of this "
+        "material may differ"
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
         f"the interval reaches the {values['side']} bound: the links only show that the value is "
@@ -79,11 +79,11 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         f"it trades off with {values['parameter']} (rank correlation {values['correlation']:.2f})"
     ),
     ReasonKind.CONFOUNDED: lambda values, _: (
-        f"links change by up to {values['change_db']:.1f} dB over its range, but other unknowns compensate: an offset, "
-        "or noise that links share"
+        f"links change by up to {values['change_db']:.1f} dB over its range, but other unknowns can compensate: an "
+        "offset, or noise that links share"
     ),
     ReasonKind.NOISE: lambda values, _: (
-        f"links change by up to {values['change_db']:.1f} dB over its range, too little against noise of "
+        f"links change by up to {values['change_db']:.1f} dB over its range, too little compared with noise of "
         f"{values['noise_db']:.1f} dB"
     ),
     ReasonKind.TOO_FEW_LINKS: lambda values, _: (
@@ -120,8 +120,8 @@ def remark_text(remark: Remark) -> str:
 
 def _noise_remark(finding: str) -> Callable[[dict[str, Any]], str]:
     return lambda values: (
-        f"{finding} (weight {values['weight']:.2f}, independent Gaussian noise {values['gaussian_weight']:.2f}). The "
-        "intervals allow for it."
+        f"{finding} (posterior weight {values['weight']:.2f}, independent Gaussian noise "
+        f"{values['gaussian_weight']:.2f}). The intervals allow for it."
     )
 
 
@@ -129,7 +129,7 @@ _CAUSES: Final = {
     "correlated": "neighbouring links share part of their noise, so that many links count as few",
     "student-t": "outliers count less where noise has heavy tails",
     "heterogeneous": "links that depend on single buildings count less where buildings differ",
-    "gaussian": "the noise differs in a way that squares do not show",
+    "gaussian": "their noise model differs from the one that RMSE assumes",
 }
 
 
@@ -148,7 +148,7 @@ def _outside_interval(values: dict[str, Any]) -> str:
     text = (
         f"The candidate of least RMSE is not the most probable one: {parameters}. RMSE treats the "
         f"noise of all links as independent; the intervals do not, since {_CAUSES[values['cause']]}. The most probable "
-        f"values are {times} times as probable. Do not take the values of least RMSE for the materials' constants."
+        f"values are {times} times as probable. Do not use the values of least RMSE as constants of the materials."
     )
     if values["blocks"]:
         return text + " Held-out blocks show which model predicts best."
@@ -162,8 +162,8 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     replay = ", with the corrected replay of its scene" if values["replay"] else ""
     return (
         f"The intervals are approximate: the engine {values['engine']!r} gives no derivatives, so an emulator was "
-        f"fitted to {values['calls']} of its calls{replay}. It predicts the better half of these calls to "
-        f"{values['error_db']:.2g} dB, each from all others."
+        f"fitted to {values['calls']} of its calls{replay}. In cross-validation it predicts the "
+        f"better half of these calls to {values['error_db']:.2g} dB."
     )
 
 
@@ -176,25 +176,25 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.UNDECLARED_OFFSET: lambda values: (
         f"The data show an undeclared offset of {values['offset_db']:+.1f} dB, standard error {values['error_db']:.1f} "
         f"dB. With it the RMSE would be {values['rmse_db']:.2f} instead of {values['rmse_without_db']:.2f} dB. Add "
-        "[offset] if cables or antenna gains may be off."
+        "[offset] if cable losses or antenna gains are uncertain."
     ),
     RemarkKind.MISSED_OPTIMUM: lambda values: (
-        f"The method missed the optimum: draws reach {values['draws_db']:.2f} dB, the method {values['found_db']:.2f} "
-        "dB. The intervals are those around the optimum."
+        f"The method missed the optimum: draws from the posterior reach an RMSE of {values['draws_db']:.2f} dB, the "
+        f"method {values['found_db']:.2f} dB. The intervals are around the optimum."
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
-        "Too few draws fit the data among so many parameters. The intervals are rough, and a mode may be missing. "
+        "Too few draws fit the data for this number of parameters. The intervals are rough, and a mode may be missing. "
         "Calibrate fewer parameters, or give them priors."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
-    RemarkKind.NO_CHEAP_MODEL: lambda values: f"There is no cheap model: {values['cause']}.",
+    RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
 }
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """Whether calibration helped on held-out links, over which baseline, by how much, and how certain that is.
+    """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly.
 
     Args:
         judgement: The comparison.
@@ -245,8 +245,8 @@ def chosen_model_text(record: Record) -> str:
     if model is None or model.name == Model.CALIBRATED or calibrated_db is None:
         return ""
     return (
-        f"On held-out blocks the prediction model {model.name!r} has {model.residual_db:.2f} dB, the calibrated model "
-        f"{calibrated_db:.2f} dB."
+        f"On held-out blocks the prediction model {model.name!r} has an RMSE of {model.residual_db:.2f} dB, the "
+        f"calibrated model {calibrated_db:.2f} dB."
     )
 
 
