@@ -98,7 +98,7 @@ def test_prediction_where_no_path_leads_is_infinite(result):
     [
         (
             lambda links: links.assign(half="north"),
-            "group 'north' has no calibrated offset; known: east, west",
+            "group 'north' has no calibrated offset; the calibrated groups are east, west",
         ),
         (lambda links: links.drop(columns="half"), "no column 'half'"),
         (lambda links: links.drop(columns="rx_z"), "no column 'rx_z'"),
