@@ -162,8 +162,8 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             intervals=certainty.intervals,
             draws=certainty.draws,
             noise=certainty.noise,
-            undeclared_offset_db=certainty.free_offset_db,
-            undeclared_offset_error_db=certainty.free_offset_error_db,
+            undeclared_offset_db=certainty.undeclared_offset_db,
+            undeclared_offset_error_db=certainty.undeclared_offset_error_db,
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
                 *certainty.remarks,

@@ -87,8 +87,8 @@ class Term:
             return replace(self, value=value, group=np.zeros(len(links), dtype=np.int64))
         link_labels = _labels(self.name, links, labels)
         index = np.minimum(np.searchsorted(self.labels, link_labels), len(self.labels) - 1)
-        known = np.array(self.labels)[index] == link_labels
-        return replace(self, value=value, group=np.where(known, index, -1))
+        matches = np.array(self.labels)[index] == link_labels
+        return replace(self, value=value, group=np.where(matches, index, -1))
 
 
 def make_term(
@@ -274,12 +274,12 @@ class Nuisance:
         for term in self.terms:
             columns = np.arange(first, first + len(term.labels))
             first += len(term.labels)
-            known, unknown = columns[measured[columns]], columns[~measured[columns]]
-            if len(known) and len(unknown):
-                filled[:, unknown] = coefficients[:, known].mean(axis=1, keepdims=True)
+            fitted, missing = columns[measured[columns]], columns[~measured[columns]]
+            if len(fitted) and len(missing):
+                filled[:, missing] = coefficients[:, fitted].mean(axis=1, keepdims=True)
                 # Variance between groups, plus that of their mean.
-                spread = np.std(coefficients[0, known], ddof=1) if len(known) > 1 else UNKNOWN_DB
-                deviation[unknown] = spread * np.sqrt(1 + 1 / len(known))
+                spread = np.std(coefficients[0, fitted], ddof=1) if len(fitted) > 1 else UNKNOWN_DB
+                deviation[missing] = spread * np.sqrt(1 + 1 / len(fitted))
         return filled, deviation
 
     def _per_column(self, values: list[float]) -> NDArray[np.float64]:

@@ -85,8 +85,8 @@ class Certainty:
         posterior: All draws for the measured buildings, in the search space; None if none were made.
         means: Draws of the means over all buildings; the posterior itself if buildings do not differ.
         noise: Posterior weights of the kinds of noise, and of an undeclared offset.
-        free_offset_db: The best offset in addition to the study's model, if that has none [dB].
-        free_offset_error_db: Its standard error [dB].
+        undeclared_offset_db: The best offset in addition to the study's model; None if the study declares one [dB].
+        undeclared_offset_error_db: Its standard error [dB].
         remarks: Warnings and advice.
         calls: Replays that the draws took.
         seconds: Time of the assessment [s].
@@ -97,8 +97,8 @@ class Certainty:
     posterior: Draws | None = None
     means: Draws | None = None
     noise: dict[str, float] = field(default_factory=dict)
-    free_offset_db: float | None = None
-    free_offset_error_db: float | None = None
+    undeclared_offset_db: float | None = None
+    undeclared_offset_error_db: float | None = None
     remarks: tuple[Remark, ...] = ()
     calls: int = 0
     seconds: float = 0.0
@@ -207,7 +207,9 @@ def _assess(
     relevant, least = relevant_minima(minima, squares, freedom), float(squares.min())
     offset = fit_undeclared_offset(problem, relevant, least, freedom)
     assessment = Certainty(
-        free_offset_db=offset.offset_db, free_offset_error_db=offset.error_db, remarks=offset.remarks
+        undeclared_offset_db=offset.offset_db,
+        undeclared_offset_error_db=offset.error_db,
+        remarks=offset.remarks,
     )
     if problem.objective.num_counted > MAX_LINKS:
         reason = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": MAX_LINKS})
@@ -225,7 +227,7 @@ def _assess(
     density = density.without_negligible(at_minima)
     posterior = _draw(density, engines, starts, covariances(problem, starts, freedom), budget, progress)
     at_draws = density(posterior.resampled(NOISE_DRAWS))
-    noise = density.kinds(np.exp(at_draws - np.logaddexp.reduce(at_draws, axis=1, keepdims=True)))
+    noise = density.noise_weights(np.exp(at_draws - np.logaddexp.reduce(at_draws, axis=1, keepdims=True)))
     means = population_means(density, posterior, at_draws, tried)
     intervals = _intervals(density, posterior, means, local)
     log_odds = float(posterior.density.max() - np.logaddexp.reduce(at_minima[0]))

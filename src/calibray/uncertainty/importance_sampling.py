@@ -179,8 +179,8 @@ def sample(
         proposal = _Proposal(_kernels(unit, flattened, random), _Histograms.of(unit, flattened))
         new = _inside(proposal.draw(batch, random))
         log_proposals = [
-            np.concatenate([known, earlier.log_density(new)])
-            for known, earlier in zip(log_proposals, proposals, strict=True)
+            np.concatenate([values, earlier.log_density(new)])
+            for values, earlier in zip(log_proposals, proposals, strict=True)
         ]
         unit = np.concatenate([unit, new])
         log_posterior = np.concatenate([log_posterior, density(lower + new * width)])

@@ -115,7 +115,7 @@ class PosteriorDensity:
         """Number of replays per point."""
         return 1 + (len(corners(len(self.problem.parameters))) if self.marginal.spread else 0)
 
-    def kinds(self, share: NDArray[np.float64]) -> dict[str, float]:
+    def noise_weights(self, share: NDArray[np.float64]) -> dict[str, float]:
         """Posterior weight of each kind of noise, and of an undeclared offset.
 
         Args:

@@ -68,13 +68,11 @@ class Verdict:
 
     Attributes:
         pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
-        best: Value at the draw of highest density.
         name: The verdict.
         reason: Its reason.
     """
 
     pieces: tuple[tuple[float, float], ...]
-    best: float
     name: VerdictName
     reason: Reason
 
@@ -146,7 +144,7 @@ def verdicts(
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
             others = _outlying_pieces(index, pieces, reported, draws, axes)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
-        result.append(Verdict(reported, float(best[index]), name, reason))
+        result.append(Verdict(reported, name, reason))
     return result
 
 
