@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import http.server
 import json
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -278,6 +280,173 @@ def test_an_unsuitable_height_model_is_refused(tmp_path, bounds, spacing, messag
     (tmp_path / "no.tif").write_text("text")
     with pytest.raises(InputError, match="cannot be read"):
         read_terrain(tmp_path / "no.tif", FRAME, (0, 0, 1, 1))
+
+
+# Formats, bounds and units of what GDAL opens
+
+
+@pytest.fixture
+def requests():
+    """A server on this machine, and the paths that were asked of it."""
+    paths = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            paths.append(self.path)
+            self.send_error(404)
+
+        do_HEAD = do_GET
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", paths
+    server.shutdown()
+    server.server_close()
+
+
+VECTORS = {
+    "vrt": '<OGRVRTDataSource><OGRVRTLayer name="x"><SrcDataSource>/vsicurl/{url}/a.geojson</SrcDataSource>'
+    "</OGRVRTLayer></OGRVRTDataSource>",
+    "wfs": "<OGRWFSDataSource><URL>{url}/wfs</URL></OGRWFSDataSource>",
+    "gdalg": '{{"type": "gdal_streamed_alg", "command_line": "gdal vector convert /vsicurl/{url}/a.geojson"}}',
+    "geojson": '{{"type": "FeatureCollection", "features": [], "type": "gdal_streamed_alg", "command_line": '
+    '"gdal vector convert /vsicurl/{url}/a.geojson"}}',
+    "gml": '<gml:FeatureCollection xmlns:gml="http://www.opengis.net/gml" '
+    'xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" xsi:schemaLocation="x {url}/a.xsd"/>',
+}
+RASTERS = {
+    "vrt": '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand band="1"><SimpleSource>'
+    "<SourceFilename>/vsicurl/{url}/a.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>",
+    "wms": '<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/a</ServerUrl></Service></GDAL_WMS>',
+    "stac": '{{"type": "Feature", "stac_version": "1.0.0", "assets": {{"a": {{"href": "{url}/a.tif"}}}}}}',
+}
+
+
+@pytest.mark.parametrize("kind", VECTORS)
+@pytest.mark.parametrize("ending", ["geojson", "gpkg", "shp"])
+def test_a_vector_file_that_refers_to_the_network_is_refused(tmp_path, requests, kind, ending):
+    url, paths = requests
+    file = tmp_path / f"town.{ending}"
+    file.write_text(VECTORS[kind].format(url=url))
+    with pytest.raises(InputError, match=r"none of the formats|cannot be read"):
+        read_footprints(file, 5.0)
+    assert not paths
+
+
+@pytest.mark.parametrize("kind", RASTERS)
+@pytest.mark.parametrize("ending", ["tif", "vrt"])
+def test_a_height_model_that_refers_to_the_network_is_refused(tmp_path, requests, kind, ending):
+    url, paths = requests
+    file = tmp_path / f"dem.{ending}"
+    file.write_text(RASTERS[kind].format(url=url))
+    with pytest.raises(InputError, match=r"cannot be read .*give a GeoTIFF"):
+        read_terrain(file, FRAME, (-10, -10, 10, 10))
+    assert not paths
+
+
+def test_a_mask_in_another_file_is_refused(tmp_path, requests):
+    url, paths = requests
+    file = height_model(tmp_path / "dem.tif")
+    (tmp_path / "dem.tif.msk").write_text(RASTERS["vrt"].format(url=url))
+    with pytest.raises(InputError, match=r"its mask dem\.tif\.msk is not read"):
+        read_terrain(file, FRAME, (-10, -10, 10, 10))
+    assert not paths
+    (tmp_path / "dem.tif.msk").unlink()
+    auxiliary = tmp_path / "dem.tif.aux.xml"
+    auxiliary.write_text("<PAMDataset><PAMRasterBand><Scale>0.1</Scale></PAMRasterBand></PAMDataset>")
+    with pytest.raises(InputError, match=r"dem\.tif\.aux\.xml states Scale, which is not read"):
+        read_terrain(file, FRAME, (-10, -10, 10, 10))
+
+
+def rewrite(
+    source: Path, stored: str = "float64", crs: str = "EPSG:32632", unit: str = "", **changes
+) -> Path:
+    """A height model stored in another way, its numbers divided by `scale`."""
+    scale, offset = changes.pop("scale", 1.0), changes.pop("offset", 0.0)
+    with rasterio.open(source) as model:
+        profile = {**model.profile, "dtype": stored, "crs": crs, **changes}
+        heights = model.read(1)
+    with rasterio.open(source, "w", **profile) as model:
+        model.write(((heights - offset) / scale).astype(stored), 1)
+        model.scales, model.offsets = (scale,), (offset,)
+        if unit:
+            model.units = (unit,)
+    return source
+
+
+@pytest.mark.parametrize(
+    ("change", "factor"),
+    [
+        ({"stored": "int32", "scale": 0.001, "offset": 100.0, "nodata": None}, 1.0),
+        ({"unit": "ft"}, 0.3048),
+        ({"unit": "US survey foot"}, 1200 / 3937),
+        ({"crs": "EPSG:32632+8228"}, 0.3048),
+        ({"crs": "EPSG:32632+5773", "unit": "m"}, 1.0),
+    ],
+    ids=str,
+)
+def test_scale_offset_and_unit_of_a_height_model_are_respected(tmp_path, change, factor):
+    file = rewrite(height_model(tmp_path / "dem.tif"), **change)
+    terrain = read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100), spacing=10.0)
+    east, north = np.meshgrid(terrain.x, terrain.y)
+    np.testing.assert_allclose(terrain.z, factor * (500 + 0.05 * east + 0.02 * north), atol=2e-3)
+
+
+LOCAL = 'ENGCRS["site",EDATUM["site"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"unit": "cubits"}, "the unit 'cubits' of its heights is not known"),
+        ({"unit": "m", "crs": "EPSG:32632+8228"}, "in another unit"),
+        ({"crs": LOCAL}, "has no place on the globe"),
+        ({"crs": "EPSG:5773"}, "has no place on the globe|no reference system"),
+        ({"transform": Affine(0, 0, 5, 0, 0, 6)}, "is not a grid|cannot be read|no reference|does not cover"),
+        ({"transform": Affine(float("nan"), 0, 5, 0, -1, 6)}, "is not a grid"),
+    ],
+)
+def test_a_height_model_without_a_usable_grid_is_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_terrain(rewrite(height_model(tmp_path / "dem.tif"), **change), FRAME, (-10, -10, 10, 10))
+
+
+@pytest.mark.parametrize("gap", [-32768.0, -9999.0, 32767.0, -3.4e38])
+def test_an_undeclared_gap_is_no_height(tmp_path, gap):
+    file = height_model(tmp_path / "dem.tif", missing=True)
+    with rasterio.open(file) as model:
+        heights, profile = model.read(1), model.profile
+    heights[heights == -9999.0] = gap
+    with rasterio.open(file, "w", **{**profile, "nodata": None}) as model:
+        model.write(heights, 1)
+    with pytest.raises(InputError, match=r"12 of \d+ cells hold no height on land, such as .*a_nodata"):
+        read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
+
+
+@pytest.mark.parametrize("tiled", [True, False])
+def test_a_height_model_of_enormous_size_is_refused_before_it_is_read(tmp_path, tiled):
+    """A file of some kilobytes that declares 10^10 heights."""
+    origin = Frame.utm(11.5755, 48.1374)
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=100_000, height=100_000, count=1, dtype="float64",
+        crs="EPSG:32632", transform=Affine(0.01, 0, origin.easting - 500, 0, -0.01, origin.northing + 500),
+        sparse_ok=True, compress="deflate", **({"tiled": True} if tiled else {"blockysize": 100_000}),
+    ):  # fmt: skip
+        pass
+    with pytest.raises(InputError, match=r"more than 25,000,000|is stored in blocks of"):
+        read_terrain(tmp_path / "dem.tif", origin, (-400, -400, 400, 400))
+
+
+def test_a_vector_file_that_declares_more_than_fits_into_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("calibray.scenes.authoring.geodata.available_memory", lambda: 1000)
+    with pytest.raises(InputError, match="declares 3 features, more than fit into memory"):
+        read_footprints(layer(tmp_path / "town.gpkg", [1.0, 2.0, 3.0], "GPKG"), "hoehe")
+    (tmp_path / "town.geojson").write_text('{"type": "FeatureCollection", "features": []}' + " " * 100)
+    with pytest.raises(InputError, match=r"need about .* of memory; convert"):
+        read_footprints(tmp_path / "town.geojson", 5.0)
 
 
 # Without the libraries

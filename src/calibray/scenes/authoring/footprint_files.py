@@ -23,9 +23,9 @@ from calibray.scenes.authoring.footprints import (
     parse_length,
     project,
 )
+from calibray.scenes.authoring.geodata import read_features
 from calibray.support.extras import library
 from calibray.support.messages import did_you_mean, shortened
-from calibray.support.output_files import exists
 
 _KEYS: Final = ("building", "building:part")
 _SOURCES: Final[tuple[HeightSource, ...]] = ("default", "levels", "height")
@@ -98,7 +98,8 @@ def read_footprints(
     """Read footprints with their heights from a vector file.
 
     Args:
-        path: Any vector file that GDAL reads and that states its reference system.
+        path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
+            system.
         height: Column with the heights of the buildings above the ground [m], or one height for all.
         bottom: Column with the heights at which the buildings begin [m], or one height for all.
         name: Column with their names; by default they are numbered.
@@ -147,20 +148,10 @@ def _local_frame(outlines: NDArray[Any], crs: str) -> Frame:
 
 def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArray[Any]], str]:
     """Polygons [n], the columns of their table, and the reference system."""
-    pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
-    # A geodatabase is a folder.
-    if not (path.is_dir() or exists(path)):
-        raise InputError(f"footprints {path}: does not exist; check the path")
-    try:
-        meta, _, geometry, fields = pyogrio.raw.read(path, layer=layer)
-        outlines = shapely.from_wkb(geometry)
-    except (
-        pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, shapely.GEOSException, UnicodeDecodeError,
-    ) as error:  # fmt: skip
-        raise InputError(
-            f"footprints {path}: cannot be read ({error}); give GeoJSON, a Shapefile or a GeoPackage"
-        ) from None
-    if meta["crs"] is None:
+    shapely = library("shapely", "scenes")
+    features = read_features(path, layer)
+    outlines = features.outline
+    if features.crs is None:
         raise InputError(
             f"footprints {path}: has no reference system; add its .prj file, or convert it to GeoJSON"
         )
@@ -169,8 +160,8 @@ def _read(path: Path, layer: str | None) -> tuple[NDArray[Any], dict[str, NDArra
         raise InputError(
             f"footprints {path}: none of its {len(outlines)} features is a polygon; give outlines of buildings"
         )
-    columns = dict(zip(map(str, meta["fields"]), (values[is_polygon] for values in fields), strict=True))
-    return outlines[is_polygon], columns, str(meta["crs"])
+    columns = {name: values[is_polygon] for name, values in features.columns.items()}
+    return outlines[is_polygon], columns, features.crs
 
 
 def _column(path: Path, columns: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:

@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt
 
 from calibray.coordinates import Frame, transformer
 from calibray.errors import InputError
+from calibray.scenes.authoring.geodata import open_height_model
 from calibray.scenes.meshes import Mesh
-from calibray.support.extras import library
 
 MAX_POINTS: Final = 4_000_000
 """Largest number of points of a ground sheet, which bounds memory."""
@@ -102,7 +102,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     """Read the ground from a height model.
 
     Args:
-        path: A GeoTIFF, or another raster that GDAL reads and that states its reference system; heights in metres.
+        path: A GeoTIFF that states its reference system; its scale, offset, unit and missing heights are respected.
         frame: The scene's frame.
         bounds: The area to cover in the frame: west, south, east and north [4], [m].
         spacing: Width of the grid's cells [m]; by default that of the model, but at least 1 m.
@@ -112,43 +112,28 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
         on water, the nearest height is taken and counted.
 
     Raises:
-        InputError: The file does not exist, cannot be read, states no reference system, does not cover the bounds or
-            has no height in them, or the grid would be too fine.
+        InputError: The file does not exist, cannot be read or used (see `open_height_model`), does not cover the bounds
+            or has no height in them, or the grid would be too fine.
     """
     path = Path(path)
-    rasterio = library("rasterio", "scenes")
-    if not path.is_file():
-        raise InputError(f"height model {path}: does not exist; check the path")
     west, south, east, north = np.asarray(bounds, dtype=float)
     share = np.linspace(0, 1, 21)
     sample_x, sample_y = np.meshgrid(west + (east - west) * share, south + (north - south) * share)
-    try:
-        with rasterio.open(path) as model:
-            if model.crs is None:
-                raise InputError(
-                    f"height model {path}: has no reference system; give a GeoTIFF that states it"
-                )
-            crs, affine = model.crs.to_wkt(), model.transform
-            column, row = _pixels(sample_x, sample_y, frame, crs, affine)
-            # One cell more on each side, for the interpolation.
-            first = np.floor([row.min() - 1, column.min() - 1]).astype(int)
-            last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
-            if (
-                column.min() < 0
-                or row.min() < 0
-                or column.max() > model.width - 1
-                or row.max() > model.height - 1
-            ):
-                centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
-                raise InputError(
-                    f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
-                    f"around {centre.round(5).tolist()}; give a larger one, or lower the margin"
-                )
-            first, last = np.maximum(first, 0), np.minimum(last, [model.height - 1, model.width - 1])
-            window = rasterio.windows.Window.from_slices((first[0], last[0] + 1), (first[1], last[1] + 1))
-            heights = model.read(1, window=window, masked=True).astype(float)
-    except rasterio.errors.RasterioIOError as error:
-        raise InputError(f"height model {path}: cannot be read ({error}); give a GeoTIFF") from None
+    with open_height_model(path) as model:
+        dataset, affine = model.dataset, model.dataset.transform
+        column, row = _pixels(sample_x, sample_y, frame, model.crs, affine)
+        inside = (column >= 0) & (row >= 0) & (column <= dataset.width - 1) & (row <= dataset.height - 1)
+        if not inside.all():
+            centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
+            raise InputError(
+                f"height model {path}: does not cover the scene, {east - west:.0f} m x {north - south:.0f} m "
+                f"around {centre.round(5).tolist()}; give a larger one, or lower the margin"
+            )
+        # One cell more on each side, for the interpolation.
+        first = np.maximum(np.floor([row.min() - 1, column.min() - 1]).astype(int), 0)
+        last = np.ceil([row.max() + 1, column.max() + 1]).astype(int)
+        last = np.minimum(last, [dataset.height - 1, dataset.width - 1])
+        crs, heights = model.crs, model.read(first, last)
     filled, repairs = _fill(path, heights)
     if spacing is None:
         spacing = max(float(np.ptp(sample_x) / np.ptp(column)), 1.0)

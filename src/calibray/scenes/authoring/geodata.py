@@ -1,0 +1,359 @@
+"""Vector files and height models, opened with a closed list of drivers.
+
+GDAL has drivers that fetch network addresses, open other files or run pipelines that a file names (VRT, WMS, WFS,
+GDALG), and it chooses the driver by the file's content. Only formats that hold their data themselves are opened here,
+recognised by their first bytes, and what they declare is bounded before anything is read.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.coordinates import WGS84, parse_crs
+from calibray.errors import InputError
+from calibray.support.extras import library
+from calibray.support.memory import available_memory
+from calibray.support.messages import first_line, shortened
+from calibray.support.output_files import exists
+
+RASTER_DRIVER: Final = "GTiff"
+"""The driver of rasters: GeoTIFF, cloud-optimized ones included."""
+
+VECTOR_FORMATS: Final = "GeoJSON, a Shapefile, a GeoPackage, a FlatGeobuf file or an Esri geodatabase"
+"""Formats of vector files, for messages."""
+
+MOST_CELLS: Final = 25_000_000
+"""Cells of a height model that are read at most; filling gaps takes about 40 bytes for each."""
+
+LARGEST_BLOCK: Final = 2**28
+"""Largest block of a raster [bytes]; GDAL decompresses a block as a whole."""
+
+FEATURE_BYTES: Final = 500
+"""Memory of a feature with its outline and attributes [bytes], at least."""
+
+JSON_GROWTH: Final = 15
+"""Memory of parsed GeoJSON as a multiple of the file's size."""
+
+HEIGHTS: Final = (-1000.0, 10_000.0)
+"""Range of heights on land [m]; -32768 and -9999 are gaps that the file does not declare."""
+
+_MAGIC: Final = (
+    (b"SQLite format 3\0", "GPKG"),
+    (b"\0\0\x27\x0a", "ESRI Shapefile"),
+    (b"fgb\x03fgb", "FlatGeobuf"),
+)
+
+_METRES: Final = {
+    **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(
+        ("us survey foot", "us-ft", "ftus", "foot_us", "survey foot", "us_survey_foot"), 1200 / 3937
+    ),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), 0.01),
+    **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
+}
+"""Units of heights in metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of a vector file.
+
+    Attributes:
+        outline: Geometries [n].
+        columns: Attributes by name [n] each.
+        crs: Reference system of the geometries; None if the file states none.
+    """
+
+    outline: NDArray[Any]
+    columns: dict[str, NDArray[Any]]
+    crs: str | None
+
+
+def read_features(path: Path, layer: str | None) -> Features:
+    """Read a vector file.
+
+    Args:
+        path: The file, in one of `VECTOR_FORMATS`.
+        layer: Layer of the file, if it has several.
+
+    Returns:
+        Its features.
+
+    Raises:
+        InputError: The file does not exist, has another format, is damaged, or does not fit into memory.
+    """
+    # A geodatabase is a folder.
+    if not (path.is_dir() or exists(path)):
+        raise InputError(f"footprints {path}: does not exist; check the path")
+    try:
+        head = b"" if path.is_dir() else _head(path)
+        if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"{":
+            return _read_geojson(path)
+        driver = next((name for magic, name in _MAGIC if head.startswith(magic)), None)
+        if path.is_dir() and path.suffix == ".gdb" and (path / "a00000001.gdbtable").is_file():
+            driver = "OpenFileGDB"
+        if driver == "GPKG" and head[68:70] != b"GP":
+            driver = None
+        if driver is None:
+            raise InputError(
+                f"footprints {path}: is none of the formats that are read; give {VECTOR_FORMATS}"
+            )
+        return _read_with_gdal(path, layer, driver)
+    except OSError as error:
+        raise InputError(f"footprints {path}: cannot be read ({error.strerror}); check the file") from None
+    except MemoryError:
+        raise InputError(
+            f"footprints {path}: does not fit into memory; cut out the area that you need"
+        ) from None
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(100)
+
+
+def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
+    pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
+    # Absolute, so that no part of the name is taken for a prefix of GDAL's, such as /vsicurl or WFS:.
+    file = str(path.resolve())
+    try:
+        info = pyogrio.read_info(file, layer=layer)
+        count = int(info["features"])
+        if info["driver"] != driver:
+            raise InputError(f"footprints {path}: is damaged; give {VECTOR_FORMATS}")
+        if count * FEATURE_BYTES > available_memory():
+            raise InputError(
+                f"footprints {path}: declares {count:,} features, more than fit into memory; cut out the area that you "
+                "need"
+            )
+        meta, _, geometry, fields = pyogrio.raw.read(file, layer=layer)
+        outline = shapely.from_wkb(geometry)
+    except (
+        pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.FeatureError,
+        pyogrio.errors.GeometryError, shapely.GEOSException, ValueError,
+    ) as error:  # fmt: skip
+        raise InputError(
+            f"footprints {path}: cannot be read ({first_line(error)}); give {VECTOR_FORMATS}"
+        ) from None
+    crs = None if meta["crs"] is None else str(meta["crs"])
+    return Features(outline, dict(zip(map(str, meta["fields"]), fields, strict=True)), crs)
+
+
+def _read_geojson(path: Path) -> Features:
+    """Read GeoJSON (RFC 7946, and the member `crs` of its predecessor), which GDAL would try with other drivers."""
+    shapely = library("shapely", "scenes")
+    size = path.stat().st_size
+    if size * JSON_GROWTH > available_memory():
+        raise InputError(
+            f"footprints {path}: {size / 1e6:,.0f} MB of GeoJSON need about {JSON_GROWTH * size / 1e9:,.1f} GB of "
+            "memory; convert it to a GeoPackage, or cut out the area that you need"
+        )
+    try:
+        content = json.loads(path.read_bytes().decode("utf-8-sig"))
+        kind = content["type"]
+        if kind not in ("FeatureCollection", "Feature"):
+            raise ValueError(f"type {shortened(repr(kind))} is neither FeatureCollection nor Feature")
+        features = content["features"] if kind == "FeatureCollection" else [content]
+        features = [feature for feature in features if feature.get("geometry") is not None]
+        outline = shapely.from_geojson([json.dumps(feature["geometry"]) for feature in features])
+        properties = [feature.get("properties") or {} for feature in features]
+        names = list(dict.fromkeys(name for record in properties for name in record))
+        columns = {name: _column([record.get(name) for record in properties]) for name in names}
+        stated = content.get("crs", {"properties": {"name": WGS84}})
+        crs = None if stated is None else str(stated["properties"]["name"])
+    except (
+        ValueError,
+        LookupError,
+        AttributeError,
+        TypeError,
+        RecursionError,
+        shapely.GEOSException,
+    ) as error:
+        raise InputError(
+            f"footprints {path}: cannot be read ({first_line(error)}); give valid GeoJSON of features, as UTF-8"
+        ) from None
+    # CRS84 is WGS 84 with longitude first, which is how all coordinates are taken here.
+    return Features(outline, columns, WGS84 if crs is not None and crs.endswith("CRS84") else crs)
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    """A column: numbers if all of its values are numbers or missing, else objects."""
+    if all(
+        value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values
+    ):
+        return np.array([np.nan if value is None else float(value) for value in values])
+    column = np.empty(len(values), dtype=object)
+    column[:] = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+    return column
+
+
+@dataclass(frozen=True)
+class HeightModel:
+    """An open height model.
+
+    Attributes:
+        path: Its file.
+        dataset: The raster of rasterio.
+        crs: Its reference system as WKT, without heights.
+        metres: What its numbers, after scale and offset, are in metres.
+    """
+
+    path: Path
+    dataset: Any
+    crs: str
+    metres: float
+
+    def read(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> np.ma.MaskedArray:
+        """Read heights.
+
+        Args:
+            first: First row and column [2].
+            last: Last row and column [2].
+
+        Returns:
+            Heights [rows, columns], [m]; gaps are masked.
+
+        Raises:
+            InputError: There are too many, they cannot be read, or one is not a height on land.
+        """
+        rasterio = library("rasterio", "scenes")
+        rows, columns = (last - first + 1).tolist()
+        if rows * columns > MOST_CELLS:
+            raise InputError(
+                f"height model {self.path}: {rows * columns:,} cells lie in the scene, more than {MOST_CELLS:,}; give "
+                "a coarser model, or lower the margin"
+            )
+        window = rasterio.windows.Window(first[1], first[0], columns, rows)
+        try:
+            stored = self.dataset.read(1, window=window, masked=True).astype(float)
+        except (rasterio.errors.RasterioError, MemoryError) as error:
+            raise InputError(
+                f"height model {self.path}: cannot be read ({first_line(error)}); check the file"
+            ) from None
+        heights = (stored * self.dataset.scales[0] + self.dataset.offsets[0]) * self.metres
+        heights = np.ma.masked_invalid(heights)
+        low, high = HEIGHTS
+        wrong = (heights < low) | (heights > high)
+        if np.ma.filled(wrong, False).any():
+            value = stored[np.ma.filled(wrong, False)][0]
+            raise InputError(
+                f"height model {self.path}: {int(wrong.sum())} of {rows * columns} cells hold no height on land, such "
+                f"as {value:g}; declare the number of missing heights (gdal_edit.py -a_nodata {value:g}), or the unit"
+            )
+        return heights
+
+
+@contextmanager
+def open_height_model(path: Path) -> Iterator[HeightModel]:
+    """Open a height model.
+
+    Args:
+        path: A GeoTIFF.
+
+    Yields:
+        The model.
+
+    Raises:
+        InputError: The file does not exist, is not a GeoTIFF or cannot be used: it states no reference system or unit
+            that is known, no regular grid, or another scale in a file next to it.
+    """
+    rasterio = library("rasterio", "scenes")
+    if not path.is_file():
+        raise InputError(f"height model {path}: does not exist; check the path")
+    _check_sidecars(path)
+    # No file next to the model is opened: a mask or overview may be any format, a VRT included.
+    environment = rasterio.Env(
+        GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO", GDAL_CACHEMAX=256
+    )
+    try:
+        with environment, rasterio.open(str(path.resolve()), driver=RASTER_DRIVER) as dataset:
+            _check_layout(path, dataset)
+            if dataset.crs is None:
+                raise InputError(
+                    f"height model {path}: has no reference system; give a GeoTIFF that states it"
+                )
+            horizontal, metres = _systems(path, dataset)
+            yield HeightModel(path, dataset, horizontal, metres)
+    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as error:
+        raise InputError(
+            f"height model {path}: cannot be read ({first_line(error)}); give a GeoTIFF"
+        ) from None
+
+
+def _check_sidecars(path: Path) -> None:
+    """Refuse files next to a model that change its heights, because they are not read."""
+    mask, auxiliary = Path(f"{path}.msk"), Path(f"{path}.aux.xml")
+    if mask.exists():
+        raise InputError(f"height model {path}: its mask {mask.name} is not read; write it into the GeoTIFF")
+    if not auxiliary.is_file():
+        return
+    try:
+        text = auxiliary.read_bytes()[:10_000_000]
+        tags = {element.tag for element in ElementTree.fromstring(text).iter()}
+    except (OSError, ElementTree.ParseError):
+        return
+    if changed := sorted(tags & {"NoDataValue", "Scale", "Offset", "UnitType", "SRS", "GeoTransform"}):
+        raise InputError(
+            f"height model {path}: {auxiliary.name} states {', '.join(changed)}, which is not read; write it into the "
+            "GeoTIFF, with gdal_translate"
+        )
+
+
+def _check_layout(path: Path, dataset: Any) -> None:
+    affine = dataset.transform
+    determinant = affine.a * affine.e - affine.b * affine.d
+    if not np.isfinite([*affine]).all() or not np.isfinite(determinant) or determinant == 0:
+        raise InputError(
+            f"height model {path}: its geotransform {shortened(str(tuple(affine)[:6]), 200)} is not a grid; "
+            "give one with cells of finite size"
+        )
+    height, width = dataset.block_shapes[0]
+    bands = dataset.count if dataset.interleaving is not None and dataset.interleaving.name == "pixel" else 1
+    size = height * width * bands * np.dtype(dataset.dtypes[0]).itemsize
+    if size > LARGEST_BLOCK:
+        raise InputError(
+            f"height model {path}: is stored in blocks of {size / 2**20:,.0f} MiB; tile it "
+            "(gdal_translate -co TILED=YES)"
+        )
+
+
+def _systems(path: Path, dataset: Any) -> tuple[str, float]:
+    """The horizontal reference system as WKT, and the unit of heights [m]."""
+    crs = parse_crs(dataset.crs.to_wkt())
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    horizontal = next((part for part in parts if part.is_projected or part.is_geographic), None)
+    if horizontal is None:
+        raise InputError(
+            f"height model {path}: its reference system {shortened(crs.name, 100)!r} has no place on the globe; give "
+            "one with a projection, or longitude and latitude"
+        )
+    axes = [axis for part in parts for axis in part.axis_info if axis.direction in ("up", "down")]
+    if any(axis.direction == "down" for axis in axes):
+        raise InputError(f"height model {path}: holds depths, not heights; turn the sign")
+    declared = {axis.unit_conversion_factor for axis in axes}
+    unit = (dataset.units[0] or "").strip()
+    if unit:
+        factor = _METRES.get(re.sub(r"\s+", " ", unit.lower()))
+        if factor is None:
+            raise InputError(
+                f"height model {path}: the unit {shortened(unit, 40)!r} of its heights is not known; convert it to "
+                "metres"
+            )
+        declared.add(factor)
+    if len(declared) > 1 and not np.allclose(list(declared), min(declared), rtol=1e-4):
+        raise InputError(
+            f"height model {path}: its band states heights in {unit!r}, its reference system in another unit; "
+            "correct one"
+        )
+    return horizontal.to_wkt(), max(declared, default=1.0)
