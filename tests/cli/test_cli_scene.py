@@ -67,6 +67,43 @@ def test_a_plan_becomes_a_scene(tmp_path):
     }
 
 
+@pytest.mark.parametrize("target", ["scene.xml", "scene.json", "meshes/all-floor.ply", "meshes"])
+def test_a_scene_replaces_only_files_of_calibray(tmp_path, target):
+    plan, out = tmp_path / "plan.csv", tmp_path / "flat"
+    plan.write_text("x0,y0,x1,y1,type\n0,0,5,0,wall\n5,0,5,4,wall\n5,4,0,4,wall\n0,4,0,0,wall\n")
+    foreign = out / target
+    foreign.parent.mkdir(parents=True, exist_ok=True)
+    if target == "meshes":
+        (tmp_path / "elsewhere").mkdir()
+        foreign.symlink_to(tmp_path / "elsewhere")
+    else:
+        foreign.write_text("years of work")
+    status, _, err = typed("plan", plan, "-o", out)
+    assert status == 2
+    assert "is a link" in err if target == "meshes" else "give --overwrite" in err
+    assert not any((tmp_path / "elsewhere").iterdir()) if target == "meshes" else True
+    written = [entry for entry in out.rglob("*") if entry.is_file()]
+    assert written == ([] if target == "meshes" else [foreign])
+    if target == "meshes":
+        foreign.unlink()
+    else:
+        assert foreign.read_text() == "years of work"
+    for words in (["--overwrite"], []):  # the second time all files are Calibray's
+        assert typed("plan", plan, "-o", out, *words)[0] == 0
+
+
+def test_a_scene_never_replaces_its_input(tmp_path):
+    plan = tmp_path / "scene.xml"
+    plan.write_text("x0,y0,x1,y1,type\n0,0,5,0,wall\n5,0,5,4,wall\n5,4,0,0,wall\n")
+    before = plan.read_bytes()
+    extract = write_extract(tmp_path / "scene.osm", [(SQUARE, {"building": "yes"})])
+    (tmp_path / "scene.json").hardlink_to(extract)
+    for words in (["plan", plan], ["osm", extract], ["footprints", extract, "--height", 8]):
+        status, _, err = typed(*words, "-o", tmp_path, "--overwrite")
+        assert (status, "is an input" in err) == (2, True)
+    assert plan.read_bytes() == before
+
+
 def test_footprints_become_a_scene(tmp_path):
     extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
     # GDAL reads the extract as a layer of polygons with a column of other tags.

@@ -143,8 +143,7 @@ def test_a_scene_that_cannot_be_traced_gives_a_remark(tmp_path, monkeypatch):
     result = calibrate(study)
     assert result.cost.cheap_replays == 0
     assert (
-        result.remarks[0]
-        == "No cheap model is used: the scene cannot be traced here (no libLLVM was found)."
+        result.remarks[0] == "No cheap model is used: the scene cannot be traced here (no libLLVM was found)."
     )
     named = calibrate(study.replace(method="vector-surrogate"), seed=0)
     assert not any("cheap model" in remark for remark in named.remarks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
@@ -337,9 +338,38 @@ def test_missing_attribute(paths: Paths, tmp_path: Path, name: str) -> None:
 def test_target_that_cannot_be_written(paths: Paths, tmp_path: Path, target: str) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=r"cannot be written.*; name a file in a writable folder"):
+    with pytest.raises(InputError, match=r"output file .*(there is no folder|is a folder)"):
         paths.save(tmp_path / target)
     assert sorted(entry.name for entry in tmp_path.rglob("*")) == ["file", "folder"]
+
+
+def test_a_user_s_file_or_link_is_not_replaced(paths: Paths, tmp_path: Path) -> None:
+    """Not under the name of the file, nor under a name that the unfinished file might have."""
+    precious = tmp_path / "precious.txt"
+    precious.write_text("years of work")
+    for name in ("paths.h5.part", "paths.h5.partial", "paths.h5.tmp"):
+        (tmp_path / name).symlink_to(precious)
+    paths.save(tmp_path / "paths.h5")
+    assert Paths.load(tmp_path / "paths.h5") is not None
+    (tmp_path / "link.h5").symlink_to(precious)
+    with pytest.raises(InputError, match="is a link"):
+        paths.save(tmp_path / "link.h5", overwrite=True)
+    with pytest.raises(InputError, match="was not written by Calibray"):
+        paths.save(precious)
+    assert precious.read_text() == "years of work"
+    assert not (tmp_path / ".calibray").exists()  # path files have a seal
+    paths.save(precious, overwrite=True)
+    assert Paths.load(precious) is not None
+
+
+def test_writers_of_one_file_do_not_mix(paths: Paths, tmp_path: Path) -> None:
+    """The file of the writer that ends last remains, whole."""
+    file = tmp_path / "paths.h5"
+    with ThreadPoolExecutor(4) as pool:
+        for saved in [pool.submit(paths.save, file) for _ in range(16)]:
+            saved.result()
+    assert len(Paths.load(file).delay) == len(paths.delay)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["paths.h5"]
 
 
 # Selecting and joining

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
+from types import SimpleNamespace
 
 import h5py
 import pandas as pd
@@ -17,6 +18,7 @@ from calibray.support.output_files import (
     check_file,
     check_outputs,
     check_table,
+    check_unchanged,
     is_unchanged_output,
     replacing,
     write_table,
@@ -75,8 +77,8 @@ def test_inputs_links_and_devices_are_never_replaced(tmp_path, overwrite):
     os.mkfifo(tmp_path / "fifo.csv")
     (tmp_path / "null.csv").symlink_to("/dev/null")
     for name, message in {
-        "links.csv": "is an input of the study",
-        "hard.csv": "is an input of the study",
+        "links.csv": "is an input; name another",
+        "hard.csv": "is an input; name another",
         "soft.csv": "is a link",
         "dangling.csv": "is a link",
         "null.csv": "is a link",
@@ -114,8 +116,8 @@ def test_unfinished_files_of_ended_processes_are_removed(tmp_path):
     ended = subprocess.Popen(["true"])
     ended.wait()
     names = {
-        "old": f"a.txt.{ended.pid}-12345678.part",
-        "alive": f"a.txt.{os.getpid()}-12345678.part",
+        "old": f"a.txt.{ended.pid}-0123456789abcdef0123456789abcdef.part",
+        "alive": f"a.txt.{os.getpid()}-0123456789abcdef0123456789abcdef.part",
         "users": "a.txt.my-own.part",
     }
     for name in names.values():
@@ -125,3 +127,91 @@ def test_unfinished_files_of_ended_processes_are_removed(tmp_path):
     write_text(tmp_path / "a.txt", "one")
     remaining = {path.name for path in tmp_path.iterdir()} - {"a.txt", SIGNATURES}
     assert remaining == {names["alive"], names["users"], f"a.txt.{ended.pid}-new.part"}
+
+
+def _plant(kind: str, file, precious) -> None:
+    """Put something under a file's name that Calibray did not write."""
+    if kind == "link":
+        file.symlink_to(precious)
+    elif kind == "dangling link":
+        file.symlink_to(precious.with_name("nowhere"))
+    elif kind == "device":
+        file.symlink_to("/dev/zero")
+    elif kind == "FIFO":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    elif kind == "file of another program":
+        file.write_text("[calibray]\nverbose = true\n")
+    else:
+        with file.open("wb") as stream:
+            stream.truncate(3 * 2**30)
+
+
+PLANTS = ("link", "dangling link", "device", "FIFO", "folder", "file of another program", "3 GB")
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_only_its_own_signature_file_is_read_and_appended_to(tmp_path, kind):
+    precious, folder = tmp_path / "precious.txt", tmp_path / "out"
+    precious.write_text("years of work")
+    folder.mkdir()
+    _plant(kind, folder / SIGNATURES, precious)
+    with pytest.raises(
+        InputError, match=r"\.calibray: Calibray keeps.*; move it away, or name another folder"
+    ):
+        check_outputs(folder, ["a.txt"])
+    with pytest.raises(InputError, match=r"move it away"):
+        check_file(folder / "a.txt")
+    with pytest.raises(InputError, match=r"move it away"):
+        write_text(folder / "a.txt", "one")
+    (folder / "users.txt").write_text("by hand")
+    assert not is_unchanged_output(folder / "users.txt")
+    check_unchanged(folder / "users.txt")
+    assert {entry.name for entry in folder.iterdir()} == {SIGNATURES, "users.txt"}
+    assert [entry.name for entry in tmp_path.iterdir() if entry.is_file()] == ["precious.txt"]
+    assert precious.read_text() == "years of work"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
+def test_the_signature_file_of_another_user_is_not_used(tmp_path):
+    file = tmp_path / "a.txt"
+    write_text(file, "one")
+    assert is_unchanged_output(file)
+    os.chown(tmp_path / SIGNATURES, 65534, 65534)
+    assert not is_unchanged_output(file)
+    with pytest.raises(InputError, match="belongs to another user"):
+        check_file(file)
+
+
+def test_an_unfinished_file_is_created_and_never_followed(tmp_path, monkeypatch):
+    """Not even if somebody knows its name, or exchanges it while it is written."""
+    precious, file = tmp_path / "precious.txt", tmp_path / "a.txt"
+    precious.write_text("years of work")
+
+    def exchange() -> None:
+        with replacing(file) as partial:
+            partial.unlink()
+            partial.symlink_to(precious)
+
+    with pytest.raises(InputError, match="another program replaced"):
+        exchange()
+    name = "0" * 32
+    monkeypatch.setattr("uuid.uuid4", lambda: SimpleNamespace(hex=name))
+    planted = tmp_path / f"a.txt.{os.getpid()}-{name}.part"
+    planted.symlink_to(precious)
+    with pytest.raises(FileExistsError):
+        write_text(file, "one")
+    assert precious.read_text() == "years of work"
+    assert planted.is_symlink()
+    assert not file.exists()
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "device", "FIFO", "folder"])
+def test_nothing_but_a_file_is_replaced_even_unchecked(tmp_path, kind):
+    precious, file = tmp_path / "precious.txt", tmp_path / "a.txt"
+    precious.write_text("years of work")
+    _plant(kind, file, precious)
+    with pytest.raises(InputError, match=r"output file .*: is a"):
+        write_text(file, "one")
+    assert precious.read_text() == "years of work"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import log
+from calibray.cli.console import Overwrite, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,20 +92,22 @@ def osm(
     default_height: DefaultHeight = 9.0,
     margin: Margin = 50.0,
     per_building: PerBuilding = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a scene from the buildings of an OpenStreetMap extract."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import HeightRule, read_openstreetmap
-    from calibray.support.output_files import check_folder
+    from calibray.scenes.authoring import SCENE_FILES, HeightRule, read_openstreetmap
+    from calibray.support.output_files import check_outputs
 
-    check_folder(out)
+    check_outputs(out, SCENE_FILES, [extract, *([terrain] if terrain else [])], overwrite)
     with progress_bars(log()) as progress:
         progress("reading", 0, None)
         buildings, frame = read_openstreetmap(
             extract, _frame(origin, utm), HeightRule(storey, default_height)
         )
         made = _make(
-            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building, progress,
+            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
+            overwrite, progress,
         )  # fmt: skip
     _print(made)
 
@@ -138,13 +140,14 @@ def footprints(
     default_height: DefaultHeight = 9.0,
     margin: Margin = 50.0,
     per_building: PerBuilding = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a scene from building footprints with heights."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import HeightRule, read_footprints
-    from calibray.support.output_files import check_folder
+    from calibray.scenes.authoring import SCENE_FILES, HeightRule, read_footprints
+    from calibray.support.output_files import check_outputs
 
-    check_folder(out)
+    check_outputs(out, SCENE_FILES, [file, *([terrain] if terrain else [])], overwrite)
     with progress_bars(log()) as progress:
         progress("reading", 0, None)
         buildings, frame = read_footprints(
@@ -152,7 +155,8 @@ def footprints(
             _frame(origin, utm), HeightRule(storey, default_height),
         )  # fmt: skip
         made = _make(
-            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building, progress,
+            buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
+            overwrite, progress,
         )  # fmt: skip
     _print(made)
 
@@ -180,15 +184,20 @@ def plan(
         list[str] | None,
         typer.Option(metavar="TYPE=ITU[:M]", help="Material of one type of wall; may be repeated."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make a scene from a floor plan, with one sheet per wall, door and window."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import make_plan_scene, read_plan
+    from calibray.scenes.authoring import SCENE_FILES, make_plan_scene, read_plan
+    from calibray.support.output_files import check_outputs
 
     types = _types(material or [])
+    check_outputs(out, SCENE_FILES, [file], overwrite)
     with progress_bars(log()) as progress:
         progress("making", 0, None)
-        made = make_plan_scene(read_plan(file, height, unit), out, types, floor, ceiling, merge)
+        made = make_plan_scene(
+            read_plan(file, height, unit), out, types, floor, ceiling, merge, overwrite=overwrite
+        )
     _print(made)
 
 
@@ -212,6 +221,7 @@ def _make(
     window_share: float,
     margin: float,
     per_building: bool,
+    overwrite: bool,
     progress: Progress,
 ) -> MadeScene:
     """Make a scene from footprints."""
@@ -231,7 +241,17 @@ def _make(
         surface, frame = lower_origin(read_terrain(terrain, frame, bounds, spacing), frame)
     typer.echo(f"Making a scene with {len(buildings)} buildings", err=True)
     progress("making", 0, None)
-    return make_scene(buildings, out, frame, surface, palette, windows, margin, per_building=per_building)
+    return make_scene(
+        buildings,
+        out,
+        frame,
+        surface,
+        palette,
+        windows,
+        margin,
+        per_building=per_building,
+        overwrite=overwrite,
+    )
 
 
 def _frame(origin: str | None, utm: bool) -> Frame | None:

@@ -55,13 +55,13 @@ def trace(
         links, trace_again = setup.links, check and not study.trace.adaptive
         with open_workers(workers, scheduler) as pool:
             if pool is None and stated_chunk_size(setup) is None:
-                paths, change = _trace(setup, out, trace_again, progress)
+                paths, change = _trace(setup, out, overwrite, trace_again, progress)
             else:
                 paths, change = trace_in_chunks(
                     setup, pool or InProcess(), check=trace_again, progress=progress
                 )
                 if out is not None:
-                    paths.save(out)
+                    paths.save(out, overwrite)
     typer.echo(render(trace_tables.overview(paths, links.row, setup.enclosed)))
     if check and study.trace.adaptive:
         typer.echo("\n" + trace_tables.last_round(paths.settings, study.fidelity.tolerance_db))
@@ -72,7 +72,7 @@ def trace(
 
 
 def _trace(
-    setup: Setup, out: Path | None, trace_again: bool, progress: Progress
+    setup: Setup, out: Path | None, overwrite: bool, trace_again: bool, progress: Progress
 ) -> tuple[Paths, Convergence | None]:
     """Trace all links at once, store the paths, and trace again as a check if requested."""
     from functools import partial
@@ -86,7 +86,7 @@ def _trace(
         typer.echo(announcement, err=True)
     paths = tracer.trace(links, progress)
     if out is not None:
-        paths.save(out)
+        paths.save(out, overwrite)
     if not trace_again:
         return paths, None
     loss = partial(path_loss, combining=study.objective.combining, bandwidth=study.scene.bandwidth)

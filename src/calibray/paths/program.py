@@ -9,7 +9,6 @@ field, the last one part of the receive field.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from html import escape
 from pathlib import Path
@@ -25,7 +24,7 @@ from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.paths.checksum import BLOCK, verify, write_checksum
 from calibray.paths.file_format import DATASETS, Content, read, write
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
-from calibray.support.output_files import exists
+from calibray.support.output_files import check_file, exists, replacing
 
 _WIDTH: Final = 80
 """Longest line of the summary [characters]."""
@@ -162,29 +161,26 @@ class Paths:
             )
         return {**self.materials, **(materials or {})}
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Write an HDF5 file (format in docs/reference/path-file.md), readable by h5py and MATLAB.
 
         Args:
-            path: File to write; replaced only once the new one is complete.
+            path: File to write; a path file there is replaced only once the new one is complete.
+            overwrite: Replace a file that Calibray did not write.
 
         Raises:
-            InputError: The folder does not exist or cannot be written.
+            InputError: The folder does not exist or cannot be written, or the file there must not be replaced.
         """
-        target = Path(path)
-        partial = target.with_name(target.name + ".part")
+        target = check_file(path, overwrite=overwrite)
         try:
-            with h5py.File(partial, "w", userblock_size=BLOCK) as file:
-                write(file, _content(self))
-            write_checksum(partial)
-            partial.replace(target)
+            with replacing(target, signed=False) as partial:
+                with h5py.File(partial, "w", userblock_size=BLOCK) as file:
+                    write(file, _content(self))
+                write_checksum(partial)
         except OSError as error:
             raise InputError(
                 f"{target}: cannot be written ({error}); name a file in a writable folder"
             ) from None
-        finally:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | Path) -> Paths:

@@ -7,15 +7,12 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
 from shutil import copyfile
-from typing import Final
 
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes.scene import TRACED, Scene, is_itu_name, material_element
-from calibray.support.output_files import check_replaceable, replacing, write_text
-
-MESHES: Final = "meshes"
-"""Folder for copies of meshes, next to the scene file."""
+from calibray.scenes.scene_file import MESHES
+from calibray.support.output_files import check_outputs, replacing, write_text
 
 
 def export_scene(
@@ -84,10 +81,12 @@ def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) ->
     while copies.setdefault(name, mesh) != mesh:
         number += 1
         name = f"{mesh.stem}-{number}{mesh.suffix}"
-    folder.mkdir(parents=True, exist_ok=True)
+    if folder.is_symlink():
+        raise InputError(f"{folder}: is a link; remove it, or export into another folder")
     if (folder / name).exists() and (folder / name).samefile(mesh):
         return mesh
-    check_replaceable(folder / name, [mesh], overwrite)
+    check_outputs(folder, [name], [mesh], overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / name) as partial:
         copyfile(mesh, partial)
     return folder / name

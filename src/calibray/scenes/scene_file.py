@@ -18,12 +18,15 @@ from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.scenes.meshes import Mesh, MeshObject, ply_bytes, read_mesh
 from calibray.support.messages import shortened
-from calibray.support.output_files import exists, replacing
+from calibray.support.output_files import check_outputs, exists, write_bytes, write_text
 
 BUNDLED_PREFIX: Final = "sionna:"
 
 SHAPES: Final = ("cube", "obj", "ply", "rectangle", "serialized")
 """Types of shapes that are triangle meshes; Sionna RT takes no others."""
+
+MESHES: Final = "meshes"
+"""Folder for meshes, next to the scene file."""
 
 MAX_DEPTH: Final = 64
 """Largest depth of nested elements in a scene file."""
@@ -306,6 +309,7 @@ def write_scene(
     objects: Sequence[MeshObject],
     materials: Mapping[str, Mapping[str, float | str]],
     frame: Frame | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
 
@@ -315,18 +319,27 @@ def write_scene(
         materials: Constants by material name. A `type` names a material of ITU-R P.2040, which then gives
             permittivity and conductivity.
         frame: Where the scene lies on the globe; kept in a comment, from which `read_frame` reads it.
+        overwrite: Replace files that Calibray did not write.
 
     Returns:
         Path of the XML file.
+
+    Raises:
+        InputError: The folder cannot be written, or a file there must not be replaced; nothing is written then.
     """
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    for item in objects:
-        with replacing(folder / "meshes" / f"{item.name}.ply") as partial:
-            partial.write_bytes(ply_bytes(item.mesh))
-    path = folder / "scene.xml"
-    with replacing(path) as partial:
-        partial.write_bytes(_scene_xml(objects, materials, frame).encode("utf-8"))
-    return path
+    meshes = {f"{item.name}.ply": item.mesh for item in objects}
+    check_outputs(folder, ["scene.xml"], overwrite=overwrite)
+    # The meshes of another folder must not be replaced through a link.
+    if (folder / MESHES).is_symlink():
+        raise InputError(
+            f"output folder {folder}: {folder / MESHES} is a link; remove it, or name another folder"
+        )
+    check_outputs(folder / MESHES, list(meshes), overwrite=overwrite)
+    (folder / MESHES).mkdir(parents=True, exist_ok=True)
+    for name, mesh in meshes.items():
+        write_bytes(folder / MESHES / name, ply_bytes(mesh))
+    write_text(folder / "scene.xml", _scene_xml(objects, materials, frame))
+    return folder / "scene.xml"
 
 
 def _scene_xml(
@@ -347,7 +360,7 @@ def _scene_xml(
     for item in objects:
         lines += [
             f'    <shape type="ply" id={quoteattr(f"mesh-{item.name}")}>',
-            f'        <string name="filename" value={quoteattr(f"meshes/{item.name}.ply")}/>',
+            f'        <string name="filename" value={quoteattr(f"{MESHES}/{item.name}.ply")}/>',
             '        <boolean name="face_normals" value="true"/>',
             f'        <ref id={quoteattr(f"mat-{item.material}")} name="bsdf"/>',
             "    </shape>",

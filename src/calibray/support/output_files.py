@@ -2,20 +2,23 @@
 
 An output never replaces an input, a link or a device, nor a file that Calibray did not write or that was changed since.
 Calibray signs the files that it writes: `.calibray` in the same folder lists the digest and the name of each.
+
+All files are written by `replacing`: under a random name in the same folder, created by this process and not through a
+link, then moved into place in one step.
 """
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import os
+import re
 import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, BinaryIO, Final, NoReturn
 
 from calibray.errors import InputError
 from calibray.support.messages import shortened
@@ -26,8 +29,14 @@ if TYPE_CHECKING:
 TABLES: Final = (".csv", ".parquet")
 PARTIAL: Final = ".part"  # end of the name of an unfinished file
 SIGNATURES: Final = ".calibray"  # a line per file written, its SHA-256 and its name; only appended to
+SIGNATURES_LIMIT: Final = 2**26  # largest signature file that is read [bytes]; a line takes about 80
 PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
 STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its process has ended
+
+_UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process
+_SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
+# Windows has neither flag: its links need special rights, and it has no FIFO in a folder.
+_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def exists(file: str | Path) -> bool:
@@ -77,9 +86,10 @@ def check_outputs(
         The folder's path.
 
     Raises:
-        InputError: As for `check_folder` and `check_replaceable`.
+        InputError: As for `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
     """
     target, sources = check_folder(folder), list(inputs)
+    _check_signature_file(target)
     for name in names:
         check_replaceable(target / name, sources, overwrite)
     return target
@@ -97,7 +107,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
         Its path.
 
     Raises:
-        InputError: It is a folder, its folder does not exist or cannot be written, or as for `check_replaceable`.
+        InputError: It is a folder, its folder does not exist or cannot be written, or as for `check_outputs`.
     """
     target = _valid_name(file, "output file")
     if target.is_dir():
@@ -108,6 +118,7 @@ def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = 
         )
     if not os.access(target.parent, os.W_OK | os.X_OK):
         raise InputError(f"output file {target}: {target.parent} cannot be written; name another")
+    _check_signature_file(target.parent)
     check_replaceable(target, inputs, overwrite)
     return target
 
@@ -145,7 +156,7 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
         raise InputError(f"output file {file}: is a folder, a device or a FIFO; name a file")
     for source in inputs:
         if source.exists() and file.samefile(source):
-            raise InputError(f"output file {file}: is an input of the study; name another")
+            raise InputError(f"output file {file}: is an input; name another")
     if status.st_size and not overwrite and not is_unchanged_output(file):
         raise InputError(
             f"output file {file}: was not written by Calibray, or was changed since; name another, move it away, or "
@@ -199,13 +210,74 @@ def _status(path: Path, role: str) -> os.stat_result | None:
 
 
 def _signatures(folder: Path) -> list[str]:
+    """The lines of a folder's signature file; none if there is no such file, or if it is not Calibray's."""
     try:
-        return (folder / SIGNATURES).read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
+        with _open_signatures(folder, os.O_RDONLY) as stream:
+            return stream.read().decode("utf-8", errors="replace").splitlines()
+    except (OSError, InputError):
         return []
 
 
+def _check_signature_file(folder: Path) -> None:
+    """Refuse a folder whose signature file is not Calibray's, because files there could not be signed."""
+    # Without permission to read it, writing fails later with the same message as for any other file.
+    with suppress(OSError), _open_signatures(folder, os.O_RDONLY):
+        pass
+
+
+def _open_signatures(folder: Path, flags: int) -> BinaryIO:
+    """Open the signature file of a folder.
+
+    Args:
+        folder: The folder.
+        flags: Flags of `os.open`.
+
+    Returns:
+        The open file.
+
+    Raises:
+        InputError: It is a link, a folder or a device; another user owns it; it is too large; or another program wrote
+            it.
+        OSError: It does not exist or cannot be opened.
+    """
+    path = folder / SIGNATURES
+    # Opening a FIFO or a device may block or have effects, so the status is checked before and after.
+    with suppress(FileNotFoundError):
+        _check_signature_status(path, path.lstat())
+    stream = os.fdopen(
+        os.open(path, flags | _NO_LINK, 0o666), "rb" if flags == os.O_RDONLY else "r+b", buffering=0
+    )
+    try:
+        _check_signature_status(path, os.fstat(stream.fileno()))
+        head = stream.read(66)
+        if head and not _SIGNATURE_LINE.match(head):
+            _refuse_signature_file(path, "another program wrote it")
+        stream.seek(0)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _check_signature_status(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        _refuse_signature_file(path, "it is a link, a folder, a device or a FIFO")
+    if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
+        _refuse_signature_file(path, "it belongs to another user")
+    if status.st_size > SIGNATURES_LIMIT:
+        _refuse_signature_file(path, f"it has more than {SIGNATURES_LIMIT} bytes")
+
+
+def _refuse_signature_file(path: Path, fault: str) -> NoReturn:
+    raise InputError(
+        f"{path}: Calibray keeps the digests of its files under this name, but {fault}; move it away, or name another "
+        "folder"
+    )
+
+
 def _signature(file: Path, name: str) -> str:
+    """The line of a file, in which a name with line breaks is escaped."""
+    name = name if name.isprintable() else ascii(name)
     with file.open("rb") as stream:
         return f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name}"
 
@@ -214,36 +286,65 @@ def _signature(file: Path, name: str) -> str:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     """Write a file under a temporary name; it is signed and moved into place once it is complete.
 
     Args:
         path: The file.
+        signed: Whether to sign it in `.calibray`; files with a seal of their own need no signature.
 
     Yields:
-        The temporary file in the same folder, removed if writing fails.
+        The temporary file in the same folder, which exists and is empty; removed if writing fails.
+
+    Raises:
+        InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or somebody exchanged the
+            temporary file.
     """
+    check_replaceable(
+        path, overwrite=True
+    )  # whether a regular file may be replaced was checked before the work
     _remove_unfinished(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex[:8]}{PARTIAL}")
+    partial = path.with_name(f"{path.name}.{os.getpid()}-{uuid.uuid4().hex}{PARTIAL}")
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK, 0o666)
     try:
-        yield partial
-        # Signed first: after a kill between the two steps, the next run must still recognise the file as its own.
-        signature = _signature(partial, path.name)
-        if signature not in _signatures(path.parent):
-            with (path.parent / SIGNATURES).open("a", encoding="utf-8") as stream:
-                stream.write(f"{signature}\n")
+        with os.fdopen(descriptor, "wb") as created:
+            yield partial
+            # Whoever else may write to the folder could have put a link or another file under the name. The file that
+            # was created is open until here, so that no other file can have its number.
+            if not os.path.samestat(partial.lstat(), os.fstat(created.fileno())):
+                raise InputError(
+                    f"output file {path}: another program replaced {partial}; name another folder"
+                )
+        if signed:
+            # Signed first: after a kill between the two steps, the next run must still recognise the file as its own.
+            _sign(partial, path)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
 
+def _sign(partial: Path, path: Path) -> None:
+    """Add the line of a file to the folder's signatures."""
+    signature = _signature(partial, path.name)
+    # A file that does not exist has not been signed lately; a line that stands there twice does no harm.
+    if path.exists() and signature in _signatures(path.parent):
+        return
+    with _open_signatures(path.parent, os.O_RDWR | os.O_CREAT | os.O_APPEND) as stream:
+        stream.write(f"{signature}\n".encode())
+
+
 def _remove_unfinished(path: Path) -> None:
     """Remove the unfinished files of processes that were killed while they wrote this file."""
-    for partial in path.parent.glob(f"{glob.escape(path.name)}.*-*{PARTIAL}"):
-        process = partial.name.removeprefix(f"{path.name}.").split("-")[0]
+    for partial in path.parent.iterdir():
+        if not partial.name.startswith(path.name):
+            continue
+        match = _UNFINISHED.fullmatch(partial.name.removeprefix(path.name))
+        if match is None:
+            continue
         try:
-            if process.isdigit() and time.time() - partial.lstat().st_mtime > STALE_SECONDS:
-                os.kill(int(process), 0)  # raises ProcessLookupError if it has ended
+            status = partial.lstat()
+            if stat.S_ISREG(status.st_mode) and time.time() - status.st_mtime > STALE_SECONDS:
+                os.kill(int(match[1]), 0)  # raises ProcessLookupError if it has ended
         except ProcessLookupError:
             partial.unlink(missing_ok=True)
         except (OSError, OverflowError):
@@ -252,8 +353,13 @@ def _remove_unfinished(path: Path) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file and move it into place once it is complete."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file and move it into place once it is complete."""
     with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(content)
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.footprints import HeightRule as HeightRule
     from calibray.scenes.authoring.footprints import HeightSource as HeightSource
     from calibray.scenes.authoring.footprints import clean_footprints as clean_footprints
+    from calibray.scenes.authoring.made_scene import SCENE_FILES as SCENE_FILES
     from calibray.scenes.authoring.made_scene import MadeScene as MadeScene
     from calibray.scenes.authoring.made_scene import Palette as Palette
     from calibray.scenes.authoring.made_scene import SurfaceMaterial as SurfaceMaterial
@@ -35,7 +36,7 @@ _MODULES = {
     "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
     "footprint_files": ("read_footprints", "read_openstreetmap"),
     "footprints": ("Footprints", "HeightRule", "HeightSource", "clean_footprints"),
-    "made_scene": ("MadeScene", "Palette", "SurfaceMaterial"),
+    "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}

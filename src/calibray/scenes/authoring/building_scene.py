@@ -26,13 +26,13 @@ from calibray.scenes.authoring.extrusion import (
     extrude,
 )
 from calibray.scenes.authoring.footprints import Footprints
-from calibray.scenes.authoring.made_scene import MadeScene, Palette, write_made_scene
+from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, write_made_scene
 from calibray.scenes.authoring.overlaps import split_overlaps
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.meshes import MeshObject, weld
 from calibray.support.extras import library
-from calibray.support.output_files import check_folder
+from calibray.support.output_files import check_outputs
 
 SINK: Final = 0.5
 """Depth to which buildings on sloping ground extend below the lowest ground under their walls [m]."""
@@ -48,6 +48,7 @@ def make_scene(
     margin: float = 50.0,
     ground: bool = True,
     per_building: bool = False,
+    overwrite: bool = False,
 ) -> MadeScene:
     """Make a scene of buildings and ground.
 
@@ -63,14 +64,16 @@ def make_scene(
         ground: Whether to make ground; without it buildings are closed at the bottom.
         per_building: One mesh per building and material, named `BUILDING-MATERIAL`, instead of one per material.
             Calibray can then give some buildings a separate material. Tracing many meshes takes longer.
+        overwrite: Replace files that Calibray did not write.
 
     Returns:
         The scene.
 
     Raises:
-        InputError: There is no building, or the folder cannot be written.
+        InputError: There is no building, the folder cannot be written, or a file there must not be replaced.
     """
-    folder, palette = check_folder(folder), palette or Palette()
+    folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
+    palette = palette or Palette()
     if not len(footprints):
         raise InputError("there is no building to make a scene of; check the file and its columns")
     base = _base_heights(footprints, terrain)
@@ -88,7 +91,7 @@ def make_scene(
     }
     guessed = {source: names for source, names in footprints.guessed().items() if names}
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
-    return write_made_scene(folder, objects, materials, frame, counts, guessed)
+    return write_made_scene(folder, objects, materials, frame, counts, guessed, overwrite)
 
 
 def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:

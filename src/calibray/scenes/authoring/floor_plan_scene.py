@@ -22,14 +22,14 @@ from calibray.scenes.authoring.extrusion import (
     wall_triangles,
 )
 from calibray.scenes.authoring.floor_plan import OPENINGS, Segment, merge_faces
-from calibray.scenes.authoring.made_scene import MadeScene, SurfaceMaterial, write_made_scene
+from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, SurfaceMaterial, write_made_scene
 from calibray.scenes.authoring.overlaps import subtract
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.meshes import MeshObject, weld
 from calibray.scenes.scene import ITU_NAMES
 from calibray.support.extras import library
 from calibray.support.messages import did_you_mean
-from calibray.support.output_files import check_folder
+from calibray.support.output_files import check_outputs
 
 TYPES: Final = {
     "wall": SurfaceMaterial("wall", "plasterboard", 0.12),
@@ -60,6 +60,7 @@ def make_plan_scene(
     ceiling: bool = True,
     merge: bool = True,
     frame: Frame | None = None,
+    overwrite: bool = False,
 ) -> MadeScene:
     """Make a scene of a floor plan.
 
@@ -77,14 +78,17 @@ def make_plan_scene(
         ceiling: Whether to make a ceiling, at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
         frame: Where the scene lies on the globe, if known.
+        overwrite: Replace files that Calibray did not write.
 
     Returns:
         The scene.
 
     Raises:
-        InputError: A type has no material, there is no segment, or the folder cannot be written.
+        InputError: A type has no material, there is no segment, the folder cannot be written, or a file there must not
+            be replaced.
     """
-    folder, types = check_folder(folder), {**TYPES, **(types or {})}
+    folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
+    types = {**TYPES, **(types or {})}
     if not segments:
         raise InputError("the floor plan holds no segment; give at least one wall")
     sheets, merged = merge_faces(segments) if merge else (list(segments), 0)
@@ -106,7 +110,7 @@ def make_plan_scene(
         "sheets": len(sheets),
         **({"lines merged as faces of one wall": merged} if merged else {}),
     }
-    return write_made_scene(folder, objects, materials, frame, counts)
+    return write_made_scene(folder, objects, materials, frame, counts, overwrite=overwrite)
 
 
 def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:

@@ -17,7 +17,10 @@ from calibray.scenes.meshes import MeshObject
 from calibray.scenes.scene import ITU_NAMES, is_itu_name
 from calibray.scenes.scene_file import write_scene
 from calibray.support.messages import did_you_mean
-from calibray.support.output_files import write_text
+from calibray.support.output_files import check_outputs, write_text
+
+SCENE_FILES: Final = ("scene.xml", "scene.json")
+"""What is written next to the meshes."""
 
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
@@ -116,6 +119,7 @@ def write_made_scene(
     frame: Frame | None,
     counts: Mapping[str, int],
     guessed: Mapping[str, Sequence[str]] | None = None,
+    overwrite: bool = False,
 ) -> MadeScene:
     """Write a scene and the assumptions made.
 
@@ -126,12 +130,14 @@ def write_made_scene(
         frame: Where it lies on the globe, if known.
         counts: Number of objects used, repaired or left out, by what they are.
         guessed: The buildings whose height is a guess, by the source of the guess.
+        overwrite: Replace files that Calibray did not write.
 
     Returns:
         The scene.
 
     Raises:
-        InputError: Two different materials, or a material and a mesh, have the same name.
+        InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
+            replaced.
     """
     used = {item.material for item in objects}
     constants: dict[str, Mapping[str, float | str]] = {}
@@ -149,9 +155,9 @@ def write_made_scene(
         triangles[item.material] += len(item.mesh.faces)
     corners = np.array([[item.mesh.vertices.min(axis=0), item.mesh.vertices.max(axis=0)] for item in objects])
     bounds = (*corners[:, 0].min(axis=0).tolist(), *corners[:, 1].max(axis=0).tolist())
-    path = write_scene(
-        folder, objects, {name: values for name, values in constants.items() if name in used}, frame
-    )
+    check_outputs(folder, SCENE_FILES, overwrite=overwrite)
+    used_constants = {name: values for name, values in constants.items() if name in used}
+    path = write_scene(folder, objects, used_constants, frame, overwrite)
     scene = MadeScene(path, frame, bounds, triangles, counts, guessed or {})
     write_text(folder / "scene.json", json.dumps(scene.record(), indent=2) + "\n")
     return scene
