@@ -78,7 +78,7 @@ def test_a_scene_replaces_only_files_of_calibray(tmp_path, target):
         foreign.symlink_to(tmp_path / "elsewhere")
     else:
         foreign.write_text("years of work")
-    status, _, err = typed("plan", plan, "-o", out)
+    status, _, err = scene_command("plan", plan, "-o", out)
     assert status == 2
     assert "is a link" in err if target == "meshes" else "give --overwrite" in err
     assert not any((tmp_path / "elsewhere").iterdir()) if target == "meshes" else True
@@ -89,7 +89,7 @@ def test_a_scene_replaces_only_files_of_calibray(tmp_path, target):
     else:
         assert foreign.read_text() == "years of work"
     for words in (["--overwrite"], []):  # the second time all files are Calibray's
-        assert typed("plan", plan, "-o", out, *words)[0] == 0
+        assert scene_command("plan", plan, "-o", out, *words)[0] == 0
 
 
 def test_a_scene_never_replaces_its_input(tmp_path):
@@ -99,7 +99,7 @@ def test_a_scene_never_replaces_its_input(tmp_path):
     extract = write_extract(tmp_path / "scene.osm", [(SQUARE, {"building": "yes"})])
     (tmp_path / "scene.json").hardlink_to(extract)
     for words in (["plan", plan], ["osm", extract], ["footprints", extract, "--height", 8]):
-        status, _, err = typed(*words, "-o", tmp_path, "--overwrite")
+        status, _, err = scene_command(*words, "-o", tmp_path, "--overwrite")
         assert (status, "is an input" in err) == (2, True)
     assert plan.read_bytes() == before
 
