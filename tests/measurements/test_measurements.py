@@ -14,6 +14,7 @@ from calibray.measurements import (
     read_measurements,
     read_table,
 )
+from calibray.measurements.table_files import PiecedTable
 
 TABLE = """\
 x,y,z,loss,set,spread
@@ -145,6 +146,31 @@ def test_a_row_with_a_missing_value_does_not_pass_a_filter(tmp_path):
     frame.to_parquet(tmp_path / "links.parquet")
     arguments = (tmp_path / "links.parquet", [0, 0, 10.0], ["x", "y", "z"], "loss")
     assert read_measurements(*arguments, where="mode == 4").row.tolist() == [1, 3]
+
+
+@pytest.mark.parametrize("column", ["zeros", "text"])
+def test_a_parquet_file_that_decompresses_to_gigabytes_is_refused_before_it_is_read(
+    tmp_path, monkeypatch, column
+):
+    """A file of zeros, or of one word, is a thousandth of its size in memory; the limit is lower here."""
+    monkeypatch.setattr("calibray.measurements.table_files.LARGEST_TABLE", 2**22)
+    count = 200_000
+    values = np.zeros(count) if column == "zeros" else ["word"] * count
+    path = tmp_path / "links.parquet"
+    pd.DataFrame({"x": values, "y": values, "z": values}).to_parquet(path, compression="zstd")
+    assert path.stat().st_size < 10_000
+    with pytest.raises(InputError, match=r"links\.parquet: the table takes 0\.0 GiB decompressed, at most"):
+        read_table(path)
+    # In pieces, a row group at a time is small enough.
+    assert PiecedTable.open(path).rows == count
+
+
+def test_a_row_group_that_decompresses_to_gigabytes_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "links.parquet"
+    pd.DataFrame({"x": np.zeros(1000)}).to_parquet(path)
+    monkeypatch.setattr("calibray.measurements.table_files.available_memory", lambda: 4000)
+    with pytest.raises(InputError, match=r"a row group takes .* decompressed"):
+        PiecedTable.open(path)
 
 
 def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Final, final
 
 import numpy as np
 import pandas as pd
@@ -17,8 +18,15 @@ from calibray.errors import InputError
 from calibray.measurements.excel import sheet_text
 from calibray.measurements.source_table import SourceTable
 from calibray.support.extras import library
+from calibray.support.memory import available_memory
 from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
+
+LARGEST_TABLE: Final = 2 * 2**30
+"""Decompressed size of a Parquet file that is read at once [bytes]; pandas takes up to twice as much."""
+
+LARGEST_ROW_GROUP: Final = 2**30
+"""Decompressed size of a row group of a Parquet file that is read in pieces [bytes]."""
 
 
 def read_table(path: str | Path) -> SourceTable:
@@ -90,6 +98,8 @@ class PiecedTable:
         library("pyarrow", "parquet")
         with _open_parquet(path) as file:
             rows = file.metadata.num_rows
+            for number in range(file.metadata.num_row_groups):
+                _check_size(path, [file.metadata.row_group(number)], LARGEST_ROW_GROUP, "a row group")
         if not rows:
             raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
         return cls(str(path), rows, None)
@@ -187,15 +197,41 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
 
 
 def _read_parquet(path: Path) -> SourceTable:
-    try:
-        frame = pd.read_parquet(path, engine="pyarrow")
-    except ImportError:
-        raise InputError(
-            f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]"
-        ) from None
-    except Exception as error:
-        raise _damaged(path, error) from None
+    if find_spec("pyarrow") is None:
+        raise InputError(f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]")
+    with _open_parquet(path) as file:
+        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        _check_size(path, groups, LARGEST_TABLE, "the table")
+        try:
+            frame = file.read().to_pandas()
+        except Exception as error:
+            raise _damaged(path, error) from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
+
+
+def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> None:
+    """Refuse row groups whose declared size is too large: some kilobytes may decompress to many gigabytes.
+
+    Args:
+        path: The file.
+        groups: Metadata of the row groups that are read together.
+        limit: Largest size [bytes].
+        what: What is read together, for the message.
+
+    Raises:
+        InputError: The size exceeds the limit or the memory.
+    """
+    # A column of one repeated value takes almost no space in the file, but eight bytes for each row in memory.
+    size = sum(
+        max(group.column(index).total_uncompressed_size, 8 * group.num_rows)
+        for group in groups
+        for index in range(group.num_columns)
+    )
+    if size > min(limit, available_memory()):
+        raise InputError(
+            f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, at most {limit / 2**30:g} GiB and the free "
+            "memory are read; keep the columns and rows that you need, or write smaller row groups"
+        )
 
 
 def _open_parquet(path: Path) -> Any:
@@ -233,4 +269,6 @@ def _integer_columns_with_gaps(file: Any) -> list[str]:
 
 def _damaged(path: Path, error: Exception) -> InputError:
     """The error for a Parquet file that its library cannot read."""
+    if isinstance(error, MemoryError):
+        return InputError(f"{path}: does not fit into memory; keep the columns and rows that you need")
     return InputError(f"{path}: not a Parquet file ({first_line(error)}); export it again")
