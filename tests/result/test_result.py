@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -281,3 +283,39 @@ def test_a_result_never_takes_the_place_of_the_users_files(result, tmp_path):
     before = (home / "links.csv").read_bytes()
     result.save(home)
     assert (home / "links.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("written", [0, 1, 2, 3])
+def test_a_run_killed_between_two_files_leaves_no_mixture(result, folder, monkeypatch, written):
+    """Files are written in the order scene, links, history, result.json; the scene is the same in both runs."""
+    links = result.links.assign(measured_db=result.links.measured_db + 1, after_db=result.links.after_db + 3)
+    second = replace(result, links=links, history=result.history.assign(seconds=1.0))
+    renamed, rename = [], Path.replace
+
+    def rename_or_die(self, target):
+        if len(renamed) == written:
+            raise KeyboardInterrupt
+        renamed.append(target)
+        return rename(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", rename_or_die)
+        with pytest.raises(KeyboardInterrupt):
+            second.save(folder)
+    if written < 2:
+        assert Result.load(folder).links.measured_db.to_numpy() == pytest.approx(result.links.measured_db)
+    else:
+        for allow in (False, True):
+            with pytest.raises(InputError, match=r"another run than result\.json.*run the study again"):
+                Result.load(folder, allow_changed_inputs=allow)
+    second.save(folder)
+    assert Result.load(folder).links.measured_db.to_numpy() == pytest.approx(links.measured_db)
+
+
+def test_an_edited_table_is_refused_even_without_signatures(folder):
+    (folder / SIGNATURES).unlink()
+    file = folder / "result-links.csv"
+    file.write_text(file.read_text().replace(",True,", ",False,", 1))
+    with pytest.raises(InputError, match=r"differs from the file.*--allow-changed-inputs"):
+        Result.load(folder)
+    assert Result.load(folder, allow_changed_inputs=True) is not None

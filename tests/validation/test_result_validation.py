@@ -15,10 +15,13 @@ from calibray.reporting.summary import summary
 from calibray.reporting.trust_figures import trust_figures
 from calibray.result.files import VALIDATION_FILE, read_validation, write_validation
 from calibray.result.held_out import Model
+from calibray.study import Study
 from calibray.validation.validation import Validation
 from made_up_report import made_up
 
 LINKS = 60
+MEASURED = np.linspace(80, 120, LINKS)
+STUDY = made_up(2, 1)[0].study
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +33,18 @@ def validation() -> Validation:
         for name, size in ((Model.INITIAL, 6), (Model.CALIBRATED, 2), (Model.LOG_DISTANCE, 8))
     }
     errors[Model.LOG_DISTANCE][:5] = np.nan
-    return Validation(("west", "<b>", "east"), block, errors, random.uniform(0, 300, (LINKS, 3)))
+    return Validation(("west", "<b>", "east"), block, errors, random.uniform(0, 300, (LINKS, 3)), MEASURED)
 
 
 def test_a_validation_is_read_back(validation, tmp_path):
-    write_validation(validation, tmp_path, validation.content())
-    errors = read_validation(tmp_path, LINKS)
+    write_validation(validation, STUDY, tmp_path, validation.content())
+    errors = read_validation(tmp_path, STUDY, MEASURED)
     assert errors is not None
     stored = Validation.of(errors)
     assert stored.table.to_numpy() == pytest.approx(validation.table.to_numpy(), abs=1e-3)
     assert stored.sentence == validation.sentence
     assert stored.labels == validation.labels
-    assert read_validation(tmp_path / "none", LINKS) is None
+    assert read_validation(tmp_path / "none", STUDY, MEASURED) is None
 
 
 @pytest.mark.parametrize(
@@ -57,12 +60,23 @@ def test_a_validation_is_read_back(validation, tmp_path):
     ],
 )
 def test_a_damaged_validation_is_refused(validation, tmp_path, change, words):
-    write_validation(validation, tmp_path, validation.content())
+    write_validation(validation, STUDY, tmp_path, validation.content())
     content = json.loads((tmp_path / VALIDATION_FILE).read_text())
     change(content)
     (tmp_path / VALIDATION_FILE).write_text(json.dumps(content))
     with pytest.raises(InputError, match=words):
-        read_validation(tmp_path, LINKS)
+        read_validation(tmp_path, STUDY, MEASURED)
+
+
+def test_a_validation_of_another_study_or_of_other_measurements_is_refused(validation, tmp_path):
+    write_validation(validation, STUDY, tmp_path, validation.content())
+    other = STUDY.replace(method="gwo", seed=7)
+    assert read_validation(tmp_path, other, MEASURED) is not None
+    content = STUDY.content()
+    content["scene"]["frequency"] = 7e9
+    for study, measured in ((Study.from_content(content), MEASURED), (STUDY, MEASURED + 0.1)):
+        with pytest.raises(InputError, match="belongs to another study or other measurements"):
+            read_validation(tmp_path, study, measured)
 
 
 def test_the_report_shows_the_validation(validation):
@@ -83,7 +97,7 @@ def test_the_report_shows_the_validation(validation):
 
 
 def test_saving_a_result_removes_an_earlier_validation(validation, tmp_path: Path):
-    write_validation(validation, tmp_path, validation.content())
+    write_validation(validation, STUDY, tmp_path, validation.content())
     result, _ = made_up(LINKS, 12)
     replace(result, held_out=None).save(tmp_path)
     assert not (tmp_path / VALIDATION_FILE).exists()

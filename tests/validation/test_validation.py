@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,7 +80,9 @@ def synthetic_validation(scales, count=400, seed=4):
     random = np.random.default_rng(seed)
     position = positions(count)
     errors = {name: size * random.normal(size=count) for name, size in scales.items()}
-    return Validation(tuple("abcd"), spatial_blocks(position[:, :2], 4), errors, position)
+    return Validation(
+        tuple("abcd"), spatial_blocks(position[:, :2], 4), errors, position, np.full(count, 100.0)
+    )
 
 
 def test_the_table_has_rmse_log_density_and_coverage():
@@ -98,12 +102,7 @@ def test_intervals_from_other_blocks_do_not_cover_a_block_that_differs():
     """Negative control: coverage can fail."""
     validation = synthetic_validation({Model.INITIAL: 6.0, Model.CALIBRATED: 3.0})
     wide = np.where(validation.block == 0, 4.0, 1.0) * validation.errors[Model.CALIBRATED]
-    uneven = Validation(
-        validation.labels,
-        validation.block,
-        {**validation.errors, Model.CALIBRATED: wide},
-        validation.position,
-    )
+    uneven = replace(validation, errors={**validation.errors, Model.CALIBRATED: wide})
     assert uneven.table.loc[Model.CALIBRATED, "coverage"] < 0.85
 
 
@@ -111,7 +110,7 @@ def test_choosing_by_the_other_blocks_costs_accuracy_where_blocks_disagree():
     validation = synthetic_validation({Model.INITIAL: 3.0, Model.CALIBRATED: 3.0})
     even = validation.block % 2 == 0
     errors = {Model.INITIAL: np.where(even, 1.0, 9.0), Model.CALIBRATED: np.where(even, 9.0, 1.0)}
-    opposed = Validation(validation.labels, validation.block, errors, validation.position)
+    opposed = replace(validation, errors=errors)
     assert opposed.nested_rmse_db >= opposed.table["rmse_db"].min() - 1e-9
     # The other blocks always choose the model that fails on the block that is held out.
     assert opposed.nested_rmse_db == pytest.approx(9.0)

@@ -62,5 +62,5 @@ def validate(
     typer.echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_validation(validation, out, validation.content())
+        write_validation(validation, study, out, validation.content())
         typer.echo(f"Written to {out / VALIDATION_FILE}", err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -16,6 +17,7 @@ from calibray.result.record import (
     Accuracy,
     Cost,
     Count,
+    Digest,
     Fit,
     Nuisance,
     Prediction,
@@ -28,7 +30,14 @@ from calibray.scenes import export_scene, read_scene
 from calibray.study import Study
 from calibray.study.validation_errors import explain
 from calibray.support.messages import shortened
-from calibray.support.output_files import check_outputs, check_unchanged, write_text
+from calibray.support.output_files import (
+    check_outputs,
+    check_unchanged,
+    exists,
+    file_digest,
+    is_unchanged_output,
+    write_text,
+)
 from calibray.support.strict_models import Section
 
 VERSION: Final = 1
@@ -38,6 +47,9 @@ FILES: Final = ("result.json", "result-links.csv", "result-history.csv", "result
 """Files of a result. The prefix keeps them apart from users' own links.csv and scene.xml."""
 
 RESULT_FILE, LINKS_FILE, HISTORY_FILE, SCENE_FILE = FILES
+SIGNED_FILES: Final = (LINKS_FILE, HISTORY_FILE, SCENE_FILE)
+"""The files whose digests `result.json` holds."""
+
 VALIDATION_FILE: Final = "result-validation.json"
 
 
@@ -65,18 +77,22 @@ class Stored(Section):
     prediction: Prediction
     cost: Cost
     provenance: Provenance
+    files: dict[str, Digest]
     sentences: tuple[str, ...] = ()
 
 
 SECTIONS: Final = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "cost", "provenance")
 
 
-def content(record: Record, sentences: tuple[str, ...] = ()) -> dict[str, Any]:
+def content(
+    record: Record, sentences: tuple[str, ...] = (), files: dict[str, str] | None = None
+) -> dict[str, Any]:
     """A result as plain values, without its tables.
 
     Args:
         record: The result.
         sentences: Its remarks as text.
+        files: SHA-256 of every other file of the result, by name; None before they are written.
 
     Returns:
         The content of `result.json`.
@@ -90,6 +106,7 @@ def content(record: Record, sentences: tuple[str, ...] = ()) -> dict[str, Any]:
         "study": record.study.content(),
         "links": record.counts,
         **values,
+        "files": files or {},
         "sentences": list(sentences),
     }
 
@@ -108,7 +125,8 @@ def write(
 ) -> None:
     """Write `result.json`, its tables, the calibrated scene and, if there is one, the validation.
 
-    Each file is written under a temporary name and then renamed, so that none is ever half-written.
+    Each file is written under a temporary name and then renamed, so that none is ever half-written. `result.json` comes
+    last and holds the digests of the others: if the run is killed before that, `read` refuses the mixture of two runs.
 
     Args:
         record: The result.
@@ -133,8 +151,9 @@ def write(
         # A validation of an earlier calibration does not belong to this result.
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:
-            write_validation(record.held_out, target, validation or {})
-        write_text(target / RESULT_FILE, json.dumps(content(record, sentences), indent=2) + "\n")
+            write_validation(record.held_out, study, target, validation or {})
+        digests = {name: file_digest(target / name) for name in SIGNED_FILES}
+        write_text(target / RESULT_FILE, json.dumps(content(record, sentences, digests), indent=2) + "\n")
     except OSError as error:
         raise InputError(
             f"output folder {target}: cannot be written ({error.strerror}); name another"
@@ -152,7 +171,8 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
         The fields of a `Record`.
 
     Raises:
-        InputError: The folder holds no result, one of another version, or one that was damaged or edited.
+        InputError: The folder holds no result, one of another version, one that was damaged or edited, or files of
+            several runs.
     """
     source = Path(folder) / RESULT_FILE
     stored, study = _read_stored(source)
@@ -161,9 +181,31 @@ def read(folder: str | Path, *, allow_changed_inputs: bool = False) -> dict[str,
         for name in (RESULT_FILE, *COLUMNS, VALIDATION_FILE):
             if (source.parent / name).exists():
                 check_unchanged(source.parent / name)
-    held_out = read_validation(source.parent, len(links))
+    _check_one_run(source.parent, stored.files, allow_changed_inputs)
+    held_out = read_validation(source.parent, study, links["measured_db"].to_numpy())
     sections = {name: getattr(stored, name) for name in SECTIONS}
     return {"study": study, "links": links, "history": history, "held_out": held_out, **sections}
+
+
+def _check_one_run(folder: Path, digests: dict[str, str], allow_edits: bool) -> None:
+    """Refuse files of several runs, and edited ones unless edits are allowed."""
+    for name in SIGNED_FILES:
+        file = folder / name
+        if name not in digests:
+            raise InputError(f"{folder / RESULT_FILE}: files.{name} is missing; run the study again")
+        # Nothing is read from the scene file, so it may be absent.
+        if not exists(file) or file_digest(file) == digests[name]:
+            continue
+        if is_unchanged_output(file):
+            raise InputError(
+                f"{file}: belongs to another run than {RESULT_FILE}, because a run into this folder was interrupted or "
+                "files were copied; run the study again"
+            )
+        if not allow_edits:
+            raise InputError(
+                f"{file}: differs from the file that {RESULT_FILE} was written with; run the study again, or give "
+                "--allow-changed-inputs (allow_changed_inputs=True)"
+            )
 
 
 def _read_stored(source: Path) -> tuple[Stored, Study]:
@@ -238,22 +280,25 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
         )
 
 
-def write_validation(held_out: HeldOutErrors, folder: Path, figures: dict[str, Any]) -> None:
+def write_validation(held_out: HeldOutErrors, study: Study, folder: Path, figures: dict[str, Any]) -> None:
     """Write held-out errors into a result's folder.
 
     Args:
         held_out: The errors.
+        study: The study that was validated.
         folder: The folder.
         figures: The figures of the validation, for readers of the file.
     """
     values = {
         "version": VERSION,
         **figures,
+        "problem": _problem_digest(study),
         "blocks": list(held_out.labels),
         "level": held_out.level,
         "links": {
             "block": held_out.block.tolist(),
             "position": np.round(held_out.position, 4).tolist(),
+            "measured_db": _rounded(held_out.measured_db),
             "errors_db": {str(name): _rounded(errors) for name, errors in held_out.errors.items()},
         },
     }
@@ -265,30 +310,47 @@ def _rounded(values: NDArray[np.float64]) -> list[float | None]:
     return [round(value, 4) if np.isfinite(value) else None for value in values.tolist()]
 
 
-def read_validation(folder: Path, links: int) -> HeldOutErrors | None:
+def _problem_digest(study: Study) -> str:
+    """SHA-256 of what a study's validation depends on: `run` may use another method, seed or engine."""
+    content = {
+        key: value for key, value in study.content().items() if key not in ("method", "engine", "holdout")
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def read_validation(folder: Path, study: Study, measured_db: NDArray[np.float64]) -> HeldOutErrors | None:
     """Read the held-out errors of a result.
 
     Args:
         folder: The result's folder.
-        links: Number of links of the result.
+        study: The result's study.
+        measured_db: Measured path loss of the result's links [links], [dB].
 
     Returns:
         The errors; None without validation.
 
     Raises:
-        InputError: The file was damaged, edited, or belongs to other links.
+        InputError: The file was damaged, edited, or belongs to another study or other links.
     """
     file = folder / VALIDATION_FILE
     if not file.is_file():
         return None
     try:
-        return _checked_validation(file, json.loads(file.read_text(encoding="utf-8")), links)
+        values = json.loads(file.read_text(encoding="utf-8"))
+        held_out = _checked_validation(file, values, len(measured_db))
+        belongs = values["problem"] == _problem_digest(study)
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{file}: is not a validation of `calibray validate` ({error}); validate again"
         ) from None
+    if not belongs or np.abs(held_out.measured_db - measured_db).max() > 1e-3:
+        raise InputError(
+            f"{file}: belongs to another study or other measurements than {RESULT_FILE}; run the study again, or "
+            "remove the file and validate again"
+        )
+    return held_out
 
 
 def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldOutErrors:
@@ -300,10 +362,11 @@ def _checked_validation(file: Path, values: dict[str, Any], links: int) -> HeldO
         block=np.array(rows["block"], dtype=np.int64),
         errors={str(name): np.array(errors, dtype=float) for name, errors in rows["errors_db"].items()},
         position=np.array(rows["position"], dtype=float),
+        measured_db=np.array(rows["measured_db"], dtype=float),
         level=float(values["level"]),
     )
     block, position = held_out.block, held_out.position
-    lengths = {"block": len(block), "position": len(position)}
+    lengths = {"block": len(block), "position": len(position), "measured_db": len(held_out.measured_db)}
     lengths |= {name: len(errors) for name, errors in held_out.errors.items()}
     if wrong := [name for name, length in lengths.items() if length != links]:
         raise InputError(f"{file}: {wrong[0]} must have the result's {links} links; validate again")

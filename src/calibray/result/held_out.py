@@ -49,6 +49,7 @@ class HeldOutErrors:
         block: Block of every link [links]; -1 where it is not judged.
         errors: Modelled minus measured path loss by name of the model [links], [dB]; NaN where it is not judged.
         position: Positions of the receivers [links, 3], [m].
+        measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
     """
 
@@ -56,6 +57,7 @@ class HeldOutErrors:
     block: NDArray[np.int64]
     errors: dict[str, NDArray[np.float64]]
     position: NDArray[np.float64]
+    measured_db: NDArray[np.float64]
     level: float = 0.9
 
 

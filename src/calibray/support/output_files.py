@@ -277,9 +277,13 @@ def _refuse_signature_file(path: Path, fault: str) -> NoReturn:
 
 def _signature(file: Path, name: str) -> str:
     """The line of a file, in which a name with line breaks is escaped."""
-    name = name if name.isprintable() else ascii(name)
+    return f"{file_digest(file)}  {name if name.isprintable() else ascii(name)}"
+
+
+def file_digest(file: Path) -> str:
+    """The SHA-256 of a file's content."""
     with file.open("rb") as stream:
-        return f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name}"
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 # Writing

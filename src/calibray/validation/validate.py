@@ -127,7 +127,7 @@ def validate_problem(
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
     complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
-    return Validation(labels, np.where(judged, block, -1), complete, links.rx)
+    return Validation(labels, np.where(judged, block, -1), complete, links.rx, objective.measured)
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:

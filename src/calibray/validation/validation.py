@@ -43,7 +43,9 @@ class Validation(HeldOutErrors):
         """
         if isinstance(errors, Validation):
             return errors
-        return cls(errors.labels, errors.block, errors.errors, errors.position, errors.level)
+        return cls(
+            errors.labels, errors.block, errors.errors, errors.position, errors.measured_db, errors.level
+        )
 
     def __repr__(self) -> str:
         return display.text(*self.summary())
