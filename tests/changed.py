@@ -11,7 +11,7 @@ SECTIONS = ("fit", "accuracy", "uncertainty", "nuisance", "prediction", "cost", 
 
 
 def changed(result: Result, **values: Any) -> Result:
-    """A result with other values.
+    """A result with other values; the prediction model has the same parameters, materials and nuisance.
 
     Args:
         result: The result.
@@ -20,6 +20,17 @@ def changed(result: Result, **values: Any) -> Result:
     Returns:
         The changed result.
     """
+    prediction = result.prediction
+    model = prediction.model
+    if "parameters" in values:
+        model = replace(model, parameters=values["parameters"])
+    if "coefficients" in values:
+        coefficients = values["coefficients"]
+        terms = [term for term in model.terms if coefficients.get(term.name)]
+        terms = [replace(term, coefficients=coefficients[term.name]) for term in terms]
+        model = replace(model, terms=tuple(terms))
+    materials = values.get("materials", prediction.materials)
+    result = replace(result, prediction=replace(prediction, model=model, materials=materials))
     for section in SECTIONS:
         part = getattr(result, section)
         names = {field.name for field in fields(part)} & set(values)

@@ -56,7 +56,7 @@ def made_up(
     table = pd.DataFrame({
         "row": np.arange(2, links + 2), "measured_db": measured, "before_db": after + 3, "after_db": after,
         "log_distance_db": 40 + 30 * np.log10(distance), "has_path": np.isfinite(after),
-        "held_out": rx[:, 0] > 0.7 * side, "retrace_gap_db": np.nan,
+        "held_out": rx[:, 0] > 0.7 * side, "retrace_gap_db": np.nan, "predicted_db": after, "scene_db": after - 1.0,
         **{f"{end}_{axis}": at[:, k] for end, at in (("tx", tx), ("rx", rx)) for k, axis in enumerate("xyz")},
         "group": np.array(groups, dtype=object)[np.arange(links) % len(groups)],
     })  # fmt: skip

@@ -157,7 +157,7 @@ def test_measured_links_nearby_correct_predictions_and_narrow_the_interval(recei
     assert received.prediction.residual_field is None
     table = planted.links().assign(sent_dbm=30.0)
     plain = received.predict_interval(table)
-    size = received.accuracy.residual_db
+    size = received.prediction.model.residual_db
     field = ResidualField(range_m=20.0, shared_db=0.9 * size, own_db=0.4 * size)
     with_field = changed(received, residual_field=field)
     predictions = with_field.predict_interval(table)

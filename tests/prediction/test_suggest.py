@@ -104,7 +104,9 @@ def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
 def _predicted(result: Result, links: pd.DataFrame, value: float) -> np.ndarray:
     """Path loss of links for another permittivity, with the result's offset."""
     ground = replace(result.materials["ground"], relative_permittivity=value)
-    return changed(result, materials={"ground": ground}).predict(links[[*COLUMNS, "site"]])
+    return changed(result, materials={"ground": ground}, parameters={NAME: value}).predict(
+        links[[*COLUMNS, "site"]]
+    )
 
 
 def test_intervals_are_expected_to_narrow_with_every_suggestion(result, table):

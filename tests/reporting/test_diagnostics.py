@@ -23,7 +23,7 @@ def result() -> Result:
 def planted(result: Result, errors: np.ndarray, **columns: np.ndarray) -> Result:
     """The calibration with the given residuals; all links have a path and are calibration links."""
     links = result.links.assign(held_out=False, has_path=True, **columns)
-    return changed(result, links=links.assign(after_db=links.measured_db + errors))
+    return changed(result, links=links.assign(predicted_db=links.measured_db + errors))
 
 
 def finding(result: Result, name: str) -> str:

@@ -60,10 +60,10 @@ def test_plain_sionna_gives_the_reported_path_loss(folder, tmp_path):
     links = Result.load(folder / "out").links
     assert [int(row["row"]) for row in rows] == links.row.tolist()
     computed = np.array([float(row["computed_db"]) for row in rows])
-    assert np.isinf(computed).tolist() == np.isinf(links.after_db).tolist()
+    assert np.isinf(computed).tolist() == np.isinf(links.predicted_db).tolist()
     reached = np.isfinite(computed)
     assert reached.sum() == len(links) - 1
-    assert computed[reached] == pytest.approx(links.after_db[reached].to_numpy(), abs=LIMIT_DB)
+    assert computed[reached] == pytest.approx(links.predicted_db[reached].to_numpy(), abs=LIMIT_DB)
     # Nor would the scene before calibration, or one without offsets, have done.
     assert np.abs(computed[reached] - links.before_db[reached].to_numpy()).max() > 10 * LIMIT_DB
     assert "calibray" not in (tmp_path / "there" / "load_scene.py").read_text().replace("Calibray", "")

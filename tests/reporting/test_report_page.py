@@ -205,7 +205,7 @@ def test_inputs_that_cannot_be_read_any_more_are_listed(written, result, monkeyp
     content["links"]["file"], content["scene"]["file"] = "absent.csv", "absent.xml"
     gone = replace(
         gone, study=cb.Study.from_content(content, "study.toml"), links=gone.links[["row", "measured_db", "before_db",
-        "after_db", "log_distance_db", "has_path", "held_out"]],
+        "after_db", "log_distance_db", "has_path", "held_out", "predicted_db", "scene_db"]],
     )  # fmt: skip
     cb.report(gone, tmp_path / "report.html")
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))

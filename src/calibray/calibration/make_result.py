@@ -31,9 +31,10 @@ from calibray.uncertainty.link_diagnostics import diagnose_links
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance
-from calibray.validation.choice import choose_model
-from calibray.validation.held_out_statistics import compare
+from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
+from calibray.validation.held_out_statistics import choose, compare
 from calibray.validation.validation import Validation
+from calibray.validation.variants import add_nuisance, initial_objective
 
 FEWEST_HELD_OUT: Final = 8
 """Held-out links from which a standard deviation of residuals is computed; with fewer, that of the fit is used."""
@@ -136,13 +137,14 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         }
     )
     table = table.assign(**_as_measured(study, links, table))
-    model = None
     if validation is None:
-        accuracy = _on_held_out_links(problem, trail, models)
+        accuracy, name, residuals = _on_held_out_links(problem, trail, models)
     else:
-        accuracy = _on_blocks(validation, _rmse(problem, models.initial, validation.judged), fitted)
-        model, by_model = choose_model(problem, validation, parameters.to_search(trail.best))
-        table = table.assign(chosen_db=by_model)
+        accuracy, name, residuals = _on_blocks(
+            validation, _rmse(problem, models.initial, validation.judged), fitted
+        )
+    chosen = fit_prediction_model(problem, trail, name, residuals)
+    table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db)
     return Result(
         study=study,
         fit=Fit(
@@ -171,7 +173,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             ),
         ),
         nuisance=_nuisance(problem, coefficients[0]),
-        prediction=Prediction(model, _residual_field(problem, table)),
+        prediction=Prediction(chosen.model, chosen.materials, _residual_field(problem, table)),
         cost=Cost(
             rt_calls=trail.rt_calls,
             ledger_hits=trail.ledger_hits,
@@ -196,8 +198,10 @@ def _rmse(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_])
     return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
 
 
-def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accuracy:
-    """Accuracy on the links that a filter holds out."""
+def _on_held_out_links(
+    problem: Problem, trail: Trail, models: Models
+) -> tuple[Accuracy, str, HeldOutResiduals]:
+    """Accuracy on the links that a filter holds out, the model that they choose, and its residuals."""
     objective, links = problem.objective, problem.setup.links
     fitted = bool(objective.nuisance.terms)
     reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
@@ -217,39 +221,67 @@ def _on_held_out_links(problem: Problem, trail: Trail, models: Models) -> Accura
         judgement = compare(errors, others, links.rx[judged])
         # No link has a residual in all models.
         judgement = judgement if judgement.links else None
-    residual_db, basis = None, "too few links"
-    if len(errors) >= FEWEST_HELD_OUT:
-        residual_db, basis = float(np.sqrt(np.mean(errors**2))), f"{len(errors)} links held out"
-    elif problem.freedom >= 1:
-        residual_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
-        basis = f"{objective.num_counted} calibration links"
+    name, residuals = _choice_on_held_out_links(problem, trail, models, judged)
 
     def rmse(model: NDArray[np.float64]) -> float | None:
         return _rmse(problem, model, judged) if judged.any() else None
 
-    return Accuracy(
+    accuracy = Accuracy(
         holdout_rmse_db=rmse(models.calibrated),
         initial_holdout_rmse_db=rmse(models.initial),
         nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
         log_distance_holdout_rmse_db=rmse(models.log_distance),
         judgement=judgement,
-        residual_db=residual_db,
-        residual_basis=basis,
     )
+    return accuracy, name, residuals
 
 
-def _on_blocks(validation: Validation, initial_db: float | None, fitted: bool) -> Accuracy:
-    """Accuracy on blocks that were held out in turn."""
+def _choice_on_held_out_links(
+    problem: Problem, trail: Trail, models: Models, judged: NDArray[np.bool_]
+) -> tuple[str, HeldOutResiduals]:
+    """The model that held-out links choose, and its residuals there; the calibrated model if they are too few."""
+    objective, setup = problem.objective, problem.setup
+    modelled = {
+        Model.INITIAL: add_nuisance(initial_objective(objective, setup), problem.before),
+        Model.CALIBRATED: models.calibrated,
+        Model.LOG_DISTANCE: models.log_distance,
+    }
+    errors = {name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()}
+    finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
+    errors, count = {name: each[finite] for name, each in errors.items()}, int(finite.sum())
+    if count >= FEWEST_HELD_OUT:
+        name = choose(errors, setup.links.rx[judged][finite])
+        rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
+        basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
+        return name, HeldOutResiduals(rms_db, basis, count, errors[name])
+    rms_db = None
+    if problem.freedom >= 1:
+        rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
+    basis = f"errors of {objective.num_counted} calibration links"
+    freedom = max(objective.num_counted - len(problem.parameters), 1)
+    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, freedom, np.zeros(0))
+
+
+def _on_blocks(
+    validation: Validation, initial_db: float | None, fitted: bool
+) -> tuple[Accuracy, str, HeldOutResiduals]:
+    """Accuracy on blocks that were held out in turn, the model that they choose, and its residuals."""
     rmse = validation.table["rmse_db"]
-    return Accuracy(
+    name = validation.chosen
+    residuals = HeldOutResiduals(
+        validation.scale(name),
+        f"{name}, errors on {len(validation.labels)} blocks held out in turn",
+        int(np.count_nonzero(validation.judged)),
+        validation.errors[name][validation.judged],
+    )
+    accuracy = Accuracy(
         holdout_rmse_db=float(rmse[Model.CALIBRATED]),
         initial_holdout_rmse_db=initial_db,
         nuisance_only_holdout_rmse_db=float(rmse[Model.INITIAL]) if fitted else None,
         log_distance_holdout_rmse_db=float(rmse[Model.LOG_DISTANCE]),
         judgement=validation.judgement,
-        residual_db=validation.scale(Model.CALIBRATED),
-        residual_basis=f"{len(validation.labels)} blocks held out in turn",
     )
+    return accuracy, name, residuals
 
 
 def _not_judged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:

@@ -26,6 +26,10 @@ def export(
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.calibration.result import Result
     from calibray.reporting.export import export as write
+    from calibray.result.wording import scene_alone_text
 
-    names = write(Result.load(folder), out, copy, overwrite)
+    result = Result.load(folder)
+    names = write(result, out, copy, overwrite)
+    if warning := scene_alone_text(result):
+        typer.echo(f"Note: {warning}", err=True)
     typer.echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -13,7 +13,6 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, OFFSET, UNKNOWN_DB, transmitters
 from calibray.measurements import Measurements
 from calibray.result.prediction_model import PredictionModel
-from calibray.result.record import Record
 
 TRANSMITTER: Final = "transmitter"
 """`FittedTerm.per` of a term with one coefficient per transmitter, which needs no column."""
@@ -48,35 +47,8 @@ class Shift(NamedTuple):
     spread_db: NDArray[np.float64]
 
 
-def calibrated_terms(result: Record, links: Measurements) -> Iterator[TermAtLinks]:
-    """Terms of the calibrated model.
-
-    Args:
-        result: The calibration.
-        links: The new links.
-
-    Yields:
-        The terms.
-
-    Raises:
-        InputError: The links lack a column.
-    """
-    study, nuisance = result.study, result.nuisance
-    for name, coefficients in nuisance.coefficients.items():
-        if not coefficients:
-            continue
-        if name == OFFSET:
-            grouped = study.offset is not None and study.offset.per is not None
-            yield TermAtLinks(name, np.ones(len(links)), links.group if grouped else None, coefficients)
-        else:
-            section = study.nuisance[name]
-            labels = None if section.per is None else links.table.labels(section.per)
-            column = _column(links, section.by, nuisance.centres.get(name, 0.0))
-            yield TermAtLinks(name, column, labels, coefficients)
-
-
-def chosen_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
-    """Terms of the prediction model that validation chose.
+def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtLinks]:
+    """Terms of the prediction model.
 
     Args:
         model: The model.

@@ -10,14 +10,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from calibray import fields
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.measurements import Measurements, SourceTable
-from calibray.prediction.nuisance_shift import Shift, calibrated_terms, chosen_terms, nuisance_shift
+from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
-from calibray.result.prediction_model import PredictionModel
+from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
@@ -140,8 +139,7 @@ def check_groups(result: Record, links: Measurements) -> None:
     Raises:
         InputError: A group has no calibrated coefficient, or a column is missing.
     """
-    model = result.prediction.model
-    nuisance_shift(calibrated_terms(result, links) if model is None else chosen_terms(model, links), links)
+    nuisance_shift(model_terms(result.prediction.model, links), links)
 
 
 def interval(
@@ -166,33 +164,29 @@ def interval(
         return pd.DataFrame({"path_loss_db": _path_loss(result, setup, progress)})
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
-    links, field = setup.links, result.prediction.residual_field
+    links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
+    if model.residual_db is None:
+        raise InputError(
+            f"{result.study.path}: {result.counts['calibrated_on']} links are too few to estimate the size of "
+            "residuals; measure more, or predict without a level"
+        )
     field_db, known_share = _residual_field(result, links)
-    model = result.prediction.model
-    if model is not None:
-        path_loss_db, shift = _chosen_model(result, model, setup, progress, new_groups=True)
-        best, variance, basis = path_loss_db + shift.value_db[0], shift.spread_db**2, model.basis
-        rms_db, absolute_errors, freedom = model.residual_db, np.array(model.sizes_db), model.links
-    else:
-        rms_db, basis, absolute_errors = _residual_size(result)
-        draws, names = result.uncertainty.draws, setup.parameters.names
-        shift = nuisance_shift(calibrated_terms(result, links), links, draws, new_groups=True)
-        values = np.array([[result.parameters[name] for name in names]])
-        if draws:
-            values = np.vstack([values, np.stack([draws[name] for name in names], axis=1)])
-        engine = replay(setup, setup.trace(result.materials, progress))
-        modelled = engine.path_loss(values) + shift.value_db
-        best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
-        deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
-        variance = shift.spread_db**2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
-        best = np.where(reached, best, np.inf)
-        freedom = max(result.counts["calibrated_on"] - len(names), 1)
-        basis += "" if draws else ", without uncertainty of the parameters"
+    draws = _draws(result)
+    shift = nuisance_shift(model_terms(model, links), links, draws, new_groups=True)
+    modelled = _modelled(result, setup, draws, progress) + shift.value_db
+    best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
+    deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
+    variance = shift.spread_db**2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
+    best = np.where(reached, best, np.inf)
+    rms_db, absolute_errors = model.residual_db, np.array(model.sizes_db)
+    basis = model.basis
+    if result.held_out is None and model.parameters is not None and not draws:
+        basis += ", without uncertainty of the parameters"
     # Near measured links the residual field is known, and only the uncorrelated part of the residual is left.
     uncorrelated_db = rms_db if field is None else min(field.own_db, rms_db)
     total_db = np.sqrt((1.0 - known_share) * rms_db**2 + known_share * uncorrelated_db**2 + variance)
     if len(absolute_errors) < FEWEST_FOR_RANKS:
-        factor = float(stdtrit(freedom, (1 + level) / 2))
+        factor = float(stdtrit(model.links, (1 + level) / 2))
     else:
         factor = interval_half_width(absolute_errors, level) / max(rms_db, 1e-9)
     link_basis = np.where(shift.spread_db > 0, f"{basis}, group without measurements", basis)
@@ -254,35 +248,38 @@ def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] |
 
 def _path_loss(result: Record, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
     """Path loss at opened links, with nuisances and the residual field [links], [dB]."""
-    links, study = setup.links, result.study
-    field_db, _ = _residual_field(result, links)
-    if result.prediction.model is not None:
-        path_loss_db, shift = _chosen_model(
-            result, result.prediction.model, setup, progress, new_groups=False
-        )
-        return path_loss_db + shift.value_db[0] + field_db
-    added = nuisance_shift(calibrated_terms(result, links), links).value_db[0] + field_db
-    paths = setup.trace(result.materials, progress)
-    if links.frequency is None:
-        return fields.path_loss(paths, None, study.objective.combining, study.scene.bandwidth) + added
-    values = np.array([[result.parameters[name] for name in setup.parameters.names]])
-    return replay(setup, paths).path_loss(values)[0] + added
-
-
-def _chosen_model(
-    result: Record, model: PredictionModel, setup: Setup, progress: Progress | None, new_groups: bool
-) -> tuple[NDArray[np.float64], Shift]:
-    """Path loss of the model that validation chose, without its nuisances [links], [dB], and the nuisances."""
     links = setup.links
-    shift = nuisance_shift(chosen_terms(model, links), links, new_groups=new_groups)
-    if model.parameters is None:
+    field_db, _ = _residual_field(result, links)
+    # A group without a coefficient is refused before anything is traced.
+    shift = nuisance_shift(model_terms(result.prediction.model, links), links)
+    return _modelled(result, setup, {}, progress)[0] + shift.value_db[0] + field_db
+
+
+def _draws(result: Record) -> dict[str, list[float]]:
+    """Draws from the posterior, whose spread widens the intervals of predictions.
+
+    They are of the calibrated model. Errors of a model on held-out blocks include the uncertainty of its parameters.
+    """
+    calibrated = result.prediction.model.name == Model.CALIBRATED and result.held_out is None
+    return result.uncertainty.draws if calibrated else {}
+
+
+def _modelled(
+    result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
+) -> NDArray[np.float64]:
+    """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
+    prediction, links, names = result.prediction, setup.links, setup.parameters.names
+    if prediction.model.parameters is None:
         # The log-distance model consists of nuisances, apart from the free-space rise over carriers.
         carrier = result.study.scene.frequency if links.frequency is None else links.frequency
-        return 20 * np.log10(np.full(len(links), carrier) / result.study.scene.frequency), shift
-    values = np.array([[model.parameters[name] for name in setup.parameters.names]])
-    path_loss_db = replay(setup, setup.trace(result.materials, progress)).path_loss(values)[0]
-    ceiling_db = result.study.objective.ceiling_db
-    return path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db), shift
+        return 20 * np.log10(np.full((1, len(links)), carrier) / result.study.scene.frequency)
+    values = np.array([[prediction.model.parameters[name] for name in names]])
+    if draws:
+        values = np.vstack([values, np.stack([draws[name] for name in names], axis=1)])
+    path_loss_db = replay(setup, setup.trace(prediction.materials, progress)).path_loss(values)
+    # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
+    ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
+    return path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
 
 
 def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -293,26 +290,6 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
     rows, residuals = calibration_residuals(result.links)
     measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
     return krige_residuals(field, measured, residuals, np.hstack([links.tx, links.rx]))
-
-
-def _residual_size(result: Record) -> tuple[float, str, NDArray[np.float64]]:
-    """Standard deviation of a link's residual [dB], its source, and absolute held-out residuals, ascending [dB]."""
-    accuracy = result.accuracy
-    if accuracy.residual_db is not None:
-        table, absolute_errors = result.links, np.zeros(0)
-        if accuracy.residual_basis.endswith("links held out"):
-            errors = np.abs(table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float))
-            absolute_errors = np.sort(errors[table["held_out"].to_numpy(bool) & np.isfinite(errors)])
-        return accuracy.residual_db, f"errors of {accuracy.residual_basis}", absolute_errors
-    count = result.counts["calibrated_on"]
-    freedom = count - len(result.parameters) - len(result.nuisance.offsets_db)
-    if freedom < 1:
-        raise InputError(
-            f"{result.study.path}: {count} links are too few to estimate the size of residuals; measure more, or "
-            "predict without a level"
-        )
-    rms_db = result.rmse_db * float(np.sqrt(count / freedom))
-    return rms_db, f"errors of {count} calibration links", np.zeros(0)
 
 
 def _check_unchanged(result: Record, setup: Setup) -> None:

@@ -79,7 +79,7 @@ def calibration_residuals(links: pd.DataFrame) -> tuple[NDArray[np.int64], NDArr
     Returns:
         Rows of the calibration links that have a path [m], and their measured minus modelled path loss [m], [dB].
     """
-    modelled = links["chosen_db" if "chosen_db" in links else "after_db"].to_numpy(float)
+    modelled = links["predicted_db"].to_numpy(float)
     counted = links["has_path"].to_numpy(bool) & ~links["held_out"].to_numpy(bool) & np.isfinite(modelled)
     if "faint" in links:
         counted &= ~links["faint"].to_numpy(bool)

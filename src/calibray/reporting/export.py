@@ -10,12 +10,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS
 from calibray.reporting.link_survey import survey
 from calibray.result.record import Record
+from calibray.result.wording import scene_alone_text
 from calibray.scenes import export_scene, read_scene
 from calibray.scenes.export import exported_id
 from calibray.support.output_files import check_outputs, write_text
@@ -52,7 +54,8 @@ def export(
         overwrite: Replace files that Calibray did not write.
 
     Returns:
-        Names of the files in the folder.
+        Names of the files in the folder. `wording.scene_alone_text` says how far the scene alone is from the
+        predictions.
 
     Raises:
         InputError: The folder cannot be written, a file in it must not be replaced, or the scene or the links cannot
@@ -80,14 +83,14 @@ def export(
     content = {
         "load_scene.py": script.read_text(encoding="utf-8"),
         "calibration.json": _json(_calibration(result)),
-        "links.csv": result.links.assign(**positions, **group).to_csv(index=False, float_format="%.9g"),
+        "links.csv": _links(result).assign(**positions, **group).to_csv(index=False, float_format="%.9g"),
         "materials.csv": materials.to_csv(index=False, float_format="%.9g"),
         "materials.json": _json({row["material"]: _without_unknown(row) for row in rows}),
         "materials.m": matlab(materials, study.scene.frequency),
     }
     try:
         target.mkdir(parents=True, exist_ok=True)
-        export_scene(scene, result.materials, target / "scene.xml", copy_meshes, overwrite)
+        export_scene(scene, result.scene_materials, target / "scene.xml", copy_meshes, overwrite)
         for name, text in content.items():
             write_text(target / name, text)
     except OSError as error:
@@ -95,6 +98,16 @@ def export(
             f"output folder {target}: cannot be written ({error.strerror}); choose another"
         ) from None
     return FILES
+
+
+def _links(result: Record) -> pd.DataFrame:
+    """The links, with the nuisance that predictions add to the scene, and the path loss that the script reports [dB]."""
+    scene_db, predicted_db = (result.links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
+    if result.prediction.model.parameters is None:
+        return result.links.assign(nuisance_db=0.0, reported_db=scene_db)
+    both = np.isfinite(scene_db) & np.isfinite(predicted_db)
+    nuisance_db = np.where(both, np.where(both, predicted_db, 0.0) - np.where(both, scene_db, 0.0), 0.0)
+    return result.links.assign(nuisance_db=nuisance_db, reported_db=np.where(both, predicted_db, np.inf))
 
 
 def matlab(materials: pd.DataFrame, frequency: float) -> str:
@@ -119,8 +132,8 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
-    """One row per material: its constants, and interval and verdict of every calibrated one."""
-    for name, material in result.materials.items():
+    """One row per material: the constants that predictions use, and interval and verdict of every calibrated one."""
+    for name, material in result.scene_materials.items():
         row: dict[str, Any] = {"material": name, "scene_name": exported_id(name).removeprefix("mat-")}
         row |= {field: getattr(material, field) for field in FIELDS}
         row["scattering_pattern"] = material.scattering_pattern
@@ -154,7 +167,7 @@ def _calibration(result: Record) -> dict[str, Any]:
                 else {}
             ),
         }
-        for name, material in result.materials.items()
+        for name, material in result.scene_materials.items()
         if material.scattering_pattern != "lambertian"
     }
     return {
@@ -164,7 +177,9 @@ def _calibration(result: Record) -> dict[str, Any]:
         "antennas": {"tx": asdict(tx), "rx": asdict(rx)},
         "solver": {SOLVER.get(name, name): value for name, value in _with_samples(study.trace).items()},
         "scattering_patterns": patterns,
-        "offsets_db": result.nuisance.offsets_db,
+        "prediction_model": str(result.prediction.model.name),
+        "nuisance": {term.name: term.coefficients for term in result.prediction.model.terms},
+        "scene_alone": scene_alone_text(result),
     }
 
 

@@ -37,12 +37,12 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Calibrated minus measured path loss [L], [dB]; NaN without a path."""
+        """Predicted minus measured path loss [L], [dB]; NaN without a path."""
         return residual(self.table)
 
 
 def residual(table: pd.DataFrame) -> NDArray[np.float64]:
-    """Calibrated minus measured path loss.
+    """Predicted minus measured path loss.
 
     Args:
         table: A result's links.
@@ -50,7 +50,7 @@ def residual(table: pd.DataFrame) -> NDArray[np.float64]:
     Returns:
         Residuals [L], [dB]; NaN for links without a path.
     """
-    difference = table["after_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
+    difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return np.where(np.isfinite(difference), difference, np.nan)
 
 

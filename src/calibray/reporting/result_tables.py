@@ -129,13 +129,19 @@ def parameters(result: Record) -> Table:
     Returns:
         The table.
     """
+    predicted = result.prediction.model.parameters
+    differs = predicted is not None and predicted != result.parameters
     rows = []
     for name, after in result.parameters.items():
         heading = Column(name, _unit(name)).heading
         before, interval = result.fit.initial_parameters[name], result.intervals.get(name)
         certainty = (interval_text(interval), interval.label) if interval else ("-", "unknown")
-        rows.append((heading, f"{before:.4g}", f"{after:.4g}", *certainty))
-    columns = (Column(), numbers("before"), numbers("after"), numbers("95 % interval"), Column("verdict"))
+        used = (f"{predicted[name]:.4g}",) if predicted is not None and differs else ()
+        rows.append((heading, f"{before:.4g}", f"{after:.4g}", *used, *certainty))
+    columns = (
+        Column(), numbers("before"), numbers("after"), *([numbers("in predictions")] if differs else []),
+        numbers("95 % interval"), Column("verdict"),
+    )  # fmt: skip
     return Table("Parameters", columns, tuple(rows))
 
 
@@ -251,6 +257,7 @@ class Value:
         pieces: Ends of every piece of the interval on the bar, 0 to 1.
         reason: The reason of the verdict; empty if unknown.
         approximate: Whether the interval comes from an emulator of the engine.
+        predicted: The value that predictions use; empty if it is the calibrated one, or predictions use no scene.
     """
 
     name: str
@@ -265,6 +272,7 @@ class Value:
     pieces: tuple[tuple[float, float], ...] = ()
     reason: str = ""
     approximate: bool = False
+    predicted: str = ""
 
     @property
     def mark(self) -> str:
@@ -281,7 +289,7 @@ def values(result: Record) -> list[Value]:
     Returns:
         One entry per parameter, in the study's order.
     """
-    entries = []
+    entries, predicted = [], result.prediction.model.parameters
     for name, after in result.parameters.items():
         section, interval = result.study.parameters[name], result.intervals.get(name)
         before, position = result.fit.initial_parameters[name], _bar(*section.bounds, section.scale)
@@ -300,6 +308,7 @@ def values(result: Record) -> list[Value]:
                 tuple((position(low), position(high)) for low, high in pieces),
                 "" if interval is None else reason_text(interval.reason),
                 interval is not None and interval.approximate,
+                "" if predicted is None or predicted[name] == after else f"{predicted[name]:.4g}",
             )
         )
     return entries

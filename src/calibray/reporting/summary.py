@@ -10,7 +10,13 @@ from calibray.optimizers.methods import label
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
-from calibray.result.wording import NOT_JUDGED, block_sentence, judgement_text
+from calibray.result.wording import (
+    NOT_JUDGED,
+    block_sentence,
+    judgement_text,
+    prediction_text,
+    scene_alone_text,
+)
 from calibray.tables.display import hertz, named
 from calibray.tables.text import rows_text
 from calibray.validation.validation import Validation
@@ -59,6 +65,7 @@ def summary(result: Record, links_by_material: Mapping[str, int] | None = None) 
         measure next, and warnings.
     """
     return (
+        Sentence("What do predictions use?", f"{prediction_text(result)} {scene_alone_text(result)}".strip()),
         _scope(result),
         _fit(result),
         _held_out_accuracy(result),

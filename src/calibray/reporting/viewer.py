@@ -83,7 +83,7 @@ def strongest(paths: Paths, result: Record) -> Rays:
     Returns:
         The paths that are shown.
     """
-    gain = path_gains(paths, result.materials).reshape(paths.num_paths, -1)
+    gain = path_gains(paths, result.scene_materials).reshape(paths.num_paths, -1)
     # Summed over receive ports and averaged over transmit ports, as in path loss.
     power = (np.abs(gain) ** 2).sum(axis=1) / paths.tx_field.shape[1]
     gain_db = 10 * np.log10(np.maximum(power, 1e-40))

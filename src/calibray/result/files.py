@@ -145,7 +145,7 @@ def write(
         scene = record.scene or read_scene(
             study.scene_source, study.scene.frequency, study.overrides, study.objects
         )
-        export_scene(scene, record.materials, target / SCENE_FILE)
+        export_scene(scene, record.scene_materials, target / SCENE_FILE)
         write_text(target / LINKS_FILE, record.links.to_csv(index=False, float_format="%.10g"))
         write_text(target / HISTORY_FILE, record.history.to_csv(index=False, float_format="%.9g"))
         # A validation of an earlier calibration does not belong to this result.

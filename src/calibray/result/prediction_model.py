@@ -26,22 +26,22 @@ class FittedTerm:
 
 @dataclass(frozen=True)
 class PredictionModel:
-    """The model that validation chose, fitted to all links.
+    """A model fitted to the calibration links, and its errors on new links.
 
     Attributes:
         name: Its name; see `held_out.Model`.
         parameters: Values of the parameters in the fields' units; None where the model uses no scene.
         terms: Its nuisance terms.
-        residual_db: Root mean square of its held-out residuals [dB].
+        residual_db: Root mean square of its residuals on new links [dB]; None if there are too few links.
         basis: The links that these residuals were computed on.
-        links: Number of these links.
+        links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
     """
 
     name: str
     parameters: dict[str, float] | None
     terms: tuple[FittedTerm, ...] = field(default_factory=tuple)
-    residual_db: float = 0.0
+    residual_db: float | None = None
     basis: str = ""
     links: int = 1
     sizes_db: tuple[float, ...] = ()

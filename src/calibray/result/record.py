@@ -67,8 +67,6 @@ class Accuracy:
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model [dB].
         judgement: The calibrated model compared with its best baseline.
-        residual_db: Standard deviation of a link's residual that predictions assume [dB]; None where unknown.
-        residual_basis: The links that it was computed on.
     """
 
     holdout_rmse_db: NonNegative | None = None
@@ -76,8 +74,6 @@ class Accuracy:
     nuisance_only_holdout_rmse_db: NonNegative | None = None
     log_distance_holdout_rmse_db: NonNegative | None = None
     judgement: Judgement | None = None
-    residual_db: NonNegative | None = None
-    residual_basis: str = ""
 
 
 @dataclass(frozen=True)
@@ -124,14 +120,16 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The model that predictions use.
+    """The model that predictions, maps, exports and the report use.
 
     Attributes:
-        model: The model that validation chose; None without validation, where the calibrated model is used.
-        residual_field: The correlated part of the residuals; None where they are uncorrelated.
+        model: The model: the one that held-out links choose, or the calibrated one if no links were held out.
+        materials: All materials of the scene at its carrier with the model's parameters; None if it uses no scene.
+        residual_field: The correlated part of its residuals; None where they are uncorrelated.
     """
 
-    model: PredictionModel | None = None
+    model: PredictionModel
+    materials: dict[str, Material] | None
     residual_field: ResidualField | None = None
 
 
@@ -188,9 +186,10 @@ class Record:
         prediction: The model that predictions use.
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
-        links: One row per link: row in the source file, measured, before, after and log-distance path loss [dB],
+        links: One row per link: row in the source file, path loss measured, before, after, of the log-distance model,
+            of the prediction model (predicted) and of its scene alone [dB],
             has_path, held_out, change on tracing again [dB]; positions tx_x to rx_z [m]; where they apply: group,
-            frequency [Hz], path loss with the nuisances alone and of the prediction model [dB], the values in the
+            frequency [Hz], path loss with the nuisances alone [dB], the values in the
             measured quantity, leverage, depth, and whether the link is censored or expected near the noise floor.
         history: One row per RT call: number, iteration, RMSE, best so far, seconds since the start.
         held_out: Held-out errors of every model, where blocks were held out in turn; None otherwise.
@@ -226,6 +225,11 @@ class Record:
     def intervals(self) -> dict[str, Interval]:
         """95 % interval and verdict by parameter."""
         return self.uncertainty.intervals
+
+    @property
+    def scene_materials(self) -> dict[str, Material]:
+        """The materials that exports write: the prediction model's, or the calibrated ones if it uses no scene."""
+        return self.materials if self.prediction.materials is None else self.prediction.materials
 
     @property
     def rmse_db(self) -> float:

@@ -13,13 +13,13 @@ from calibray.support.output_files import exists
 
 LINKS: Final = {
     "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",
-    "held_out": "b", "retrace_gap_db": "f",
+    "held_out": "b", "retrace_gap_db": "f", "predicted_db": "f", "scene_db": "f",
 }  # fmt: skip
 HISTORY: Final = {"call": "i", "iteration": "i", "rmse_db": "f", "best_db": "f", "seconds": "f"}
 COLUMNS: Final = {"result-links.csv": LINKS, "result-history.csv": HISTORY}
 """Columns of each file and the NumPy kind of their values: integer, float or Boolean."""
 
-OPTIONAL: Final = ("leverage", "depth", "chosen_db")
+OPTIONAL: Final = ("leverage", "depth")
 """Columns of numbers that are optional."""
 
 FINITE: Final = ("measured_db", "log_distance_db", "best_db", "seconds")

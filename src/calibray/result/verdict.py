@@ -31,6 +31,7 @@ class ReasonKind(StrEnum):
     TRADE_OFF = "trade-off"  # the other parameter and the rank correlation
     CONFOUNDED = "confounded"  # change_db over the range, compensated by other unknowns
     NOISE = "noise"  # change_db over the range, noise_db
+    OUTSIDE_INTERVAL = "outside interval"  # value of least RMSE
     TOO_FEW_LINKS = "too few links"  # links
     TOO_FEW_DRAWS = "too few draws"  # share of the range that the draws cannot rule out
     TOO_FEW_CALLS = "too few calls"  # calls

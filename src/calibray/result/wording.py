@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
+import numpy as np
+
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.result.record import Record
 from calibray.result.remark import Remark, RemarkKind
@@ -12,6 +14,9 @@ from calibray.result.verdict import Interval, Reason, ReasonKind
 
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
+
+SCENE_ALONE_DB: Final = 0.05
+"""Difference between the exported scene and the predictions that is not reported."""
 
 SHOWN_PIECES: Final = 3
 """Most pieces of an interval that are listed one by one."""
@@ -85,6 +90,9 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.NOISE: lambda values, _: (
         f"links change by up to {values['change_db']:.1f} dB over its range, too little compared with noise of "
         f"{values['noise_db']:.1f} dB"
+    ),
+    ReasonKind.OUTSIDE_INTERVAL: lambda values, _: (
+        f"the value of least RMSE, {values['value']:.4g}, is outside the interval"
     ),
     ReasonKind.TOO_FEW_LINKS: lambda values, _: (
         f"{values['links']:.0f} links are too few for this number of unknowns"
@@ -242,11 +250,65 @@ def chosen_model_text(record: Record) -> str:
         A sentence; empty where predictions use the calibrated model.
     """
     model, calibrated_db = record.prediction.model, record.accuracy.holdout_rmse_db
-    if model is None or model.name == Model.CALIBRATED or calibrated_db is None:
+    if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
     return (
-        f"On held-out blocks the prediction model {model.name!r} has an RMSE of {model.residual_db:.2f} dB, the "
+        f"On held-out links the prediction model {model.name!r} has an RMSE of {model.residual_db:.2f} dB, the "
         f"calibrated model {calibrated_db:.2f} dB."
+    )
+
+
+def prediction_text(record: Record) -> str:
+    """What predictions use.
+
+    Args:
+        record: The result.
+
+    Returns:
+        A sentence.
+    """
+    model = record.prediction.model
+    if model.parameters is None:
+        source = "no scene"
+    elif model.parameters == record.parameters:
+        source = "the calibrated materials"
+    else:
+        source = (
+            "other values than the calibrated ones"
+            if model.name != Model.INITIAL
+            else "the initial materials"
+        )
+    terms = [term.name for term in model.terms]
+    added = f" and the fitted {', '.join(terms)}" if terms else ""
+    return f"Predictions, maps and exports use the model {str(model.name)!r}: {source}{added}."
+
+
+def scene_alone_text(record: Record) -> str:
+    """How far the exported scene alone is from the predictions.
+
+    Args:
+        record: The result.
+
+    Returns:
+        One or two sentences; empty if the scene gives the predictions.
+    """
+    links, model = record.links, record.prediction.model
+    scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
+    both = np.isfinite(scene_db) & np.isfinite(predicted_db)
+    difference = scene_db[both] - predicted_db[both]
+    rms_db = float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
+    if rms_db < SCENE_ALONE_DB:
+        return ""
+    cause = ", ".join(term.name for term in model.terms) or "its ceiling"
+    if model.parameters is None:
+        return (
+            f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "
+            f"calibrated materials; its path loss differs from the predictions by {rms_db:.2f} dB (RMS over "
+            f"{len(difference)} links)."
+        )
+    return (
+        f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links): "
+        f"a scene cannot contain {cause}."
     )
 
 

@@ -25,7 +25,7 @@ from calibray.uncertainty.importance_sampling import ENOUGH, Draws, pooled, samp
 from calibray.uncertainty.likelihood import PosteriorDensity
 from calibray.uncertainty.linear_theory import covariances, local_intervals, with_reason
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
-from calibray.uncertainty.verdicts import Axes, verdicts, widened
+from calibray.uncertainty.verdicts import Axes, consistent, verdicts, widened
 
 COST: Final = 10
 """Replays for draws, at most, per replay of the calibration; the latter compute derivatives and cost twice as much."""
@@ -237,6 +237,7 @@ def _assess(
     if problem in engines:
         remarks += missed(problem, posterior, trail)
     remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)
+    intervals = {name: consistent(interval, best[name]) for name, interval in intervals.items()}
     if posterior.flattened:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
     return replace(

@@ -249,3 +249,20 @@ def widened(drawn: Interval, local: Interval, to_unit: Callable[[float], float])
         verdict = VerdictName.WEAKLY_IDENTIFIED if share <= WEAKLY else VerdictName.NOT_IDENTIFIABLE
         reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": float(share)})
     return replace(drawn, lower=lower, upper=upper, pieces=((lower, upper),), verdict=verdict, reason=reason)
+
+
+def consistent(interval: Interval, value: float) -> Interval:
+    """The interval with a verdict that does not contradict the calibrated value.
+
+    Args:
+        interval: The interval.
+        value: The value of least RMSE.
+
+    Returns:
+        The interval; ambiguous if it was identified, but does not contain the value.
+    """
+    identified = interval.verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED)
+    if not identified or interval.contains(value, 1e-9 * abs(value)):
+        return interval
+    reason = Reason(ReasonKind.OUTSIDE_INTERVAL, {"value": float(value)})
+    return replace(interval, verdict=VerdictName.AMBIGUOUS, reason=reason)

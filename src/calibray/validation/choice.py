@@ -1,7 +1,11 @@
-"""The prediction model that held-out blocks choose, fitted once more to all links."""
+"""The prediction model, fitted to the calibration links.
+
+Predictions, maps, exports and the report all use this model.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -10,12 +14,19 @@ from numpy.typing import NDArray
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
+from calibray.fitting.search import Trail
+from calibray.materials import Material
 from calibray.result.held_out import Model
 from calibray.result.prediction_model import FittedTerm, PredictionModel
 from calibray.study import Study
 from calibray.validation.baselines import log_distance_objective
-from calibray.validation.validation import Validation
-from calibray.validation.variants import TX_OFFSET, add_nuisance, find_minima, variants
+from calibray.validation.variants import (
+    TX_OFFSET,
+    add_nuisance,
+    find_minima,
+    initial_objective,
+    variants,
+)
 
 SEARCHES: Final = 16
 """Local searches for the model's optimum, in addition to the one from the calibrated optimum."""
@@ -24,46 +35,82 @@ MOST_ERRORS: Final = 400
 """Most absolute errors that are stored with the model; of more, quantiles are stored."""
 
 
-def choose_model(
-    problem: Problem, validation: Validation, best: NDArray[np.float64]
-) -> tuple[PredictionModel, NDArray[np.float64]]:
-    """Fit the model that held-out blocks choose to all links that have a weight.
+@dataclass(frozen=True, eq=False)
+class HeldOutResiduals:
+    """The residuals that the intervals of predictions are computed from.
 
-    Kriging is never chosen: it knows nothing away from the measured links.
+    Attributes:
+        rms_db: Their root mean square [dB]; None if there are too few links.
+        basis: The links that they are of.
+        links: Number of these links, or degrees of freedom where they are calibration links.
+        errors_db: The residuals on held-out links [n], [dB]; empty if they are of calibration links.
+    """
+
+    rms_db: float | None
+    basis: str
+    links: int
+    errors_db: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """The prediction model with its values at the study's links.
+
+    Attributes:
+        model: The model.
+        materials: Materials of the scene with the model's parameters; None if it uses no scene.
+        path_loss_db: Its path loss, with nuisances [links], [dB].
+        scene_db: Path loss of its scene alone; of the calibrated scene if it uses none [links], [dB].
+    """
+
+    model: PredictionModel
+    materials: dict[str, Material] | None
+    path_loss_db: NDArray[np.float64]
+    scene_db: NDArray[np.float64]
+
+
+def fit_prediction_model(
+    problem: Problem, trail: Trail, name: str, residuals: HeldOutResiduals
+) -> FittedModel:
+    """Fit the chosen model to all links that have a weight.
 
     Args:
         problem: The problem.
-        validation: Held-out errors of every model.
-        best: The calibrated optimum, a point of the search space [d].
+        trail: Its search.
+        name: The model; see `Model`.
+        residuals: Its residuals on new links.
 
     Returns:
-        The model, and its path loss at all links [links], [dB].
+        The fitted model.
     """
-    name = validation.chosen
-    study = problem.setup.study
-    values: dict[str, float] | None = None
+    setup, parameters = problem.setup, problem.parameters
+    candidate, scene_db = trail.best, trail.best_modelled
+    objective, modelled = problem.objective, scene_db
     if name == Model.LOG_DISTANCE:
         objective, modelled = log_distance_objective(
-            problem.setup.links, problem.objective, study.scene.frequency
+            setup.links, problem.objective, setup.study.scene.frequency
         )
-    else:
-        variant, point = variants(problem, best)[name], best
-        if name == Model.INITIAL:
-            point = problem.parameters.to_search(problem.parameters.start)
-        elif name != Model.CALIBRATED:
-            point = find_minima(variant, best[None], SEARCHES)[0]
-        objective, modelled = variant.objective, variant.evaluate(point[None]).modelled[0]
-        values = problem.parameters.named(problem.parameters.from_search(point))
+    elif name == Model.INITIAL:
+        candidate, scene_db = parameters.start, problem.before
+        objective, modelled = initial_objective(problem.objective, setup), scene_db
+    elif name != Model.CALIBRATED:
+        best = parameters.to_search(trail.best)
+        variant = variants(problem, best)[Model(name)]
+        point = find_minima(variant, best[None], SEARCHES)[0]
+        candidate, scene_db = parameters.from_search(point), variant.evaluate(point[None]).modelled[0]
+        objective, modelled = variant.objective, scene_db
+    uses_scene = name != Model.LOG_DISTANCE
     model = PredictionModel(
         name,
-        values,
-        _fitted_terms(objective, modelled, study),
-        validation.scale(name),
-        f"{name}, errors on {len(validation.labels)} blocks held out in turn",
-        int(np.count_nonzero(validation.block >= 0)),
-        _quantiles(validation.sizes(name)),
+        parameters.named(candidate) if uses_scene else None,
+        _fitted_terms(objective, modelled, setup.study),
+        residuals.rms_db,
+        residuals.basis,
+        residuals.links,
+        _quantiles(np.sort(np.abs(residuals.errors_db))),
     )
-    return model, add_nuisance(objective, modelled)
+    materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
+    return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
 
 
 def _quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
@@ -76,13 +123,18 @@ def _quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
 def _fitted_terms(
     objective: Objective, path_loss_db: NDArray[np.float64], study: Study
 ) -> tuple[FittedTerm, ...]:
-    """Nuisance terms with the coefficients that fit best to a path loss without nuisance [links], [dB]."""
-    coefficients = objective.coefficients(path_loss_db[None])
-    filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
+    """Nuisance terms with the coefficients that fit best to a path loss without nuisance [links], [dB].
+
+    Groups whose coefficient no link determines are left out.
+    """
+    coefficients = objective.coefficients(path_loss_db[None])[0]
     terms, first = [], 0
     for term in objective.nuisance.terms:
         last = first + len(term.labels)
-        by_group = dict(zip(term.labels, filled[0, first:last].tolist(), strict=True))
+        rows = zip(
+            term.labels, coefficients[first:last].tolist(), objective.determined[first:last], strict=True
+        )
+        by_group = {label: value for label, value, determined in rows if determined}
         first = last
         if term.labels == ("",):
             per = ""
@@ -90,5 +142,6 @@ def _fitted_terms(
             per = "transmitter"
         else:
             per = OFFSET if term.name == OFFSET else str(study.nuisance[term.name].per)
-        terms.append(FittedTerm(term.name, term.by, per, by_group, term.centre))
+        if by_group:
+            terms.append(FittedTerm(term.name, term.by, per, by_group, term.centre))
     return tuple(terms)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from calibray.result.held_out import Judgement, Model
+from calibray.result.held_out import FITTED, Judgement, Model
 
 CLUSTER_LINKS: Final = 4
 """Neighbouring links that are resampled together, since they share part of their noise."""
@@ -96,6 +96,41 @@ def compare(
         error = float(np.std(baseline_rmse - model_rmse) * np.sqrt(len(size) / (len(size) - 1)))
     name = list(baselines)[best - 1]
     return Judgement(count, float(rmse[0]), str(name), float(rmse[best]), error, len(size))
+
+
+def choose(errors: Mapping[str, NDArray[np.float64]], position: NDArray[np.float64]) -> str:
+    """Choose the model for predictions by held-out errors.
+
+    The initial materials are kept until another model is better by more than the bootstrap error of the difference.
+    Kriging is never chosen: it knows nothing away from the measured links.
+
+    Args:
+        errors: Held-out residuals by model [n], [dB]; those of `Model.INITIAL` among them.
+        position: Positions of the receivers [n, 3], [m].
+
+    Returns:
+        The model's name.
+    """
+    chosen: str = Model.INITIAL
+    for name in (least(errors, FITTED), Model.LOG_DISTANCE):
+        if name in errors:
+            comparison = compare(errors[name], {chosen: errors[chosen]}, position)
+            error_db = np.inf if comparison.error_db is None else comparison.error_db
+            chosen = name if comparison.gain_db > error_db else chosen
+    return chosen
+
+
+def least(errors: Mapping[str, NDArray[np.float64]], names: tuple[str, ...]) -> str:
+    """The model of least RMSE among some.
+
+    Args:
+        errors: Held-out residuals by model [n], [dB].
+        names: The models; at least one has residuals.
+
+    Returns:
+        Its name.
+    """
+    return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:

@@ -8,7 +8,6 @@ models of similar accuracy, and a fitted model loses more where its fit does not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, final
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from calibray.result.held_out import BASELINES, FITTED, HeldOutErrors, Judgement, Model
 from calibray.result.wording import choice_text, judgement_text
 from calibray.tables import Column, Table, display, numbers
-from calibray.validation.held_out_statistics import compare, interval_half_width
+from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least
 
 
 @final
@@ -96,7 +95,7 @@ class Validation(HeldOutErrors):
     def choice(self) -> str:
         """Which model predictions use, and why."""
         return choice_text(
-            self.chosen, self._least((Model.INITIAL, *FITTED, Model.LOG_DISTANCE), self.judged)
+            self.chosen, least(self._on(self.judged), (Model.INITIAL, *FITTED, Model.LOG_DISTANCE))
         )
 
     def scale(self, name: str) -> float:
@@ -153,21 +152,12 @@ class Validation(HeldOutErrors):
             "sentence": self.sentence,
         }
 
-    def _least(self, names: Sequence[str], mask: NDArray[np.bool_]) -> str:
-        """The model with the least RMSE on some links."""
-        present = [name for name in names if name in self.errors]
-        return min(present, key=lambda name: float(np.mean(self.errors[name][mask] ** 2)))
-
     def _choose(self, mask: NDArray[np.bool_]) -> str:
         """The prediction model that some links choose."""
-        chosen: str = Model.INITIAL
-        for name in (self._least(FITTED, mask), Model.LOG_DISTANCE):
-            if name in self.errors:
-                current = {chosen: self.errors[chosen][mask]}
-                comparison = compare(self.errors[name][mask], current, self.position[mask])
-                if comparison.error_db is not None and comparison.gain_db > comparison.error_db:
-                    chosen = name
-        return chosen
+        return choose(self._on(mask), self.position[mask])
+
+    def _on(self, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+        return {name: errors[mask] for name, errors in self.errors.items()}
 
     def _blocks(self) -> list[NDArray[np.bool_]]:
         return [self.block == number for number in np.unique(self.block[self.judged])]

@@ -94,7 +94,7 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
         part, priors=_priors_around_start(part), objective=replace(objective, noise_db=noise_db)
     )
     problems = {
-        Model.INITIAL: replace(part, objective=_with_term(objective, CONSTANT, setup)),
+        Model.INITIAL: replace(part, objective=initial_objective(objective, setup)),
         Model.CALIBRATED: part,
         Model.PRIOR: with_prior,
         Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
@@ -152,6 +152,19 @@ def add_nuisance(objective: Objective, path_loss_db: NDArray[np.float64]) -> NDA
     coefficients = objective.coefficients(path_loss_db[None])
     filled, _ = objective.nuisance.filled(coefficients, objective.weight > 0)
     return objective.capped(path_loss_db) + objective.nuisance.contribution(filled)[0]
+
+
+def initial_objective(objective: Objective, setup: Setup) -> Objective:
+    """The objective of the initial materials: with an offset of all links, unless the study declares one.
+
+    Args:
+        objective: The study's objective.
+        setup: The opened study.
+
+    Returns:
+        The objective.
+    """
+    return _with_term(objective, CONSTANT, setup)
 
 
 def _with_offset_per_transmitter(objective: Objective, setup: Setup) -> Objective | None:

@@ -83,9 +83,8 @@ def main() -> None:
             print(f"{link['row']}: left out, since its carrier is not that of the scene", file=sys.stderr)
             continue
         tx, rx = ([float(link[f"{end}_{axis}"]) for axis in "xyz"] for end in ("tx", "rx"))
-        group = link.get("group") or ""
-        computed = path_loss(scene, tx, rx) + CALIBRATION["offsets_db"].get(group, 0.0)
-        reported = float(link["after_db"] or "inf")
+        # The nuisance is what the predictions add to the scene's path loss (calibration.json).
+        computed, reported = path_loss(scene, tx, rx) + float(link["nuisance_db"]), float(link["reported_db"])
         print(f"{link['row']},{reported:.4f},{computed:.4f}")
         if np.isfinite(reported):
             largest = max(largest, abs(computed - reported))

@@ -1,0 +1,118 @@
+"""One record decides what predictions, exports and the report use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import planted
+import shown
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
+from calibray.reporting.export import export
+from calibray.reporting.link_survey import residual
+from calibray.reporting.result_tables import parameters, values
+from calibray.reporting.summary import summary
+from calibray.result.held_out import Model
+from calibray.result.verdict import Interval, ReasonKind, Verdict
+from calibray.result.wording import prediction_text, reason_text, scene_alone_text
+from calibray.scenes import read_scene
+from calibray.scenes.export import exported_id
+from calibray.tables.text import render
+from calibray.uncertainty.verdicts import consistent
+
+NAME = next(name for name in shown.result().parameters if name.endswith(".relative_permittivity"))
+MATERIAL = NAME.rpartition(".")[0]
+
+
+@pytest.fixture
+def other() -> Result:
+    """A result whose prediction model has another ground than the calibrated one, and an offset of +3 dB."""
+    result = shown.result()
+    model = result.prediction.model
+    parameters = {**model.parameters, NAME: 7.25}
+    material = replace(result.materials[MATERIAL], relative_permittivity=7.25)
+    links = result.links.assign(predicted_db=result.links.scene_db + 3.0)
+    term = replace(model.terms[0], per="", coefficients={"": 3.0})
+    prediction = replace(
+        result.prediction,
+        model=replace(model, name=Model.PRIOR, parameters=parameters, terms=(term,)),
+        materials={**result.materials, MATERIAL: material},
+    )
+    return replace(result, prediction=prediction, links=links)
+
+
+def test_the_tables_say_which_values_predictions_use(other: Result) -> None:
+    assert "in predictions" not in render(parameters(shown.result()))
+    text = render(parameters(other))
+    assert "in predictions" in text
+    assert "7.25" in text
+    assert {value.name: value.predicted for value in values(other)}[NAME] == "7.25"
+    assert summary(other)[0].text.startswith(
+        "Predictions, maps and exports use the model 'calibrated with prior'"
+    )
+
+
+def test_the_residuals_of_the_report_are_those_of_predictions(other: Result) -> None:
+    expected = other.links.predicted_db - other.links.measured_db
+    np.testing.assert_array_equal(residual(other.links)[:5], expected[:5])
+
+
+def test_the_exported_scene_is_the_one_that_predictions_use(tmp_path: Path) -> None:
+    table = planted.campaign(noise_db=0.5)
+    result = calibrate(planted.study(tmp_path, table), engine=planted.engine())
+    model = result.prediction.model
+    name, value = next(iter(model.parameters.items()))
+    material, _, constant = name.rpartition(".")
+    materials = {
+        **result.materials,
+        material: replace(result.materials[material], **{constant: value * 1.25}),
+    }
+    model = replace(model, name=Model.PRIOR, parameters={**model.parameters, name: value * 1.25})
+    changed = replace(result, prediction=replace(result.prediction, model=model, materials=materials))
+    export(changed, tmp_path / "exported")
+    changed.save(tmp_path / "out")
+    exported = exported_id(material).removeprefix("mat-")
+    for file in (tmp_path / "exported" / "scene.xml", tmp_path / "out" / "result-scene.xml"):
+        written = read_scene(file, result.study.scene.frequency).materials[exported]
+        assert getattr(written, constant) == pytest.approx(value * 1.25, rel=1e-6)
+    loaded = Result.load(tmp_path / "out")
+    links = planted.links()
+    assert np.abs(loaded.predict(links) - result.predict(links)).max() > 0.01
+
+
+def test_an_offset_is_named_as_the_difference_between_scene_and_predictions(other: Result) -> None:
+    assert "differs from the predictions by 3.00 dB" in scene_alone_text(other)
+    assert "cannot contain offset" in scene_alone_text(other)
+    same = replace(other, links=other.links.assign(predicted_db=other.links.scene_db))
+    assert scene_alone_text(same) == ""
+    assert "calibrated" in prediction_text(shown.result())
+
+
+def test_a_filter_of_held_out_links_chooses_the_model_too(tmp_path: Path) -> None:
+    """Path loss planted by distance alone: predictions follow the distance law, as after held-out blocks."""
+    links = planted.links()
+    distance = np.linalg.norm(links[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    noise = 0.5 * np.random.default_rng(5).standard_normal(len(links))
+    table = links.assign(path_loss_db=30 + 35 * np.log10(distance) + noise, part=np.arange(len(links)) % 4)
+    result = calibrate(
+        planted.study(tmp_path, table, holdout={"where": "part > 0"}, offset={}), engine=planted.engine()
+    )
+    assert result.links.held_out.sum() >= 8
+    assert result.prediction.model.name == Model.LOG_DISTANCE
+    assert result.predict(links) == pytest.approx(30 + 35 * np.log10(distance), abs=3.0)
+
+
+def test_a_verdict_never_contradicts_its_value() -> None:
+    interval = Interval(0.1, 1.5, 4.123, Verdict.IDENTIFIED)
+    assert consistent(interval, 3.0) == interval
+    contradicted = consistent(interval, 14.99)
+    assert contradicted.verdict == Verdict.AMBIGUOUS
+    assert contradicted.reason is not None
+    assert contradicted.reason.kind == ReasonKind.OUTSIDE_INTERVAL
+    assert "14.99, is outside the interval" in reason_text(contradicted.reason)
+    unknown = replace(interval, verdict=Verdict.NOT_IDENTIFIABLE)
+    assert consistent(unknown, 14.99) == unknown
