@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -15,7 +18,7 @@ from calibray.reporting import scene_tables as report
 from calibray.scenes import read_frame, read_scene
 from calibray.scenes.checks import check_scene
 from calibray.tables.text import render
-from planted_maps import write_extract
+from planted_maps import FRAME, write_extract
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]
 
@@ -104,12 +107,67 @@ def test_a_scene_never_replaces_its_input(tmp_path):
     assert plan.read_bytes() == before
 
 
-def test_footprints_become_a_scene(tmp_path):
-    extract = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes"})])
-    # GDAL reads the extract as a layer of polygons with a column of other tags.
-    status, out, _ = scene_command(
-        "footprints", extract, "-o", tmp_path / "out", "--height", 8, "--layer", "multipolygons"
+def write_town(path: Path, *properties: dict, move: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """One square for each set of properties, the last one moved [deg], as GeoJSON."""
+    corners = FRAME.to_geographic([(*corner, 0) for corner in [*SQUARE, SQUARE[0]]])[:, :2]
+    features = []
+    for number, record in enumerate(properties):
+        last = number == len(properties) - 1
+        ring = (corners + [0.001 * number, 0] + np.array(move) * last).tolist()
+        geometry = {"type": "Polygon", "coordinates": [ring]}
+        features.append({"type": "Feature", "properties": record, "geometry": geometry})
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "move", "message"),
+    [
+        (["--margin", "nan"], (0, 0), "margin = nan: must be 0 to 50000 m"),
+        (["--margin", "inf"], (0, 0), "margin = inf: must be"),
+        (["--margin", "-1000"], (0, 0), "margin = -1000.0: must be"),
+        ([], (-11.576, -48.137), r"building 'Hut' lies [\d,]+ km from the others"),
+        ([], (-191.5, 0), r"building 'Hut' .*(180 degrees|km from the others)"),
+        (
+            ["--origin", "48.1374,11.5755"],
+            (0, 0),
+            r"the buildings lie [\d,]+ km from it; give longitude first",
+        ),
+        (
+            ["--height", "tall"],
+            (0, 0),
+            r"feature 2: tall = 1e\+12, must be finite, not negative and at most 1000",
+        ),
+        (["--height", "1e300"], (0, 0), r"1e\+300 = 1e\+300, must be finite|at most 1000"),
+        (["--height", "nan"], (0, 0), "at most 1000|must"),
+        (["--wall", "brick:1e20"], (0, 0), r"thickness = 1e\+20 must be greater than 0 and at most 100 m"),
+    ],
+    ids=str,
+)
+def test_senseless_scenes_are_refused(tmp_path, words, move, message):
+    town = write_town(
+        tmp_path / "town.geojson", {"name": "Hall", "tall": 9.0}, {"name": "Hut", "tall": 1e12}, move=move
     )
+    height = [] if "--height" in words else ["--height", 9]
+    status, _, error = scene_command(
+        "footprints", town, "-o", tmp_path / "out", "--name", "name", *height, *words
+    )
+    assert status == 2
+    assert re.search(message, error.replace("\n", " "))
+    assert not (tmp_path / "out" / "scene.xml").exists()
+
+
+def test_a_column_whose_name_is_a_number_is_taken_with_a_warning(tmp_path, caplog):
+    town = write_town(tmp_path / "town.geojson", {"2020": 12.0})
+    status, out, _ = scene_command("footprints", town, "-o", tmp_path / "out", "--height", "2020")
+    assert status == 0
+    assert "0.0 m to 12.0 m high" in out
+    assert "2020 is taken for the column of that name" in caplog.text
+
+
+def test_footprints_become_a_scene(tmp_path):
+    town = write_town(tmp_path / "town.geojson", {})
+    status, out, _ = scene_command("footprints", town, "-o", tmp_path / "out", "--height", 8)
     assert status == 0
     assert "0.0 m to 8.0 m high" in out
 

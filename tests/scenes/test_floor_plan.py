@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,44 @@ def test_bad_plans_are_refused(tmp_path, text, message):
     for name in (tmp_path / "nowhere.csv", tmp_path, "/dev/full"):
         with pytest.raises(InputError, match="is not a file; check the path"):
             read_plan(name)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [[(0, 0, 5, 0)], [(0, 0, 5, 0), (6, 0, 9, 0)], [(0, 0, 5, 5), (5, 5, 9, 9)]],
+    ids=["one wall", "in line", "oblique"],
+)
+def test_a_plan_that_encloses_no_area_has_no_floor(tmp_path, lines):
+    walls = [line(*ends) for ends in lines]
+    with pytest.raises(InputError, match=r"encloses no area.*--no-floor --no-ceiling"):
+        make_plan_scene(walls, tmp_path / "with")
+    made = make_plan_scene(walls, tmp_path / "without", floor=False, ceiling=False)
+    assert made.bounds[5] == 3.0
+
+
+@pytest.mark.parametrize("height", [np.nan, np.inf, 1e300, -1.0])
+def test_a_senseless_height_of_a_plan_is_refused(tmp_path, height):
+    (tmp_path / "plan.csv").write_text("x0,y0,x1,y1,type\n0,0,4,0,brick\n")
+    with pytest.raises(InputError, match=r"height = .*: must be a number of metres greater than 0"):
+        read_plan(tmp_path / "plan.csv", height)
+
+
+@pytest.mark.parametrize(
+    "row", ["0,0,1e20,0,brick,,", "0,0,4,0,brick,1e20,", "0,0,4,0,brick,,1e6", "0,0,60000,0,brick,,"]
+)
+def test_walls_of_impossible_size_are_refused(tmp_path, row):
+    (tmp_path / "plan.csv").write_text(f"x0,y0,x1,y1,type,thickness,height\n{row}\n")
+    with pytest.raises(
+        InputError, match=r"row 2: .*coordinates may be 50000 m, heights and thicknesses 1000 m"
+    ):
+        read_plan(tmp_path / "plan.csv")
+
+
+@pytest.mark.parametrize("ending", ["csv.gz", "csv.zip", "csv.xz", "csv.zst", "csv.bz2", "tar"])
+@pytest.mark.parametrize(
+    "content", [gzip.compress(b"x0,y0,x1,y1,type\n" + b"\0" * 10**7), b"text", b"\0\xff"]
+)
+def test_a_compressed_plan_is_refused_without_decompressing_it(tmp_path, ending, content):
+    (tmp_path / f"plan.{ending}").write_bytes(content)
+    with pytest.raises(InputError, match=r"is not a table|no column"):
+        read_plan(tmp_path / f"plan.{ending}")

@@ -166,7 +166,7 @@ def test_footprints_of_geojson_are_projected(tmp_path):
     [
         ({"height": "height"}, "no column 'height'"),
         ({"height": "word"}, "holds 'high', must hold metres"),
-        ({"height": "negative"}, "feature 2: negative = -1, must be finite and not negative"),
+        ({"height": "negative"}, "feature 2: negative = -1, must be finite, not negative and at most 1000"),
         ({"layer": "roads"}, "cannot be read"),
     ],
 )
@@ -179,13 +179,16 @@ def test_wrong_columns_and_layers_are_refused(tmp_path, change, message):
 @pytest.mark.filterwarnings("ignore")  # warnings of GDAL
 @pytest.mark.parametrize(
     ("old", "new"),
-    [(b"[0, 0], [1, 0], [1, 1], [0, 0]", b"[0, 0], [1, 0], [1, 1], [0, 2]"), (b'"h"', b'"\x85"')],
+    [
+        (b"[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]", b"[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.2]"),
+        (b'"h"', b'"\x85"'),
+    ],
     ids=["open ring", "encoding"],
 )
 def test_malformed_geojson_is_refused(tmp_path, old, new):
     sound = (
         b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"h": 5}, "geometry": '
-        b'{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}}]}'
+        b'{"type": "Polygon", "coordinates": [[[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]]]}}]}'
     )
     path = tmp_path / "town.geojson"
     path.write_bytes(sound)
@@ -283,6 +286,24 @@ def test_an_unsuitable_height_model_is_refused(tmp_path, bounds, spacing, messag
 
 
 # Formats, bounds and units of what GDAL opens
+
+
+@pytest.mark.parametrize("height", ["9" * 400, "1000001", "1e400"])
+def test_an_impossible_height_of_an_extract_is_a_guess(tmp_path, height):
+    path = write_extract(tmp_path / "town.osm", [(SQUARE, {"building": "yes", "height": height})])
+    buildings, _ = read_openstreetmap(path, FRAME)
+    assert buildings.top.tolist() == [9.0]
+    assert buildings.guessed()["default"] == list(buildings.name)
+
+
+def test_an_unknown_reference_system_of_geojson_is_refused(tmp_path):
+    path = tmp_path / "town.geojson"
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [0.1, 0], [0.1, 0.1], [0, 0]]]}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::999999"}}
+    feature = {"type": "Feature", "properties": {}, "geometry": square}
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [feature]}))
+    with pytest.raises(InputError, match=r"EPSG::999999.*PROJ does not know it"):
+        read_footprints(path, 5.0)
 
 
 @pytest.fixture

@@ -95,7 +95,6 @@ def test_empty_repeated_and_crowded_faces_are_counted():
     [
         (1000.0, 0.0, "as if in millimetres"),
         (1e-5, 11.5, "as if in degrees"),
-        (1.0, 691_000.0, "stores coordinates in steps of 0.0625 m"),
     ],
 )
 def test_a_wrong_unit_is_named(tmp_path, factor, offset, problem):

@@ -105,6 +105,7 @@ def osm(
         buildings, frame = read_openstreetmap(
             extract, _frame(origin, utm), HeightRule(storey, default_height)
         )
+        _check_origin(origin, buildings)
         made = _make(
             buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
             overwrite, progress,
@@ -151,9 +152,10 @@ def footprints(
     with progress_bars(log()) as progress:
         progress("reading", 0, None)
         buildings, frame = read_footprints(
-            file, _number_or_column(height), _number_or_column(bottom), name, levels, layer,
+            file, height, bottom, name, levels, layer,
             _frame(origin, utm), HeightRule(storey, default_height),
         )  # fmt: skip
+        _check_origin(origin, buildings)
         made = _make(
             buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
             overwrite, progress,
@@ -271,6 +273,20 @@ def _frame(origin: str | None, utm: bool) -> Frame | None:
     return Frame.utm(longitude, latitude) if utm else Frame.local(longitude, latitude)
 
 
+def _check_origin(origin: str | None, buildings: Footprints) -> None:
+    """Refuse an origin far from the buildings, such as latitude before longitude."""
+    import numpy as np
+
+    from calibray.scenes.authoring import WIDEST
+
+    distance = float(np.abs(buildings.bounds).max())
+    if origin is not None and distance > WIDEST:
+        raise InputError(
+            f"--origin {origin}: the buildings lie {distance / 1000:,.0f} km from it; give longitude first, then "
+            "latitude"
+        )
+
+
 def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
     """Materials by type of wall, from entries such as `drywall=plasterboard:0.1`."""
     from calibray.scenes.authoring import WALL_THICKNESS
@@ -280,15 +296,12 @@ def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
         kind, equals, material = entry.partition("=")
         if not equals:
             raise InputError(f"--material {entry}: must be TYPE=ITU, such as drywall=plasterboard:0.1")
+        if kind in types:
+            raise InputError(
+                f"--material {entry}: the type {kind!r} has a material already; give one for each type"
+            )
         types[kind] = _material(kind, material, WALL_THICKNESS)
     return types
-
-
-def _number_or_column(text: str) -> str | float:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _material(name: str, text: str, thickness: float) -> SurfaceMaterial:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
     from calibray.scenes.authoring.footprint_files import read_footprints as read_footprints
     from calibray.scenes.authoring.footprint_files import read_openstreetmap as read_openstreetmap
+    from calibray.scenes.authoring.footprints import WIDEST as WIDEST
     from calibray.scenes.authoring.footprints import Footprints as Footprints
     from calibray.scenes.authoring.footprints import HeightRule as HeightRule
     from calibray.scenes.authoring.footprints import HeightSource as HeightSource
@@ -35,7 +36,7 @@ _MODULES = {
     "floor_plan": ("Segment", "merge_faces", "read_plan"),
     "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
     "footprint_files": ("read_footprints", "read_openstreetmap"),
-    "footprints": ("Footprints", "HeightRule", "HeightSource", "clean_footprints"),
+    "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
     "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),
 }

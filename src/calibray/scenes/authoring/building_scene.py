@@ -25,7 +25,7 @@ from calibray.scenes.authoring.extrusion import (
     Windows,
     extrude,
 )
-from calibray.scenes.authoring.footprints import Footprints
+from calibray.scenes.authoring.footprints import WIDEST, Footprints
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, write_made_scene
 from calibray.scenes.authoring.overlaps import split_overlaps
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
@@ -70,12 +70,15 @@ def make_scene(
         The scene.
 
     Raises:
-        InputError: There is no building, the folder cannot be written, or a file there must not be replaced.
+        InputError: There is no building, the margin is out of range, the folder cannot be written, or a file there must
+            not be replaced.
     """
     folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
     palette = palette or Palette()
     if not len(footprints):
         raise InputError("there is no building to make a scene of; check the file and its columns")
+    if not 0 <= margin <= WIDEST:
+        raise InputError(f"margin = {margin!r}: must be 0 to {WIDEST:g} m")
     base = _base_heights(footprints, terrain)
     cells, overlapping = split_overlaps(footprints, base + footprints.bottom, base + footprints.top)
     shell = extrude(cells, windows, base if ground else None)

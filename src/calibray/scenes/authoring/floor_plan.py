@@ -17,7 +17,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.support.messages import did_you_mean
+from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
+from calibray.support.messages import did_you_mean, first_line
 from calibray.support.output_files import exists
 
 OPENINGS: Final = frozenset({"door", "window"})
@@ -74,14 +75,22 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
     Raises:
         InputError: The file or a column is missing or malformed, or a segment has no length, height or thickness.
     """
+    for name, value in (("height", height), ("unit", unit)):
+        if not 0 < value <= HIGHEST:
+            raise InputError(
+                f"{name} = {value!r}: must be a number of metres greater than 0, at most {HIGHEST:g}"
+            )
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
     try:
-        frame = pd.read_csv(path, skipinitialspace=True)
+        # A file of compressed data, which some kilobytes of could fill the memory, is no text and is refused.
+        frame = pd.read_csv(path, skipinitialspace=True, compression=None)
     except OSError as error:
         raise InputError(f"floor plan {path}: cannot be read ({error.strerror}); check the file") from None
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise InputError(f"floor plan {path}: is not a table ({error}); give a CSV file") from None
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"floor plan {path}: is not a table ({first_line(error)}); give a CSV file"
+        ) from None
     for column in (*_ENDS, "type"):
         if column not in frame:
             raise InputError(
@@ -103,6 +112,12 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
         if segment.length < SHORTEST or extent <= 0 or thickness <= 0:
             raise InputError(
                 f"{row}: its length, height and thickness must be greater than 0; correct or remove it"
+            )
+        size = max(map(abs, (x0, y0, x1, y1)))
+        if size > WIDEST or max(abs(bottom), extent, thickness) > HIGHEST:
+            raise InputError(
+                f"{row}: {size:g} m from the origin, {extent:g} m high and {thickness:g} m thick; coordinates may be "
+                f"{WIDEST:g} m, heights and thicknesses {HIGHEST:g} m at most; correct it or its unit"
             )
         segments.append(segment)
     if not segments:

@@ -96,6 +96,11 @@ def make_plan_scene(
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
     objects = _wall_objects(pieces)
     outline = _enclosed(pieces)
+    if (floor or ceiling) and outline.area == 0:
+        raise InputError(
+            "the floor plan encloses no area, so that it has no floor or ceiling; draw walls around the room, or leave "
+            "both out (--no-floor --no-ceiling)"
+        )
     lids = {}
     if floor:
         lids["floor"] = min(sheet.bottom for sheet in sheets)

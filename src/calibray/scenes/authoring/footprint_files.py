@@ -7,6 +7,8 @@ tags. Nothing is downloaded.
 
 from __future__ import annotations
 
+import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from calibray.coordinates import WGS84, Frame, transformer
 from calibray.errors import InputError
 from calibray.scenes.authoring.footprints import (
+    HIGHEST,
     Footprints,
     HeightRule,
     HeightSource,
@@ -26,6 +29,8 @@ from calibray.scenes.authoring.footprints import (
 from calibray.scenes.authoring.geodata import read_features
 from calibray.support.extras import library
 from calibray.support.messages import did_you_mean, shortened
+
+_LOG: Final = logging.getLogger(__name__)
 
 _KEYS: Final = ("building", "building:part")
 _SOURCES: Final[tuple[HeightSource, ...]] = ("default", "levels", "height")
@@ -100,7 +105,8 @@ def read_footprints(
     Args:
         path: A GeoJSON file, Shapefile, GeoPackage, FlatGeobuf file or Esri geodatabase that states its reference
             system.
-        height: Column with the heights of the buildings above the ground [m], or one height for all.
+        height: Column with the heights of the buildings above the ground [m], or one height for all; a text that is a
+            number and the name of a column means the column.
         bottom: Column with the heights at which the buildings begin [m], or one height for all.
         name: Column with their names; by default they are numbered.
         levels: Column with the numbers of storeys, for buildings without a height.
@@ -170,10 +176,23 @@ def _column(path: Path, columns: dict[str, NDArray[Any]], name: str) -> NDArray[
     return columns[name]
 
 
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _numbers(
     path: Path, columns: dict[str, NDArray[Any]], source: str | float, count: int
 ) -> NDArray[np.float64]:
     """Numbers from a column or a constant [count], NaN where the column has none; texts are parsed as lengths."""
+    if isinstance(source, str) and source not in columns:
+        with suppress(ValueError):
+            source = float(source)
+    elif isinstance(source, str) and _is_number(source):
+        _LOG.warning("%s: %s is taken for the column of that name, not for a number", path, source)
     values = _column(path, columns, source) if isinstance(source, str) else np.full(count, float(source))
     if values.dtype == object:
         lengths = [parse_length(None if value is None else str(value)) for value in values]
@@ -182,9 +201,12 @@ def _numbers(
             raise InputError(f"footprints {path}: column {source!r} holds {unread[0]!r}, must hold metres")
         values = np.array([np.nan if length is None else length for length in lengths])
     numbers = np.asarray(values, dtype=float)
-    if (bad := np.flatnonzero((numbers < 0) | np.isinf(numbers))).size:
+    bad = np.flatnonzero(
+        (numbers < 0) | (numbers > HIGHEST) | (np.isnan(numbers) & (not isinstance(source, str)))
+    )
+    if bad.size:
         raise InputError(
-            f"footprints {path}, feature {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, must be finite and not "
-            "negative; correct it"
+            f"footprints {path}, feature {bad[0] + 1}: {source} = {numbers[bad[0]]:g}, must be finite, not "
+            f"negative and at most {HIGHEST:g}; correct it"
         )
     return numbers

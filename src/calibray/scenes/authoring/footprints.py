@@ -18,6 +18,12 @@ from calibray.support.extras import library
 GRID: Final = 0.01
 """Grid to which the corners of buildings are rounded [m]."""
 
+HIGHEST: Final = 1000.0
+"""Largest height of a building or part of one [m]; the highest building stands 828 m."""
+
+WIDEST: Final = 50_000.0
+"""Largest extent of a scene that is made [m]."""
+
 HeightSource = Literal["height", "levels", "default"]
 
 _METRES: Final = {
@@ -45,14 +51,17 @@ class HeightRule:
 
     def __post_init__(self) -> None:
         for name in ("storey", "default"):
-            if not (np.isfinite(value := getattr(self, name)) and value > 0):
-                raise InputError(f"{name} = {value!r}: must be a finite number of metres greater than 0")
+            if not 0 < (value := getattr(self, name)) <= HIGHEST:
+                raise InputError(
+                    f"{name} = {value!r}: must be a number of metres greater than 0, at most {HIGHEST:g}"
+                )
 
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
         """Find the bottom and top of a building from OpenStreetMap tags.
 
         `height` and `min_height` have priority, then `building:levels` and `building:min_level` times `storey`, then
-        `default`. All heights are above the ground. Roof shapes are ignored: the roof is flat at `height`.
+        `default`. All heights are above the ground; those above `HIGHEST` are ignored. Roof shapes are ignored: the
+        roof is flat at `height`.
 
         Args:
             tags: The building's tags.
@@ -68,10 +77,11 @@ class HeightRule:
         """
         low, floor = parse_length(tags.get("min_height")), parse_length(tags.get("building:min_level"))
         bottom = max(low if low is not None else (floor or 0.0) * self.storey, 0.0)
+        bottom = bottom if bottom <= HIGHEST else 0.0
         height, levels = parse_length(tags.get("height")), parse_length(tags.get("building:levels"))
-        if height is not None and height > bottom:
+        if height is not None and bottom < height <= HIGHEST:
             return bottom, height, "height"
-        if levels is not None and levels * self.storey > bottom:
+        if levels is not None and bottom < levels * self.storey <= HIGHEST:
             return bottom, levels * self.storey, "levels"
         return bottom, bottom + self.default, "default"
 
@@ -148,6 +158,9 @@ def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0)
 
     Returns:
         The footprints, with unique names; repairs are counted.
+
+    Raises:
+        InputError: A height is not a number or above `HIGHEST`, or the buildings lie further apart than `WIDEST`.
     """
     shapely = library("shapely", "scenes")
     valid = shapely.is_valid(raw.polygon)
@@ -161,6 +174,8 @@ def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0)
         f"of less than {smallest:g} m2, left out": int((~large).sum()),
     }
     keep = np.flatnonzero(large)
+    _check_heights(raw, keep)
+    _check_extent(polygons[keep], [raw.name[index] for index in keep])
     return Footprints(
         polygon=polygons[keep],
         bottom=raw.bottom[keep],
@@ -169,6 +184,36 @@ def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0)
         height_from=tuple(raw.height_from[index] for index in keep),
         part=raw.part[keep],
         repairs={reason: count for reason, count in repairs.items() if count},
+    )
+
+
+def _check_heights(raw: Footprints, keep: NDArray[np.int64]) -> None:
+    for which, heights in (("top", raw.top), ("bottom", raw.bottom)):
+        wrong = keep[~((heights[keep] >= 0) & (heights[keep] <= HIGHEST))]
+        if len(wrong):
+            raise InputError(
+                f"building {raw.name[wrong[0]]!r}: its {which} is {heights[wrong[0]]:g} m above the ground, must be "
+                f"0 to {HIGHEST:g} m; correct the height or its unit"
+            )
+
+
+def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
+    """Refuse buildings far from the others, such as one at 0, 0, and maps across 180 degrees of longitude."""
+    if not len(polygons):
+        return
+    bounds = library("shapely", "scenes").bounds(polygons)
+    centre = (bounds[:, :2] + bounds[:, 2:]) / 2
+    if np.ptp(bounds.reshape(-1, 2), axis=0).max() <= WIDEST:
+        return
+    distance = np.linalg.norm(centre - np.median(centre, axis=0), axis=1)
+    size = (bounds[:, 2:] - bounds[:, :2]).max(axis=1)
+    furthest = int(np.argmax(distance + size))
+    problem = f"lies {distance[furthest] / 1000:,.0f} km from the others"
+    if size[furthest] > WIDEST:
+        problem = f"is {size[furthest] / 1000:,.0f} km wide"
+    raise InputError(
+        f"building {names[furthest]!r} {problem}, scenes may be {WIDEST / 1000:g} km wide; remove it, or cut out the "
+        "area that you need (a map that crosses 180 degrees of longitude: on one side of it)"
     )
 
 

@@ -22,6 +22,9 @@ from calibray.support.output_files import check_outputs, write_text
 SCENE_FILES: Final = ("scene.xml", "scene.json")
 """What is written next to the meshes."""
 
+THICKEST: Final = 100.0
+"""Largest thickness of a material of a new scene [m]."""
+
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
@@ -36,7 +39,7 @@ class SurfaceMaterial:
 
     Raises:
         InputError: The name is an ITU name or has characters other than letters, digits, `_` and `-`; there is no such
-            ITU material; or the thickness is not greater than 0.
+            ITU material; or the thickness is not greater than 0 and at most `THICKEST`.
     """
 
     name: str
@@ -56,8 +59,11 @@ class SurfaceMaterial:
             raise InputError(
                 f"material {self.name}: ITU-R P.2040 has no {self.itu!r}; {did_you_mean(self.itu, sorted(ITU_NAMES))}"
             )
-        if not (np.isfinite(self.thickness) and self.thickness > 0):
-            raise InputError(f"material {self.name}: thickness = {self.thickness!r} must be greater than 0 m")
+        if not 0 < self.thickness <= THICKEST:
+            raise InputError(
+                f"material {self.name}: thickness = {self.thickness!r} must be greater than 0 and at most "
+                f"{THICKEST:g} m"
+            )
 
     def constants(self) -> dict[str, float | str]:
         """The constants as a scene file holds them."""
