@@ -101,7 +101,7 @@ def export(
 
 
 def _links(result: Record) -> pd.DataFrame:
-    """The links, with the nuisance that predictions add to the scene, and the path loss that the script reports [dB]."""
+    """The links, the nuisance that predictions add to the scene, and the path loss that the script reports [dB]."""
     scene_db, predicted_db = (result.links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
     if result.prediction.model.parameters is None:
         return result.links.assign(nuisance_db=0.0, reported_db=scene_db)
