@@ -1,5 +1,19 @@
 """The two ways in which Calibray refuses: bad input, and an engine that failed while running."""
 
+from __future__ import annotations
+
+from typing import Final
+
+LONGEST_MESSAGE: Final = 4000
+"""Characters of a message at most; a value from the input may have any length."""
+
+
+def _bounded(message: str) -> str:
+    """The start and the end of a message that is too long, because the end states the remedy."""
+    if len(message) <= LONGEST_MESSAGE:
+        return message
+    return f"{message[: LONGEST_MESSAGE - 1000]} ... {message[-900:]}"
+
 
 class InputError(ValueError):
     """Input that cannot be used.
@@ -8,6 +22,12 @@ class InputError(ValueError):
     alone, without a traceback, and exits with 2.
     """
 
+    def __str__(self) -> str:
+        return _bounded(super().__str__())
+
 
 class EngineError(RuntimeError):
     """An engine that failed while running; whatever was computed before is kept. The command line exits with 1."""
+
+    def __str__(self) -> str:
+        return _bounded(super().__str__())

@@ -183,3 +183,17 @@ def test_settings_are_restored_after_an_error() -> None:
     assert not jax.config.jax_enable_x64
     assert jax.config.jax_compilation_cache_dir is None
     assert compilation_cache._cache is None
+
+
+def test_a_platform_without_a_device_is_refused(tmp_path: Path) -> None:
+    program = (
+        "from calibray.errors import InputError\nfrom calibray.fields import jax_settings\ntry:\n"
+        "    with jax_settings():\n        pass\nexcept InputError as error:\n    print(error)"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "JAX_PLATFORMS": "rocm"},
+        capture_output=True,
+        text=True,
+    )
+    assert "JAX finds no device to compute on (JAX_PLATFORMS = 'rocm')" in said.stdout, said.stderr

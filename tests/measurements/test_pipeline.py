@@ -16,6 +16,8 @@ from calibray.measurements import (
     links_from_table,
     measured_links,
 )
+from calibray.measurements.preparation import Track
+from calibray.measurements.tracks import join_track
 
 FRAME = Frame.local(11.5755, 48.1374, height=515.0)
 RX = np.array([[0.0, 0.0, 1.5], [120.0, -35.5, 2.0]])
@@ -131,3 +133,14 @@ def test_links_to_predict_at_are_placed_like_measured_ones(log):
     np.testing.assert_allclose(links.tx[0], [0.0, 0.0, 10.0], atol=1e-3)
     assert links.group_names == ("a",)
     assert not links.measured
+
+
+@pytest.mark.parametrize("year", ["0001", "1500", "2500", "9999"])
+def test_a_track_of_another_age_is_refused(tmp_path, year):
+    points = "".join(
+        f'<trkpt lon="11" lat="48"><time>{time}-01-01T00:00:00Z</time></trkpt>' for time in ("2020", year)
+    )
+    (tmp_path / "walk.gpx").write_text(f"<gpx><trk><trkseg>{points}</trkseg></trk></gpx>")
+    rows = SourceTable(pd.DataFrame({"time": ["2020-01-01T00:00:01Z"]}))
+    with pytest.raises(InputError, match=r"walk\.gpx: a time is not ISO 8601 or out of range"):
+        join_track(rows, Track(str(tmp_path / "walk.gpx"), "time"))

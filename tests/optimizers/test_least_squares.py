@@ -125,6 +125,12 @@ def test_an_impossible_catch_up_is_refused(catch_up):
         LeastSquares([0.0], [1.0], catch_up=catch_up)
 
 
+@pytest.mark.parametrize("start", ["abc", [["a", 1.0]], {"a": 1.0}])
+def test_a_start_that_is_not_numbers_is_refused(start):
+    with pytest.raises(InputError, match=r"x0 = .*: must be numbers, one for each parameter"):
+        LeastSquares([0.0], [1.0], x0=start)
+
+
 def test_active_bounds():
     """The minimum (1, 1) is outside; the constrained one is on the face x0 = 0.5 at x1 = 0.25."""
     landscape = within(rosenbrock(), [-2.0, -2.0], [0.5, 2.0])

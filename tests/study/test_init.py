@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
 from calibray.study.draft import draft
+from calibray.study.draft_text import toml
 from calibray.study.schema import schema_text
 
 REPOSITORY = Path(__file__).parents[2]
@@ -92,6 +94,16 @@ def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path
         draft(scene, file, tmp_path / "study.toml")
     given = draft(scene, file, tmp_path / "study.toml", tx=[1.0, 2.0, 3.0])
     assert given.study.links.tx == (1.0, 2.0, 3.0)
+
+
+def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_path):
+    """TOML forbids DEL in texts, JSON allows it."""
+    columns = {"rx_x_m\x7f": [5.0, 9.0], "rx_y_m": [1.0, 2.0], "rx_z_m": 1.5, "path_loss_db": [70.0, 80.0]}
+    file = table(tmp_path, **columns)
+    text = toml({"version": 1, "links": {"rx": list(columns), "x\x7f": 1}}, {})
+    assert tomllib.loads(text)["links"] == {"rx": list(columns), "x\x7f": 1}
+    drafted = draft(scene, file, tmp_path / "study.toml", tx=[0.0, 0.0, 12.0], frequency=3.5e9)
+    assert drafted.study.links.rx[0] == "rx_x_m\x7f"
 
 
 def test_a_wide_table_indoors(tmp_path):

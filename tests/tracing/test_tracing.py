@@ -260,6 +260,7 @@ def test_direct_paths_alone_and_excluded(house: Tracer) -> None:
     [
         ([[0, 0, 9]], [[np.nan, 0, 1]], r"link 0: rx position .*nan.* is not finite"),
         ([[0, 0, 9], [0, np.inf, 9]], [[1, 0, 1], [2, 0, 1]], r"link 1: tx position .*inf.* is not finite"),
+        ([[0, 0, 9]], [[1e300, 0, 1]], r"link 0: rx position .*is too far away"),
         ([[0, 0, 9], [1, 2, 3]], [[1, 0, 1], [1, 2, 3.0005]], r"link 1: transmitter and receiver coincide"),
         (
             [[0, 0, 9]],

@@ -10,6 +10,7 @@ If the user named a folder for JAX's cache (`JAX_COMPILATION_CACHE_DIR`), that o
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import threading
 from collections.abc import Iterator
@@ -20,7 +21,9 @@ from typing import Any
 
 import jax
 
+from calibray.errors import InputError
 from calibray.support import cache_folder
+from calibray.support.messages import first_line, shortened
 
 _lock = threading.Lock()
 _calls = 0
@@ -36,6 +39,9 @@ def jax_settings() -> Iterator[None]:
     Every function of `calibray.fields` that computes does so within these settings. Enter them yourself to
     differentiate or compile around one of the pure functions.
 
+    Raises:
+        InputError: JAX finds no device to compute on.
+
     Example:
         >>> import jax.numpy as jnp
         >>> with jax_settings():
@@ -44,6 +50,7 @@ def jax_settings() -> Iterator[None]:
         >>> jax.config.jax_enable_x64
         False
     """
+    _check_device()
     with jax.enable_x64(True):
         # A folder is set if the user named one, or within another call of Calibray.
         programs = _kept_programs() if jax.config.values["jax_compilation_cache_dir"] is None else None
@@ -52,6 +59,19 @@ def jax_settings() -> Iterator[None]:
         else:
             with _cache_of_jax(programs):
                 yield
+
+
+@cache
+def _check_device() -> None:
+    """Refuse a platform on which JAX has no device."""
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError, ValueError) as error:
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        raise InputError(
+            f"JAX finds no device to compute on (JAX_PLATFORMS = {shortened(platforms)!r}): {first_line(error)}; unset "
+            "JAX_PLATFORMS, or install JAX for that device"
+        ) from None
 
 
 @contextmanager

@@ -101,8 +101,12 @@ def _read_gpx(path: Path) -> pd.DataFrame:
         raise InputError(f"track {path}: no track point has a time; export the track, not a route")
     try:
         points["time"] = pd.to_datetime(points["time"], utc=True, format="ISO8601")
-    except ValueError as error:
-        raise InputError(f"track {path}: a time is not ISO 8601 ({error}); export it again") from None
+        # Years before 1678 and after 2262 are read, but cannot be subtracted.
+        _seconds(points["time"])
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"track {path}: a time is not ISO 8601 or out of range ({error}); export it again"
+        ) from None
     return points.sort_values("time", kind="stable").drop_duplicates("time").reset_index(drop=True)
 
 

@@ -32,6 +32,7 @@ from calibray.optimizers.evaluations import Archive, Evaluations, Objective, roo
 from calibray.optimizers.protocol import Optimizer, Schedule
 from calibray.optimizers.sampling import design
 from calibray.optimizers.session import Search, Session
+from calibray.support.messages import shortened
 
 CATCH_UP = 100.0
 """Default number of predicted decreases that a search may be behind the best one before it is given up."""
@@ -236,7 +237,10 @@ def _slack(ended: Starts) -> float:
 def _user_starts(x0: ArrayLike | None, box: Box) -> NDArray[np.float64]:
     if x0 is None:
         return np.empty((0, box.dimension))
-    points = np.atleast_2d(np.array(x0, dtype=float))
+    try:
+        points = np.atleast_2d(np.array(x0, dtype=float))
+    except (ValueError, TypeError):
+        raise InputError(f"x0 = {shortened(repr(x0))}: must be numbers, one for each parameter") from None
     if points.ndim != 2 or points.shape[1] != box.dimension:
         d = box.dimension
         raise InputError(f"x0 has shape {np.shape(x0)}; it must be [{d}] or [k, {d}]: reshape it")

@@ -41,7 +41,12 @@ def _table(name: str, table: Mapping[str, Any], reasons: Mapping[str, str]) -> I
 
 
 def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _text(key)
+
+
+def _text(text: str) -> str:
+    # JSON escapes all characters that TOML must, except DEL.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
 def _value(value: Any) -> str:
@@ -54,4 +59,4 @@ def _value(value: Any) -> str:
         # Frequencies are easier to read as 3.5e9.
         giga = f"{value / 1e9:.10g}e9"
         return giga if abs(value) >= 1e6 and float(giga) == value else repr(value)
-    return json.dumps(value, ensure_ascii=False)
+    return _text(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.tracing.protocol import Links
 
+LARGEST_COORDINATE: Final = 1e9
+"""Largest coordinate of an antenna [m], as in a path file."""
+
 LEAST_DISTANCE: Final = 1e-3
 """Distance below which the ends of a link coincide [m]."""
 
@@ -25,7 +28,7 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
         Transmitter and receiver of every link [L, 3] each, [m].
 
     Raises:
-        InputError: There is no link, a position is not finite, or the ends of a link coincide.
+        InputError: There is no link, a position is not finite or too far away, or the ends of a link coincide.
     """
     tx, rx = np.asarray(links.tx, dtype=float), np.asarray(links.rx, dtype=float)
     if tx.shape != rx.shape or tx.ndim != 2 or tx.shape[1:] != (3,) or not len(tx):
@@ -33,10 +36,12 @@ def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float6
             f"links: tx has the shape {tx.shape}, rx {rx.shape}; both must be [links, 3], with at least one link"
         )
     for name, position in (("tx", tx), ("rx", rx)):
-        not_finite = np.flatnonzero(~np.isfinite(position).all(axis=1))
-        if len(not_finite):
-            link = not_finite[0]
-            raise InputError(f"link {link}: {name} position {position[link]} is not finite; give metres")
+        # NaN fails the comparison.
+        wrong = np.flatnonzero(~(np.abs(position) <= LARGEST_COORDINATE).all(axis=1))
+        if len(wrong):
+            link = wrong[0]
+            fault = "is not finite" if not np.isfinite(position[link]).all() else "is too far away"
+            raise InputError(f"link {link}: {name} position {position[link]} {fault}; give metres")
     coincident = np.flatnonzero(np.linalg.norm(tx - rx, axis=1) < LEAST_DISTANCE)
     if len(coincident):
         link = coincident[0]
