@@ -54,7 +54,6 @@ CASES = {
     "missing column": ("study.toml", ('"loss"', '"los"'), ["links.csv", "'los'", "did you mean 'loss'?"]),
     "not a number": ("links.csv", ("76.0", "n/k"), ["links.csv", "row 3", "loss", "n/k"]),
     "empty cell": ("links.csv", ("76.0", ""), ["links.csv", "row 3", "loss"]),
-    "duplicate link": ("links.csv", ("30,1,80.0,b", "20,0,76.0,b"), ["links.csv", "row 4", "row 3"]),
     "negative path loss": ("links.csv", ("76.0", "-76.0"), ["links.csv", "row 3", "-76", "path_gain"]),
     "empty after filter": ("study.toml", ('"loss"', '"loss"\nwhere = "x > 99"'), ["links.csv", "x > 99"]),
     "bad filter": (

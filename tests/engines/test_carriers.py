@@ -397,11 +397,12 @@ def test_a_column_of_too_many_frequencies_or_none(folder: Path) -> None:
         study(folder, name="many", links=links).measurements()
 
 
-def test_the_same_value_at_another_carrier_is_no_copy(folder: Path) -> None:
+def test_the_same_value_at_another_carrier_is_no_repeat(folder: Path) -> None:
     assert len(study(folder, 90.0).measurements()) == 24
     links = study(folder).links.model_dump(exclude={"frequency"})
-    with pytest.raises(InputError, match="duplicate link"):
-        study(folder, 90.0, links=links).measurements()
+    merged = study(folder, 90.0, links=links).measurements()
+    assert len(merged) < 24
+    assert merged.prepared == {"rows that repeat a link, merged": 24 - len(merged)}
 
 
 def test_a_law_that_leaves_physics_at_a_carrier_is_refused_with_it(folder: Path) -> None:

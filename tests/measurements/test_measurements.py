@@ -8,9 +8,13 @@ from hypothesis import strategies as st
 
 from calibray.errors import InputError
 from calibray.measurements import (
+    LinkColumns,
     Measurements,
+    Preparation,
+    SourceTable,
     links_from_frame,
     links_from_table,
+    measured_links,
     read_measurements,
     read_table,
 )
@@ -248,7 +252,6 @@ LATER = TABLE.splitlines()[1:]
         (TABLE, {"std": 1, "weight": "spread"}, "give one of them"),
         # Links
         (TABLE, {"tx": [20, 0, 1.5]}, "row 3: transmitter and receiver are at the same point"),
-        (TABLE + LATER[1] + "\n", {}, "row 6: duplicate link, same positions and value as row 3"),
         # Filters
         (TABLE, {"where": "x > 1000"}, "passes none of 4 rows"),
         (TABLE, {"where": "sett == 'LOS'"}, "no column 'sett'; did you mean 'set'"),
@@ -276,13 +279,57 @@ def test_missing_files_and_other_formats_are_refused(tmp_path):
         read_measurements(latin, [0, 0, 1], [1, 1, 1], "loss")
 
 
-def test_repeated_measurements_are_kept_and_copies_refused(tmp_path):
-    again = TABLE + LATER[1].replace("86.5", "87.0") + "\n"
-    assert len(read(tmp_path, again)) == 5
-    other_group = TABLE + LATER[1].replace("LOS", "NLOS") + "\n"
-    assert len(read(tmp_path, other_group, group="set")) == 5
-    with pytest.raises(InputError, match="duplicate link"):
-        read(tmp_path, other_group)
+def test_rows_that_repeat_a_link_are_merged_in_linear_power(tmp_path):
+    repeated = TABLE + LATER[1].replace("86.5", "96.5") + "\n" + LATER[1] + "\n"
+    links = read(tmp_path, repeated)
+    assert len(links) == 4
+    assert links.prepared == {"rows that repeat a link, merged": 2}
+    mean_gain = (2 * 10**-8.65 + 10**-9.65) / 3
+    np.testing.assert_allclose(links.path_loss_db[1], -10 * np.log10(mean_gain))
+    assert links.row.tolist() == [2, 3, 4, 5]
+    # An exact copy changes no value.
+    copied = read(tmp_path, TABLE + LATER[1] + "\n")
+    assert copied.path_loss_db.tolist() == read(tmp_path, TABLE).path_loss_db.tolist()
+
+
+@pytest.mark.parametrize(
+    ("column", "keys"),
+    [
+        ("set", {"group": "set"}),
+        ("carrier", {"frequency": "carrier"}),
+        ("sent", {"quantity": "received_power", "tx_power_dbm": "sent"}),
+        ("timestamp", {}),
+        ("transmitter", {}),
+    ],
+)
+def test_rows_of_other_groups_carriers_powers_times_and_transmitters_are_no_repeats(column, keys):
+    frame = pd.DataFrame({"x": 20.0, "level": 80.0, column: [1e9, 1e9, 2e9]})
+    if column == "sent":
+        frame["sent"], frame["level"] = [20.0, 20.0, 23.0], -80.0
+    links = measured_links(SourceTable(frame), LinkColumns((0, 0, 5), ("x", 0, 1), "level", **keys))
+    assert len(links) == 2
+    assert links.prepared == {"rows that repeat a link, merged": 1}
+
+
+def test_a_repeat_below_the_noise_floor_stays_censored():
+    frame = pd.DataFrame({"x": 20.0, "rsrp": [-100.0, np.nan, -130.0]})
+    steps = Preparation(noise_floor_dbm=-120.0, censored=True)
+    links = measured_links(SourceTable(frame), LinkColumns((0, 0, 5), ("x", 0, 1), "rsrp", "rsrp"), steps)
+    assert links.path_loss_db.tolist() == [100.0, 120.0]
+    assert links.censored.tolist() == [False, True]
+
+
+def test_different_places_moved_to_one_corner_both_stay():
+    """Two receivers inside a building are moved to the same corner; their values agree."""
+    frame = pd.DataFrame({"x": [20.0, 21.0], "loss": 80.0})
+
+    def corner(positions):
+        return np.full_like(positions, 30.0), np.full(len(positions), 10.0)
+
+    steps = Preparation(inside="move", outside=corner)
+    links = measured_links(SourceTable(frame), LinkColumns((0, 0, 5), ("x", 0, 1), "loss"), steps)
+    assert links.rx[:, 0].tolist() == [30.0, 30.0]
+    assert "rows that repeat a link, merged" not in links.prepared
 
 
 @pytest.mark.parametrize(

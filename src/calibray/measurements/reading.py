@@ -1,4 +1,4 @@
-"""From a table to links: read the file, select rows, place them, average, clear buildings, check."""
+"""From a table to links: read the file, select rows, place them, average or merge, clear buildings, check."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from calibray.measurements.buildings import clear_buildings
 from calibray.measurements.links import Measurements
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS, place_rows
 from calibray.measurements.preparation import LinkColumns, Preparation, Quantity
+from calibray.measurements.repeats import merge_repeats
 from calibray.measurements.selection import select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import read_table
@@ -36,8 +37,7 @@ def read_measurements(
 ) -> Measurements:
     """Read measured links from a CSV, Parquet or Excel file.
 
-    A link may be measured several times; each value counts. A row that repeats an earlier one in link, carrier, group
-    and value is refused as a copy.
+    Rows that repeat a link are merged in linear power (see `repeats.merge_repeats`).
 
     Args:
         path: The table: .csv, .parquet or .xlsx.
@@ -58,8 +58,8 @@ def read_measurements(
         The links that pass, in the order of the file.
 
     Raises:
-        InputError: The file or a column is missing or malformed, a value is missing, not a number or implausible, a
-            row is a copy, or no row passes.
+        InputError: The file or a column is missing or malformed, a value is missing, not a number or implausible, or
+            no row passes.
     """
     columns = LinkColumns(tx, rx, value, quantity, group, weight, std, tx_power_dbm, frequency)
     return measured_links(read_table(path), columns, Preparation(where=where))
@@ -76,17 +76,18 @@ def measured_links(
         steps: The steps before rows are links; none if None.
 
     Returns:
-        The links; `prepared` counts what was left out, averaged or moved.
+        The links; `prepared` counts what was left out, averaged, merged or moved.
 
     Raises:
-        InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, a
-            row is a copy, or no row remains.
+        InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
+            no row remains.
     """
     steps = steps or Preparation()
     table = select_rows(table, steps, columns.value)
     table, tx, rx = place_rows(table, steps, columns.tx, columns.rx)
     columns = replace(columns, tx=tx, rx=rx)
     table = average_samples(table, steps, columns)
+    table = merge_repeats(table, steps, columns)
     table = clear_buildings(table, steps, columns.rx)
     return make_links(table, columns, steps)
 

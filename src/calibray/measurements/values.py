@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
@@ -32,15 +31,14 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
         The links.
 
     Raises:
-        InputError: A column is missing, a value is missing, not a number or implausible, or a row repeats an earlier
-            one in link, carrier, group and value.
+        InputError: A column is missing, or a value is missing, not a number or implausible.
     """
     limit_db = censored = None
     if steps.noise_floor_dbm is not None:
         sent_dbm = 0.0 if columns.tx_power_dbm is None else table.numbers(columns.tx_power_dbm)
         limit_db = np.full(len(table), sent_dbm - steps.noise_floor_dbm)
         censored = table.numbers(columns.value) <= steps.noise_floor_dbm if steps.censored else None
-    links = Measurements(
+    return Measurements(
         tx=table.positions("tx", columns.tx),
         rx=table.positions("rx", columns.rx),
         path_loss_db=_path_loss_db(table, columns),
@@ -51,8 +49,6 @@ def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> 
         censored=censored,
         table=table,
     )
-    _refuse_copies(links)
-    return links
 
 
 def _path_loss_db(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
@@ -105,20 +101,3 @@ def _weights(table: SourceTable, columns: LinkColumns) -> NDArray[np.float64]:
             f"{name}: {values[first]:g} must be greater than 0; leave the row out with a where filter"
         )
     return values if columns.std is None else 1 / values**2
-
-
-def _refuse_copies(links: Measurements) -> None:
-    """Refuse a row that repeats an earlier one in link, carrier, group and value."""
-    keys = pd.DataFrame(np.column_stack([links.tx, links.rx, links.path_loss_db]))
-    if links.group is not None:
-        keys["group"] = links.group
-    if links.frequency is not None:
-        keys["frequency"] = links.frequency
-    copies = np.flatnonzero(keys.duplicated())
-    if len(copies):
-        copy = int(copies[0])
-        first = int(np.flatnonzero((keys == keys.iloc[copy]).all(axis=1))[0])
-        raise InputError(
-            f"{links.source}, row {links.row[copy]}: duplicate link, same positions and value as row "
-            f"{links.row[first]} ({len(copies)} in all); remove one"
-        )
