@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 import json
 import shutil
 import subprocess
 import sys
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +25,9 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.reporting.export import FILES, export, matlab
 from calibray.scenes import export_scene, read_scene
+from calibray.scenes.export import exported_names
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna.exported import LinkPositions, verify_export
 from changed import changed
 from small_scenes import block, write_scene
 
@@ -141,3 +146,81 @@ def test_a_folder_that_is_a_file_is_refused(folder, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file; name another folder"):
         export(Result.load(folder / "out"), tmp_path / "file")
+
+
+NAMES = [
+    "ground",
+    "a.b",
+    'say "so"',
+    "back\\slash",
+    "line\nbreak",
+    "x" * 300,
+    "itu.x",
+    "mesh-ground",
+    "dollar",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_of_a_material_or_an_object_is_exported_as_one_that_sionna_loads(tmp_path, name):
+    """An object named like a material is refused by Sionna RT, and a dot names a parameter of Mitsuba's."""
+    file = write_scene(
+        tmp_path / "in", {"ground": block((-9, -9, -1), (9, 9, 0)), "wall": block((3, -3, 0), (4, 3, 3))}
+    )
+    root = ElementTree.parse(file).getroot()
+    material = copy.deepcopy(root.find("bsdf"))
+    material.set("id", f"mat-{name}")
+    material.find("float").set("value", "7.0")
+    root.insert(0, material)
+    wall, ground = root.findall("shape")[1], root.findall("shape")[0]
+    ground.find("ref").set("id", f"mat-{name}")
+    ground.set("id", f"mesh-{name}")
+    wall.set("id", f"mesh-{name}.wall")
+    ElementTree.ElementTree(root).write(file)
+    scene = read_scene(file, 2e9)
+    names = exported_names(scene.materials)
+    export_scene(scene, scene.materials, tmp_path / "out" / "scene.xml", copy_meshes=True)
+    verify(scene, names, tmp_path / "out" / "scene.xml")
+
+
+def verify(scene, names, target):
+    links = LinkPositions(np.array([[0.0, 0, 2.0]]), np.array([[2.0, 1.0, 1.5]]))
+    antennas = Antenna(), Antenna()
+    verify_export(
+        scene,
+        scene.materials,
+        names,
+        target,
+        frequency=2e9,
+        settings=TraceSettings(),
+        antennas=antennas,
+        links=links,
+    )
+
+
+def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
+    file = write_scene(tmp_path / "in", {"ground": block((-9, -9, -1), (9, 9, 0))})
+    scene = read_scene(file, 2e9)
+    target = tmp_path / "out.xml"
+    export_scene(scene, scene.materials, target)
+    verify(scene, {"stone": "stone"}, target)
+    sound = target.read_text()
+    for old, new, message in (
+        (
+            '"relative_permittivity" value="5.0"',
+            '"relative_permittivity" value="5.1"',
+            "relative_permittivity of",
+        ),
+        ('id="mat-stone"', 'id="mat-brick"', "Sionna RT"),
+        ("ground.ply", "missing.ply", "Sionna RT cannot load it"),
+        ("</shape>", '<boolean name="flip_normals" value="maybe"/></shape>', "Sionna RT cannot load it"),
+        (
+            "</shape>",
+            '<transform name="to_world"><scale value="2"/></transform></shape>',
+            "holds another surface of material 'stone'",
+        ),
+    ):
+        assert old in sound
+        target.write_text(sound.replace(old, new))
+        with pytest.raises(InputError, match=f"is not the calibrated scene: .*{message}"):
+            verify(scene, {"stone": "stone"}, target)

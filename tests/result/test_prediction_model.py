@@ -20,7 +20,7 @@ from calibray.result.held_out import Model
 from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import prediction_text, reason_text, scene_alone_text
 from calibray.scenes import read_scene
-from calibray.scenes.export import exported_id
+from calibray.scenes.export import exported_names
 from calibray.tables.text import render
 from calibray.uncertainty.verdicts import consistent
 
@@ -75,7 +75,7 @@ def test_the_exported_scene_is_the_one_that_predictions_use(tmp_path: Path) -> N
     changed = replace(result, prediction=replace(result.prediction, model=model, materials=materials))
     export(changed, tmp_path / "exported")
     changed.save(tmp_path / "out")
-    exported = exported_id(material).removeprefix("mat-")
+    exported = exported_names(result.materials)[material]
     for file in (tmp_path / "exported" / "scene.xml", tmp_path / "out" / "result-scene.xml"):
         written = read_scene(file, result.study.scene.frequency).materials[exported]
         assert getattr(written, constant) == pytest.approx(value * 1.25, rel=1e-6)

@@ -15,17 +15,20 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS
-from calibray.reporting.link_survey import survey
+from calibray.reporting.link_survey import Survey, survey
 from calibray.result.record import Record
 from calibray.result.wording import scene_alone_text
-from calibray.scenes import export_scene, read_scene
-from calibray.scenes.export import exported_id
+from calibray.scenes import Scene, export_scene, read_scene
+from calibray.scenes.export import exported_names
 from calibray.support.output_files import check_outputs, write_text
 from calibray.tracing.settings import TraceSettings
 
 FILES: Final = (
     "scene.xml", "load_scene.py", "calibration.json", "links.csv", "materials.csv", "materials.json", "materials.m",
 )  # fmt: skip
+VERIFIED_LINKS: Final = 3
+"""Links whose path loss is compared before an export is done."""
+
 SOLVER: Final = {"line_of_sight": "los", "samples": "samples_per_src"}
 """Settings that have another name in Sionna RT's path solver."""
 
@@ -58,8 +61,8 @@ def export(
         predictions.
 
     Raises:
-        InputError: The folder cannot be written, a file in it must not be replaced, or the scene or the links cannot
-            be read any more.
+        InputError: The folder cannot be written, a file in it must not be replaced, the scene or the links cannot be
+            read any more, or Sionna RT loads another scene than the calibrated one.
     """
     study = result.study
     target = check_outputs(folder, FILES, study.files(), overwrite)
@@ -93,11 +96,31 @@ def export(
         export_scene(scene, result.scene_materials, target / "scene.xml", copy_meshes, overwrite)
         for name, text in content.items():
             write_text(target / name, text)
+        _verify(scene, result, target / "scene.xml", links)
     except OSError as error:
         raise InputError(
             f"output folder {target}: cannot be written ({error.strerror}); choose another"
         ) from None
     return FILES
+
+
+def _verify(scene: Scene, result: Record, target: Path, links: Survey) -> None:
+    """Load the written scene as the user will, and compare it with the calibrated one."""
+    # Sionna RT takes seconds to import.
+    from calibray.tracing.sionna.exported import LinkPositions, verify_export
+
+    study = result.study
+    few = np.unique(np.linspace(0, len(links.tx) - 1, VERIFIED_LINKS).astype(int))
+    verify_export(
+        scene,
+        result.scene_materials,
+        exported_names(result.scene_materials),
+        target,
+        frequency=study.scene.frequency,
+        settings=study.trace,
+        antennas=study.antenna_pair,
+        links=LinkPositions(links.tx[few], links.rx[few]),
+    )
 
 
 def _links(result: Record) -> pd.DataFrame:
@@ -133,8 +156,9 @@ def matlab(materials: pd.DataFrame, frequency: float) -> str:
 
 def _rows(result: Record) -> Iterator[dict[str, Any]]:
     """One row per material: the constants that predictions use, and interval and verdict of every calibrated one."""
+    names = exported_names(result.scene_materials)
     for name, material in result.scene_materials.items():
-        row: dict[str, Any] = {"material": name, "scene_name": exported_id(name).removeprefix("mat-")}
+        row: dict[str, Any] = {"material": name, "scene_name": names[name]}
         row |= {field: getattr(material, field) for field in FIELDS}
         row["scattering_pattern"] = material.scattering_pattern
         for parameter in result.parameters:
@@ -157,8 +181,9 @@ def _calibration(result: Record) -> dict[str, Any]:
     """What the script needs in addition to the scene and the links."""
     study = result.study
     tx, rx = study.antenna_pair
+    names = exported_names(result.scene_materials)
     patterns = {
-        exported_id(name).removeprefix("mat-"): {
+        names[name]: {
             "name": material.scattering_pattern,
             "alpha_r": round(material.alpha_r),
             **(

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from shutil import copyfile
+from typing import Final
 
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes.scene import TRACED, Scene, is_itu_name, material_element
 from calibray.scenes.scene_file import MESHES
 from calibray.support.output_files import check_outputs, replacing, write_text
+
+_NOT_PLAIN: Final = re.compile(r"[^0-9A-Za-z_-]+")
 
 
 def export_scene(
@@ -24,8 +28,8 @@ def export_scene(
 ) -> None:
     """Write a scene file with other constants; it refers to the original meshes or to copies.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, so such a material becomes `calibrated-NAME`. Sionna's
-    scene files support the Lambertian scattering pattern only; set another pattern after loading the scene.
+    Materials and objects get names that Sionna RT takes (`exported_names`). Sionna's scene files support the
+    Lambertian scattering pattern only; set another pattern after loading the scene.
 
     Args:
         scene: The scene as it was read.
@@ -46,9 +50,12 @@ def export_scene(
     root = ElementTree.fromstring(scene.xml)
     for bsdf in root.findall("bsdf"):
         root.remove(bsdf)
-    exported = {f"{TRACED}{index}": exported_id(name) for index, name in enumerate(scene.materials)}
+    names = exported_names(materials)
+    exported = {f"{TRACED}{index}": f"mat-{names[name]}" for index, name in enumerate(scene.materials)}
+    object_names = _unique((item.name or "object" for item in scene.objects), set(names.values()), "object")
     copies: dict[str, Path] = {}
-    for shape in root.findall("shape"):
+    for shape, name in zip(root.findall("shape"), object_names, strict=True):
+        shape.set("id", f"mesh-{name}")
         for reference in shape.findall("ref"):
             reference.set("id", exported[reference.get("id", "")])
         filename = shape.find("string[@name='filename']")
@@ -58,29 +65,59 @@ def export_scene(
                 mesh = _copy(mesh, target.parent.resolve() / MESHES, copies, overwrite)
             filename.set("value", os.path.relpath(mesh, target.parent.resolve()))
     for index, (name, material) in enumerate(materials.items()):
-        root.insert(index, material_element(exported_id(name), material))
+        root.insert(index, material_element(f"mat-{names[name]}", material))
     ElementTree.indent(root)
     write_text(target, ElementTree.tostring(root, encoding="unicode") + "\n")
 
 
-def exported_id(name: str) -> str:
-    """The id of a material in an exported scene.
+def exported_names(names: Iterable[str]) -> dict[str, str]:
+    """The names of materials in an exported scene.
+
+    Sionna RT refuses a plain `radio-material` with an ITU name, and Mitsuba misreads names with dots, quotes or line
+    breaks.
 
     Args:
-        name: The material's name.
+        names: The materials' names.
 
     Returns:
-        `mat-NAME`, so that Sionna RT calls the material NAME; `mat-calibrated-NAME` for an ITU name.
+        For each name one of letters, digits, `_` and `-`, no two alike; ITU names become `calibrated-NAME`.
+
+    Example:
+        >>> exported_names(["stone", "concrete", "brick.old", "brick old"])
+        {'stone': 'stone', 'concrete': 'calibrated-concrete', 'brick.old': 'brick_old', 'brick old': 'brick_old-2'}
     """
-    return f"mat-calibrated-{name}" if is_itu_name(name) else f"mat-{name}"
+    listed = list(names)
+    plain = (f"calibrated-{name}" if is_itu_name(_plain(name)) else name for name in listed)
+    return dict(zip(listed, _unique(plain, set(), "material"), strict=True))
+
+
+def _plain(name: str) -> str:
+    return _NOT_PLAIN.sub("_", name)
+
+
+def _unique(names: Iterable[str], taken: set[str], kind: str) -> list[str]:
+    """Plain names, each different from the others and from those taken, as `NAME-2`, or `NAME-KIND` if taken."""
+    unique: list[str] = []
+    used = set(taken)
+    for name in names:
+        plain = _plain(name)[:80] or kind
+        candidate = f"{plain}-{kind}" if plain in taken else plain
+        number = 1
+        while candidate in used:
+            number += 1
+            candidate = f"{plain}-{number}"
+        used.add(candidate)
+        unique.append(candidate)
+    return unique
 
 
 def _copy(mesh: Path, folder: Path, copies: dict[str, Path], overwrite: bool) -> Path:
     """Copy a mesh; meshes of the same name from different folders get numbers."""
-    name, number = mesh.name, 1
+    stem, number = _plain(mesh.stem), 1
+    name = f"{stem}{mesh.suffix}"
     while copies.setdefault(name, mesh) != mesh:
         number += 1
-        name = f"{mesh.stem}-{number}{mesh.suffix}"
+        name = f"{stem}-{number}{mesh.suffix}"
     if folder.is_symlink():
         raise InputError(f"{folder}: is a link; remove it, or export into another folder")
     if (folder / name).exists() and (folder / name).samefile(mesh):

@@ -83,9 +83,8 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
     Raises:
         InputError: A surface differs.
     """
-    held: dict[int, list[SurfaceSize]] = {}
-    for shape in mitsuba_scene.shapes():
-        held.setdefault(int(shape.bsdf().name.split("-")[-1]), []).append(_size(shape))
+    # The names of Sionna's materials end in the number of the material (`Scene.xml`).
+    held = surfaces_by_material(mitsuba_scene, lambda material: int(material.name.split("-")[-1]))
     for number, material in enumerate(scene.materials):
         of_material = [
             size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == material
@@ -94,13 +93,21 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
         if len(stored) < len(of_material):
             continue  # a `serialized` mesh, whose file only Mitsuba reads
         traced = held.get(number, [])
-        if not traced or not _agree(traced, stored, scene.local_origin):
+        if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
                 f"{scene.path}: Mitsuba holds another surface of material {material!r} than the mesh files "
                 f"({sum(size.area for size in traced):.6g} m^2 instead of "
                 f"{sum(size.area for size in stored):.6g} m^2); export the meshes again, as binary PLY with "
                 "coordinates of type float"
             )
+
+
+def surfaces_by_material(mitsuba_scene: Any, key: Callable[[Any], Any]) -> dict[Any, list[SurfaceSize]]:
+    """Measure the shapes in Mitsuba's memory, by a key of their materials."""
+    held: dict[Any, list[SurfaceSize]] = {}
+    for shape in mitsuba_scene.shapes():
+        held.setdefault(key(shape.bsdf()), []).append(_size(shape))
+    return held
 
 
 def _size(shape: Any) -> SurfaceSize:
@@ -114,8 +121,10 @@ def _size(shape: Any) -> SurfaceSize:
     return SurfaceSize.of(Mesh(vertex, np.array(values["faces"], dtype=np.int64).reshape(-1, 3)))
 
 
-def _agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
+def surfaces_agree(traced: list[SurfaceSize], stored: list[SurfaceSize], origin: NDArray[np.float64]) -> bool:
     """Whether a surface in the local frame is, within single precision, that of objects in the scene frame."""
+    if not traced:
+        return False
     low, high = np.min([size.low for size in stored], axis=0), np.max([size.high for size in stored], axis=0)
     bounds = np.array([low, high]) - origin
     # A vertex is rounded when it is stored and once more when it is transformed.

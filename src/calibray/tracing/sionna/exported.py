@@ -1,0 +1,127 @@
+"""An exported scene compared with the calibrated one, after plain Sionna RT has loaded it."""
+
+# Mitsuba defines its types when its variant is chosen, so its stubs declare them as plain objects.
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import sionna.rt as rt
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.materials import Material
+from calibray.scenes import Scene, read_scene
+from calibray.support.messages import first_line, shortened
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna.scene import surfaces_agree, surfaces_by_material
+from calibray.tracing.sionna.solver import SCALAR_CONSTANTS
+from calibray.tracing.sionna.tracer import Tracer
+
+LARGEST_DIFFERENCE_DB: Final = 0.01
+"""Difference of path loss up to which two traces of one scene agree [dB]: constants are rounded in the file."""
+
+SAMPLES: Final = 20_000
+"""Rays of the comparison; both scenes get the same ones."""
+
+_LOG: Final = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPositions:
+    """Ends of links.
+
+    Attributes:
+        tx: Transmitters [L, 3], [m].
+        rx: Receivers [L, 3], [m].
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+
+
+def verify_export(
+    scene: Scene,
+    materials: Mapping[str, Material],
+    names: Mapping[str, str],
+    target: Path,
+    *,
+    frequency: float,
+    settings: TraceSettings,
+    antennas: tuple[Antenna, Antenna],
+    links: LinkPositions,
+) -> None:
+    """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of some links.
+
+    Args:
+        scene: The scene that was exported.
+        materials: The constants that it was exported with, by name.
+        names: The names of the materials in the exported scene.
+        target: The exported file.
+        frequency: Carrier frequency [Hz].
+        settings: The tracer's settings; fewer rays are used.
+        antennas: Transmit and receive antenna.
+        links: The links to compare.
+
+    Raises:
+        InputError: Sionna RT cannot load the exported scene, or it is another one.
+    """
+    try:
+        loaded = rt.load_scene(str(target))
+    except Exception as error:  # Mitsuba and Sionna raise whatever they run into
+        raise InputError(_failed(target, f"Sionna RT cannot load it ({first_line(error)})")) from None
+    for name in scene.materials:
+        held: Any = loaded.radio_materials.get(names[name])
+        if held is None:
+            raise InputError(_failed(target, f"Sionna RT has no material {shortened(repr(names[name]))}"))
+        for constant in SCALAR_CONSTANTS:
+            expected, value = (
+                getattr(materials[name], constant),
+                float(np.array(getattr(held, constant)).item()),
+            )
+            if not np.isclose(value, expected, rtol=1e-5, atol=1e-12):
+                fault = f"{constant} of {shortened(repr(names[name]))} is {value:g} in Sionna RT, not {expected:g}"
+                raise InputError(_failed(target, fault))
+    by_material = surfaces_by_material(loaded.mi_scene, lambda material: str(material.name))
+    for name in scene.materials:
+        sizes = [size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == name]
+        stored = [size for size in sizes if size is not None]
+        if len(stored) == len(sizes) and not surfaces_agree(
+            by_material.get(names[name], []), stored, np.zeros(3)
+        ):
+            fault = f"Sionna RT holds another surface of material {shortened(repr(names[name]))}"
+            raise InputError(_failed(target, fault))
+    if scene.local_origin.any():
+        _LOG.warning(
+            "%s lies far from its origin: plain Sionna RT computes in single precision there and may lose paths; "
+            "move the origin into the scene", target,
+        )  # fmt: skip
+    few_rays = replace(
+        settings, samples=SAMPLES, max_depth=min(settings.max_depth, 2), diffuse_reflection=False
+    )
+    # Scene files hold the Lambertian pattern only, so the constants are given again.
+    written = read_scene(target, frequency, {names[name]: materials[name] for name in scene.materials})
+    power = []
+    for traced, constants in ((scene, {name: materials[name] for name in scene.materials}), (written, {})):
+        solution = Tracer(traced, frequency, few_rays, *antennas).solve(links, constants)
+        gains = (np.abs(solution.gain) ** 2).sum(axis=(1, 2))
+        power.append(np.bincount(solution.link, gains, len(links.tx)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        difference = np.abs(10 * np.log10(power[0] / power[1]))
+    difference = np.where((power[0] == 0) & (power[1] == 0), 0.0, difference)
+    if not (difference <= LARGEST_DIFFERENCE_DB).all():
+        fault = f"path loss differs by {np.nanmax(difference):.2f} dB from the calibrated scene"
+        raise InputError(_failed(target, fault))
+
+
+def _failed(target: Path, fault: str) -> str:
+    return (
+        f"{target}: was written, but is not the calibrated scene: {fault}; rename materials, objects and mesh files "
+        "with unusual characters, and export again"
+    )
