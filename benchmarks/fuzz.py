@@ -66,7 +66,7 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
         # Told first, for who cannot be asked any more.
         print(json.dumps({"number": number, "kind": case.kind, "note": case.note}), file=answers, flush=True)
         started = time.monotonic()
-        watch.programs = case.kind in ("study", "answer", "ledger", "line")
+        watch.programs = case.kind in ("study", "answer", "ledger", "line", "paths", "cache")
         verdict = judge(case, folder, watch)
         if peak() > MEMORY:
             verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")

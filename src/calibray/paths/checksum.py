@@ -51,24 +51,31 @@ def seal(path: str | Path) -> None:
         raise InputError(f"{target}: cannot be sealed ({error.strerror}); name a path file") from None
 
 
-def write_checksum(path: Path) -> None:
+def write_checksum(path: Path) -> str:
     """Write the checksum into the empty user block of an HDF5 file.
 
     Args:
         path: The file, with a user block of `BLOCK` bytes.
+
+    Returns:
+        The checksum in hexadecimal.
     """
     with path.open("r+b") as file:
         file.seek(BLOCK)
         block = _block(file)
         file.seek(0)
         file.write(block)
+    return _digest(block)
 
 
-def verify(path: Path) -> None:
+def verify(path: Path) -> str:
     """Refuse a file whose content differs from the sealed one.
 
     Args:
         path: The file.
+
+    Returns:
+        The checksum in hexadecimal.
 
     Raises:
         InputError: The file is not a sealed HDF5 file, or was changed since; the message lacks its name.
@@ -84,6 +91,11 @@ def verify(path: Path) -> None:
             raise InputError("is damaged or no path file; trace again")
         if _block(file) != head:
             raise InputError("is damaged (its checksum does not agree); trace again")
+    return _digest(head)
+
+
+def _digest(block: bytes) -> str:
+    return block[len(PATH_SEAL) :].split()[0].decode()
 
 
 def _block(file: BinaryIO) -> bytes:

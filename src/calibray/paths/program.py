@@ -24,6 +24,8 @@ from calibray.materials import FIELDS, Material, constants_matrix
 from calibray.paths.checksum import BLOCK, verify, write_checksum
 from calibray.paths.file_format import DATASETS, Content, read, write
 from calibray.paths.interactions import Diffraction, Diffuse, Kind
+from calibray.paths.validation import remember, validate
+from calibray.support.messages import first_line
 from calibray.support.output_files import check_file, exists, replacing
 
 _WIDTH: Final = 80
@@ -176,7 +178,8 @@ class Paths:
             with replacing(target, signed=False) as partial:
                 with h5py.File(partial, "w", userblock_size=BLOCK) as file:
                     write(file, _content(self))
-                write_checksum(partial)
+                digest = write_checksum(partial)
+            remember(digest)
         except OSError as error:
             raise InputError(
                 f"{target}: cannot be written ({error}); name a file in a writable folder"
@@ -199,13 +202,33 @@ class Paths:
         if not exists(source):
             raise InputError(f"{source}: does not exist; write one with `calibray trace STUDY -o {source}`")
         try:
-            verify(source)
-            with h5py.File(source, "r") as file:
-                return _paths(read(file))
+            validate(source, verify(source))
+            return read_paths(source)
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
-        except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-            raise InputError(f"{source}: is damaged or no path file ({error}); trace again") from None
+        except OSError as error:
+            raise InputError(f"{source}: cannot be read ({error}); check the file") from None
+
+
+def read_paths(file: str | Path) -> Paths:
+    """Read a path file, its checksum not compared.
+
+    Args:
+        file: The HDF5 file.
+
+    Returns:
+        The path program.
+
+    Raises:
+        InputError: It is not a path file, has another version, or is damaged; the message lacks its name.
+    """
+    try:
+        with h5py.File(file, "r") as stream:
+            return _paths(read(stream))
+    except InputError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
+        raise InputError(f"is damaged or no path file ({first_line(error)}); trace again") from None
 
 
 def _content(paths: Paths) -> Content:
