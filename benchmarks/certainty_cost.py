@@ -24,7 +24,7 @@ from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
-from calibray.validation.choice import choose_model
+from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.validate import validate_problem
 
 LIMIT = 10.0
@@ -46,8 +46,9 @@ def costs(problem: Problem) -> dict[str, tuple[float, int]]:
         validation = timed(
             "validation", validate_problem, problem, None, None, None, {Model.CALIBRATED: trail.minima}
         )
-        best = problem.parameters.to_search(trail.best)
-        timed("choice", choose_model, problem, validation, best)
+        name = validation.chosen
+        residuals = HeldOutResiduals(validation.scale(name), "held-out blocks", 1, validation.sizes(name))
+        timed("choice", fit_prediction_model, problem, trail, name, residuals)
     return found
 
 

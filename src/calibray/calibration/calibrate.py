@@ -9,6 +9,7 @@ from typing import Final
 from calibray import engines
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
+from calibray.calibration.unreached_links import unreached_remark
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
 from calibray.engines.protocol import Engine
@@ -114,7 +115,8 @@ def calibrate(
         many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
-    run = Run(problem, trail, gap_db, cheap, enclosed, timing)
+    unreached = unreached_remark(problem, progress) if can_trace else ()
+    run = Run(problem, trail, gap_db, cheap, enclosed, unreached, timing)
     result = make_result(run, assessment, validation)
     if out is not None:
         # The folder was checked before the search; a file that appeared since then must not cost the result.

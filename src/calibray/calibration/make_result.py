@@ -83,6 +83,7 @@ class Run:
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
         cheap: The cheap model, if the method had one.
         enclosed: Antennas inside closed bodies; None where this was not checked.
+        unreached: A remark on links without a path, if they are many.
         timing: Time of its parts.
     """
 
@@ -91,6 +92,7 @@ class Run:
     retrace_gap_db: NDArray[np.float64] | None
     cheap: CheapReplay
     enclosed: EnclosedAntennas | None
+    unreached: tuple[Remark, ...]
     timing: Timing
 
 
@@ -168,6 +170,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             undeclared_offset_error_db=certainty.undeclared_offset_error_db,
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
+                *run.unreached,
                 *certainty.remarks,
                 *_not_judged(study, accuracy),
             ),
@@ -246,7 +249,9 @@ def _choice_on_held_out_links(
         Model.CALIBRATED: models.calibrated,
         Model.LOG_DISTANCE: models.log_distance,
     }
-    errors = {name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()}
+    errors: dict[str, NDArray[np.float64]] = {
+        name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
+    }
     finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
     errors, count = {name: each[finite] for name, each in errors.items()}, int(finite.sum())
     if count >= FEWEST_HELD_OUT:

@@ -21,6 +21,9 @@ class RemarkKind(StrEnum):
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"
+    UNREACHED_LINKS = (
+        "unreached links"  # links, of (all), sample, switches, reached (links of the sample by switch)
+    )
 
 
 Value = float | int | bool | str | list[str] | list[float] | list[list[float]]

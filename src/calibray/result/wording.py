@@ -175,6 +175,18 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     )
 
 
+def _unreached_links(values: dict[str, Any]) -> str:
+    trials = zip(values["switches"], values["reached"], strict=True)
+    reached = ", ".join(f"{switch} reaches {count:.0f}" for switch, count in trials)
+    text = (
+        f"{values['links']:,} of {values['of']:,} links have no path. They count in no RMSE, and nothing is fitted to "
+        "them."
+    )
+    if max(values["reached"], default=0.0) == 0:
+        return f"{text} No setting of [trace] reaches any of {values['sample']} that were tried: check their positions."
+    return f"{text} Of {values['sample']} that were tried, {reached}: change [trace]."
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -198,6 +210,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
+    RemarkKind.UNREACHED_LINKS: _unreached_links,
 }
 
 

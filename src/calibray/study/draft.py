@@ -87,8 +87,8 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         links.assume("links.inside", "move", reason)
     links.assume("antennas", "iso, V, at both ends", "unknown; state yours, with their orientation")
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
-    if indoors:
-        trace["refraction"] = True
+    # Behind buildings most links have no other path.
+    trace["refraction" if indoors else "diffraction"] = True
     return {
         "version": VERSION,
         "scene": {"file": links.scene_file, "frequency": links.frequency},

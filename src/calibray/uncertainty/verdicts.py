@@ -136,7 +136,7 @@ def verdicts(
             name, reason = VerdictName.AMBIGUOUS, _modes(index, seen_pieces, seen, axes)
         elif len(pieces) > 1:
             name, reason = VerdictName.AMBIGUOUS, _modes(index, pieces, draws, axes)
-        elif ends:
+        elif ends and pieces:
             other_end = axes.value(index, pieces[-1][1] if ends == ["lower"] else pieces[0][0])
             reason = Reason(ReasonKind.AT_BOUND, {"side": ends[0], "value": float(other_end)})
             name = VerdictName.AT_BOUND

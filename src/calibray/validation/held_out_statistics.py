@@ -11,13 +11,16 @@ is used instead.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from calibray.result.held_out import FITTED, Judgement, Model
+
+Errors = Mapping[Any, NDArray[np.float64]]
+"""Residuals by model, a `Model` or its name [n], [dB]."""
 
 CLUSTER_LINKS: Final = 4
 """Neighbouring links that are resampled together, since they share part of their noise."""
@@ -59,7 +62,7 @@ def spatial_blocks(position: NDArray[np.float64], count: int) -> NDArray[np.int6
 
 def compare(
     errors: NDArray[np.float64],
-    baselines: Mapping[Model, NDArray[np.float64]],
+    baselines: Errors,
     position: NDArray[np.float64],
     seed: int = 0,
 ) -> Judgement:
@@ -98,7 +101,7 @@ def compare(
     return Judgement(count, float(rmse[0]), str(name), float(rmse[best]), error, len(size))
 
 
-def choose(errors: Mapping[str, NDArray[np.float64]], position: NDArray[np.float64]) -> str:
+def choose(errors: Errors, position: NDArray[np.float64]) -> str:
     """Choose the model for predictions by held-out errors.
 
     The initial materials are kept until another model is better by more than the bootstrap error of the difference.
@@ -120,7 +123,7 @@ def choose(errors: Mapping[str, NDArray[np.float64]], position: NDArray[np.float
     return chosen
 
 
-def least(errors: Mapping[str, NDArray[np.float64]], names: tuple[str, ...]) -> str:
+def least(errors: Errors, names: tuple[str, ...]) -> str:
     """The model of least RMSE among some.
 
     Args:

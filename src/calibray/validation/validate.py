@@ -170,7 +170,7 @@ def fit_models(
         Path loss at all links by name of the model [links], [dB]; NaN where kriging is impossible.
     """
     setup, objective = part.setup, part.objective
-    path_loss_db = {
+    path_loss_db: dict[str, NDArray[np.float64]] = {
         name: add_nuisance(variant.objective, variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fit_variants(part, known_minima).items()
     }

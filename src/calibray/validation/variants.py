@@ -49,7 +49,7 @@ TX_OFFSET: Final = "offset of the transmitter"
 
 def fit_variants(
     part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
-) -> dict[str, tuple[Problem, NDArray[np.float64]]]:
+) -> dict[Model, tuple[Problem, NDArray[np.float64]]]:
     """Fit every variant to the links that have a weight.
 
     Args:
@@ -64,7 +64,7 @@ def fit_variants(
         calibrated = find_minima(part, known_minima[Model.CALIBRATED])
     else:
         calibrated = find_minima(part, np.zeros((0, len(part.parameters))), _global_starts(part))
-    fits = {}
+    fits: dict[Model, tuple[Problem, NDArray[np.float64]]] = {}
     for name, variant in variants(part, calibrated[0]).items():
         if name == Model.INITIAL:
             minima = part.parameters.to_search(part.parameters.start)[None]
