@@ -332,7 +332,7 @@ CURRENT = ProcessOwner.current()
     ("owner", "expires", "waits"),
     [
         (CURRENT, 100.0, True),
-        (CURRENT, -1.0, False),  # it gave no sign of life
+        (CURRENT, -3600.0, True),  # the clock was set since
         (CURRENT, 1e9, False),  # no clock of ours wrote that
         (
             replace(CURRENT, started=CURRENT.started - 60.0),
@@ -340,7 +340,11 @@ CURRENT = ProcessOwner.current()
             False,
         ),  # its number belongs to another process now
         (replace(CURRENT, pid=2**22 + 1), 100.0, False),
+        (replace(CURRENT, boot="before a restart"), 100.0, False),
         (replace(CURRENT, namespace="a container"), 100.0, True),
+        (replace(CURRENT, host="elsewhere"), -3600.0, True),  # its clock is an hour late
+        (replace(CURRENT, host="elsewhere"), 3600.0, True),
+        (replace(CURRENT, host="elsewhere"), -1e6, False),
         (replace(CURRENT, host="elsewhere", pid=2**22 + 1), 100.0, True),
         (None, 100.0, False),
     ],
@@ -354,6 +358,35 @@ def test_a_claim_holds_for_as_long_as_its_run_may_be_alive(path, monkeypatch, ow
             file.execute("INSERT INTO claims VALUES (?, ?, ?, ?, ?)", row)
         claimed = ledger.claim("p", [key(each) for each in CANDIDATES], 2)
     assert claimed == ([] if waits else [key(CANDIDATES[2])])
+
+
+def test_a_claim_of_another_machine_ends_once_nobody_renews_it(path, monkeypatch):
+    """By the observer's clock: neither clock of the two machines is asked for the time of day."""
+    monkeypatch.setattr(claims, "_observed", {})
+    clock = [1000.0]
+    monkeypatch.setattr(claims.time, "monotonic", lambda: clock[0])
+    owner = json.dumps(replace(CURRENT, host="elsewhere").record())
+    with closing(Ledger(path)) as ledger, closing(sqlite3.connect(path)) as file:
+        row = ("p", key(CANDIDATES[2]), "another run", owner, time.time() - 3600.0)
+        with file:
+            file.execute("INSERT INTO claims VALUES (?, ?, ?, ?, ?)", row)
+        wanted = [key(CANDIDATES[2])]
+        assert ledger.claim("p", wanted, 2) == []
+        clock[0] += 0.9 * claims.EXPIRY
+        with file:
+            file.execute("UPDATE claims SET expires = expires + 60")
+        assert ledger.claim("p", wanted, 2) == []
+        clock[0] += 0.9 * claims.EXPIRY
+        assert ledger.claim("p", wanted, 2) == []
+        clock[0] += 0.2 * claims.EXPIRY
+        assert ledger.claim("p", wanted, 2) == wanted
+
+
+def test_the_owner_of_a_claim_is_known_again_after_the_clock_was_set(monkeypatch):
+    """psutil counts from the machine's start by the clock of the day."""
+    monkeypatch.setattr("psutil.boot_time", lambda: 0.0)
+    monkeypatch.setattr("psutil.Process.create_time", lambda _: 0.0)
+    assert not CURRENT.is_gone
 
 
 def test_a_sign_of_life_renews_a_claim_and_the_end_of_work_gives_it_up(path, monkeypatch):

@@ -12,7 +12,8 @@ from typing import Final
 import psutil
 
 CLOCK_TOLERANCE: Final = 2.0
-"""Largest difference of two readings of one process's start time [s]: the system's clock may be corrected between them.
+"""Largest difference of two readings of one process's start time [s]: where it is counted from 1970, the system's clock
+may be corrected between them.
 
 A process number is not used again within so short a time, because the system counts through all others first.
 """
@@ -26,18 +27,21 @@ class ProcessOwner:
         host: The machine.
         namespace: The process namespace, in which a container counts its own processes; empty if unknown.
         pid: The process number.
-        started: Start time of the process [s since 1970]; process numbers are used again, also after a reboot.
+        started: Start time of the process [s since the machine's start, or since 1970 if that is unknown]; process
+            numbers are used again.
+        boot: Identifier of the machine's start, after which the same numbers mean other processes; empty if unknown.
     """
 
     host: str
     namespace: str
     pid: int
     started: float
+    boot: str
 
     @classmethod
     def current(cls) -> ProcessOwner:
         """This process."""
-        return cls(*_machine(), os.getpid(), psutil.Process().create_time())
+        return cls(*_machine(), os.getpid(), _start_time(os.getpid()), _boot())
 
     def record(self) -> dict[str, str | int | float]:
         """The owner as plain values."""
@@ -50,7 +54,13 @@ class ProcessOwner:
             owner = cls(**record)  # type: ignore[arg-type]
         except TypeError:
             return None
-        types = ((owner.host, str), (owner.namespace, str), (owner.pid, int), (owner.started, float))
+        types = (
+            (owner.host, str),
+            (owner.namespace, str),
+            (owner.pid, int),
+            (owner.started, float),
+            (owner.boot, str),
+        )
         return owner if all(isinstance(value, kind) for value, kind in types) else None
 
     @property
@@ -63,15 +73,41 @@ class ProcessOwner:
         """Whether the process has certainly ended; processes of other machines and containers cannot be checked."""
         if (self.host, self.namespace) != _machine():
             return False
+        if self.boot != _boot():
+            return True
         try:
             process = psutil.Process(self.pid)
             if process.status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
                 return True
-            return abs(process.create_time() - self.started) > CLOCK_TOLERANCE
-        except (psutil.NoSuchProcess, ValueError, OverflowError):
+            return abs(_start_time(self.pid) - self.started) > CLOCK_TOLERANCE
+        except (psutil.NoSuchProcess, FileNotFoundError, ProcessLookupError, ValueError, OverflowError):
             return True
         except psutil.AccessDenied:
             return False
+
+
+def _start_time(pid: int) -> float:
+    """Start time of a process [s]. On Linux it counts from the machine's start, so that setting the clock is harmless.
+
+    Raises:
+        FileNotFoundError: There is no such process; likewise `ProcessLookupError`, `psutil.NoSuchProcess`.
+    """
+    if not _boot():
+        return psutil.Process(pid).create_time()
+    # The name of the program, in parentheses, may contain spaces; the start time is field 22 (proc(5)).
+    fields = (
+        Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+    )
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK")
+
+
+@cache
+def _boot() -> str:
+    """Identifier of the machine's start; empty where the system has none."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 @cache

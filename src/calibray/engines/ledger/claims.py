@@ -1,6 +1,7 @@
 """Claims: which run works on which candidate, so that two runs with one ledger do not both pay for it.
 
-A claim lasts while its run renews it, and ends at once if the run's process has certainly ended.
+A claim lasts while its run renews it, and ends at once if the run's process has certainly ended. Renewals are observed
+with the clock of the observer, because the clocks of two machines may differ by hours.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ from calibray.engines.process_owner import ProcessOwner
 TABLE: Final = """CREATE TABLE IF NOT EXISTS claims (
     problem TEXT NOT NULL, candidate BLOB NOT NULL, run TEXT NOT NULL, owner TEXT NOT NULL, expires REAL NOT NULL,
     PRIMARY KEY (problem, candidate)) WITHOUT ROWID"""
-EXPIRY: Final = 300.0  # life of a claim that is not renewed, whose process cannot be checked [s]
+EXPIRY: Final = 300.0  # time without a renewal after which a claim ends, as the observer measures it [s]
+SKEW: Final = 86_400.0  # largest difference between the clocks of two machines [s]; older claims end at once
 RENEWAL: Final = 60.0  # interval between renewals [s]
 RELEASE_WAIT: Final = 500  # longest wait of `release` for other writers [ms]
 _active_runs: set[str] = set()  # the runs of this process
+_observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
+"""Claims of other runs: their `expires` when it last changed, and this process's clock at that time [s]."""
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
@@ -44,7 +48,11 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
         row = connection.execute(
             "SELECT run, owner, expires FROM claims WHERE problem = ? AND candidate = ?", (problem, candidate)
         ).fetchone()
-        if row is None or row[0] == run or not _is_valid(row[0], row[1], row[2], now):
+        if (
+            row is None
+            or row[0] == run
+            or not _is_valid((problem, candidate, str(row[0])), row[1], row[2], now)
+        ):
             connection.execute(
                 "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?)",
                 (problem, candidate, run, owner, now + EXPIRY),
@@ -53,17 +61,33 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
     return claimed
 
 
-def _is_valid(run: object, owner: object, expires: object, now: float) -> bool:
-    # If the clock was set back, a claim must not last longer than it could otherwise.
-    if not isinstance(expires, float) or not now < expires <= now + 2 * EXPIRY:
+def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
+    """Whether a claim of another run still holds.
+
+    Args:
+        claimed: Problem, candidate and run.
+        owner: The process of the run, as JSON.
+        expires: When its run expects the claim to end [s since 1970, by the clock of its machine].
+        now: The time by the clock of this machine [s since 1970].
+
+    Returns:
+        False if the process has ended, or gave no sign of life for `EXPIRY`.
+    """
+    if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False
     try:
         holder = ProcessOwner.from_record(json.loads(owner))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return False
-    if holder is None:
+    if holder is None or holder.is_gone:
         return False
-    return run in _active_runs if holder.is_current else not holder.is_gone
+    if holder.is_current:
+        return claimed[2] in _active_runs
+    last, since = _observed.get(claimed, (None, 0.0))
+    if last != expires:
+        _observed[claimed] = expires, time.monotonic()
+        return True
+    return time.monotonic() - since <= EXPIRY
 
 
 def release(connection: sqlite3.Connection, run: str) -> None:
