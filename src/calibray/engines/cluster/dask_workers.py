@@ -254,19 +254,37 @@ def local_cluster(workers: int) -> Iterator[Client]:
             "machines and --scheduler"
         )
     _require_dask("--workers")
+    import dask
     from distributed import Client, LocalCluster
 
     from calibray.engines.cluster.cores import Cores
 
     # The study states how large chunks are; with a memory limit Dask would kill a worker with a large chunk.
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "memory_limit": 0}
+    # Without an address Dask would serve HTTP on port 8787. It cannot be told not to, so that its servers get a free
+    # port of this machine alone and no page, and are closed once the cluster has started.
+    options = {
+        "threads_per_worker": 1,
+        "processes": True,
+        "memory_limit": 0,
+        "dashboard_address": "127.0.0.1:0",
+        "scheduler_kwargs": {"dashboard": False},
+    }
+    no_pages = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
     with (
+        dask.config.set(no_pages),
         # `DaskWorkers` reports dead workers itself.
         LocalCluster(n_workers=workers, silence_logs=logging.ERROR, **options) as cluster,
         Client(cluster) as client,
     ):
+        cluster.scheduler.http_server.stop()
+        client.run(_stop_http_server)
         client.register_plugin(Cores(workers))
         yield client
+
+
+def _stop_http_server(dask_worker: Any) -> None:
+    """Close the HTTP server of a worker; Dask passes the worker by the argument's name."""
+    dask_worker.http_server.stop()
 
 
 def _require_dask(option: str) -> None:
