@@ -45,6 +45,35 @@ def test_only_a_folder_that_belongs_to_the_user_is_trusted(tmp_path: Path) -> No
         assert not own.trusted
 
 
+def test_a_folder_that_others_can_write_to_is_neither_read_nor_written(tmp_path: Path) -> None:
+    """Whatever was true when the program started."""
+    store = Store(tmp_path / "own", ".x", 1000)
+    store.put("a", b"machine code")
+    assert store.get("a") == b"machine code"
+    store.path.chmod(0o777)
+    assert store.get("a") is None
+    store.put("b", b"other code")
+    store.path.chmod(0o700)
+    assert store.get("a") == b"machine code"
+    assert store.get("b") is None
+    # Another folder under the same path.
+    store.path.rename(tmp_path / "elsewhere")
+    store.path.symlink_to(tmp_path / "elsewhere")
+    assert store.get("a") is None
+
+
+def test_an_entry_is_not_read_or_written_through_a_link(tmp_path: Path) -> None:
+    store, kept = Store(tmp_path / "own", ".x", 1000), tmp_path / "kept"
+    store.put("a", b"machine code")
+    (tmp_path / "own" / "a.x").rename(kept)
+    (tmp_path / "own" / "a.x").symlink_to(kept)
+    before = kept.read_bytes()
+    assert store.get("a") is None
+    store.put("a", b"other code")
+    assert kept.read_bytes() == before
+    assert store.get("a") == b"other code"
+
+
 @pytest.mark.parametrize(
     "damage", [lambda entry: entry[:-1], lambda entry: b"", lambda entry: b"!" + entry[1:]]
 )

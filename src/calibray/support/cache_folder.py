@@ -9,7 +9,8 @@ import hashlib
 import os
 import stat
 import uuid
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -19,6 +20,7 @@ from platformdirs import user_cache_path
 CACHE_VARIABLE: Final = "CALIBRAY_CACHE"
 COMPILED_BYTES: Final = 512 * 2**20
 """Size limit of compiled programs [bytes]."""
+_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _DIGEST_BYTES: Final = 32
 """Bytes of the SHA-256 at the start of each entry."""
 
@@ -51,40 +53,66 @@ class Store:
     @property
     def trusted(self) -> bool:
         """Whether the folder, created if need be, belongs to the user and nobody else can write to it."""
-        try:
-            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            status = self.path.lstat()
-        except OSError:
-            return False
-        if not stat.S_ISDIR(status.st_mode):
-            return False
-        if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders
+        with suppress(OSError), self._folder():
             return True
-        return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        return False
 
     def get(self, name: str) -> bytes | None:
-        """Read an entry; None if it is absent or damaged."""
-        path = self._path(name)
-        with suppress(OSError):
-            content = path.read_bytes()
-            digest, value = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-            if hashlib.sha256(value).digest() == digest:
-                path.touch()
-                return value
-            path.unlink()
+        """Read an entry; None if it is absent or damaged, or if the folder is not trusted."""
+        with suppress(OSError), self._folder() as folder:
+            file = self._file(name, folder)
+            with os.fdopen(os.open(file, os.O_RDONLY | _NO_LINK, dir_fd=folder), "rb") as stream:
+                content = stream.read()
+                digest, value = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+                if hashlib.sha256(value).digest() == digest:
+                    os.utime(stream.fileno() if os.utime in os.supports_fd else file)
+                    return value
+            os.unlink(file, dir_fd=folder)
         return None
 
     def put(self, name: str, value: bytes) -> None:
-        """Write an entry."""
-        path = self._path(name)
-        partial = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
-        try:
-            partial.write_bytes(hashlib.sha256(value).digest() + value)
-            partial.replace(path)
+        """Write an entry, if the folder is trusted."""
+        with suppress(OSError), self._folder() as folder:
+            file = self._file(name, folder)
+            partial = f"{file}.{uuid.uuid4().hex[:8]}.part"
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINK
+            try:
+                with os.fdopen(os.open(partial, flags, 0o600, dir_fd=folder), "wb") as stream:
+                    stream.write(hashlib.sha256(value).digest() + value)
+                os.replace(partial, file, src_dir_fd=folder, dst_dir_fd=folder)
+            except OSError:
+                with suppress(OSError):
+                    os.unlink(partial, dir_fd=folder)
+                raise
             self._remove_oldest()
-        except OSError:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
+
+    @contextmanager
+    def _folder(self) -> Iterator[int | None]:
+        """Open the folder, created if need be, and check who may write to it.
+
+        The check applies to the open folder. Under the path there may be another one a moment later, if others can
+        write to a folder above it.
+
+        Yields:
+            Its descriptor; None on Windows, which keeps other users out of a user's folders.
+
+        Raises:
+            OSError: It cannot be opened, is a link, belongs to another user, or others can write to it.
+        """
+        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.open not in os.supports_dir_fd:
+            if not stat.S_ISDIR(self.path.lstat().st_mode):
+                raise OSError(f"{self.path}: is not a folder")
+            yield None
+            return
+        folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _NO_LINK)
+        try:
+            status = os.fstat(folder)
+            if status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                raise OSError(f"{self.path}: others can write to it")
+            yield folder
+        finally:
+            os.close(folder)
 
     def entries(self) -> list[Path]:
         """The files of the entries, the one read last first; no other file of the folder."""
@@ -105,8 +133,10 @@ class Store:
                 if total > self.limit:
                     path.unlink()
 
-    def _path(self, name: str) -> Path:
-        return self.path / f"{name}{self.suffix}"
+    def _file(self, name: str, folder: int | None) -> str:
+        """The file of an entry, relative to the folder if that is open."""
+        file = f"{name}{self.suffix}"
+        return file if folder is not None else str(self.path / file)
 
 
 def compiled_programs() -> Store | None:
