@@ -144,3 +144,26 @@ def test_the_process_exits_with_2_and_no_traceback(study):
     # On a busy machine, a line of progress precedes the message.
     assert finished.stderr.splitlines()[-1].startswith("Error: ")
     assert "Traceback" not in finished.stderr
+
+
+@pytest.mark.parametrize("empty", ["", " "])
+def test_an_empty_folder_name_is_not_the_current_folder(tmp_path, monkeypatch, empty):
+    write_wall_study(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    done = run("run", "study.toml", "-o", empty)
+    assert done.exit_code == 2
+    assert "an argument is empty" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_a_small_address_space_is_named(tmp_path):
+    """Libraries that find no memory end the process, or look as if they were not installed."""
+    resource = pytest.importorskip("resource")
+    limit = 2**30
+    done = subprocess.run(
+        [sys.executable, "-m", "calibray", "run", "study.toml"], cwd=tmp_path, capture_output=True, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)), check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "memory is short: the address space of this process is limited to 1.0 GiB" in done.stderr

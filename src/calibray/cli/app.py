@@ -30,6 +30,7 @@ from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
 from calibray.support.interruption import ensure_interruption
+from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096
 """Most characters of an argument; paths on Linux are no longer."""
@@ -39,7 +40,7 @@ class Commands(TyperGroup):
     """Commands that report expected failures by a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse overlong arguments, then parse.
+        """Refuse overlong and empty arguments, then parse.
 
         Args:
             ctx: Context of the command.
@@ -51,6 +52,9 @@ class Commands(TyperGroup):
         for argument in args:
             if len(argument) > LONGEST:
                 ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
+            # An empty name of a folder would be the current one.
+            if not argument.strip():
+                ctx.fail("an argument is empty; give a value, or leave the option out")
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -67,6 +71,7 @@ class Commands(TyperGroup):
             BrokenPipeError: The reader of stdout has closed it; Typer handles this.
         """
         try:
+            check_address_space()
             with ensure_interruption():
                 return super().invoke(ctx)
         except InputError as error:
@@ -74,6 +79,9 @@ class Commands(TyperGroup):
             raise typer.Exit(2) from error
         except EngineError as error:
             typer.echo(f"Error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except MemoryError as error:
+            typer.echo("Error: not enough memory; end other programs, or use fewer links at once", err=True)
             raise typer.Exit(1) from error
         except BrokenPipeError:
             raise

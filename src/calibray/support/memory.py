@@ -4,11 +4,32 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
-import psutil
+from calibray.errors import InputError
+
+LEAST_ADDRESS_SPACE: Final = 2_900_000_000
+"""Limit of the address space below which libraries cannot be loaded or end the process [bytes]."""
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
 """Control group (version 2) of a container, with its memory limit."""
+
+
+def check_address_space() -> None:
+    """Refuse to work where the address space (`ulimit -v`) is too small for the libraries.
+
+    Raises:
+        InputError: The limit is below `LEAST_ADDRESS_SPACE`.
+    """
+    with suppress(ImportError):  # Windows has no such limit
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
+            raise InputError(
+                f"memory is short: the address space of this process is limited to {limit / 2**30:.1f} GiB (ulimit "
+                f"-v), and the libraries need {LEAST_ADDRESS_SPACE / 2**30:.1f} GiB; raise the limit"
+            )
 
 
 def available_memory() -> int:
@@ -16,6 +37,8 @@ def available_memory() -> int:
 
     The least of what the system, the container and the limit of the address space (`ulimit -v`) leave.
     """
+    import psutil  # not needed to check the limit of the address space
+
     free = [psutil.virtual_memory().available]
     # psutil does not know limits. The file of the container holds "max" if there is none; file caches can be freed.
     with suppress(OSError, ValueError, StopIteration):
