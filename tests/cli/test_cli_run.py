@@ -201,6 +201,21 @@ def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
     assert np.isfinite(read(tmp_path / name).path_loss_db).tolist() == [True] * 3
 
 
+@pytest.mark.parametrize("table", ["links.csv", "out/result-links.csv"])
+def test_predict_takes_the_measured_table_and_the_results_own(folder, ran, tmp_path, table):
+    links = pd.read_csv(folder / table)
+    # The index that pandas writes as a column without a name.
+    links.to_csv(tmp_path / "links.csv")
+    outcome = run("predict", folder / "out", tmp_path / "links.csv", "-o", tmp_path / "new.csv")
+    assert outcome.exit_code == 0, outcome.stderr
+    predicted = pd.read_csv(tmp_path / "new.csv")
+    after = pd.read_csv(folder / "out" / "result-links.csv").predicted_db
+    np.testing.assert_allclose(predicted.path_loss_db, after, atol=0.01)
+    if "path_loss_db" in links:
+        assert predicted.input_path_loss_db.tolist() == links.path_loss_db.tolist()
+        assert "its column 'path_loss_db' is written as 'input_path_loss_db'" in outcome.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -213,13 +228,16 @@ def test_predict_writes_a_file_instead(folder, ran, tmp_path, name):
         (("trace", "{study}", "-o", "{folder}"), "is a folder; name a file in it"),
         (("trace", "{study}"), "trace: give -o FILE to store the paths, --check to check them, or both"),
         (("predict", "{folder}", "{file}"), "is not a result of `calibray run`"),
-        (("predict", "{result}", "{file}"), "has a column 'path_loss_db' already; rename or remove it"),
+        (("predict", "{result}", "{twice}"), "has the columns 'path_loss_db' and 'input_path_loss_db'"),
         (("predict", "{result}", "{folder}/absent.csv"), "absent.csv: no such file"),
         (("predict", "{result}", "{bare}", "-o", "{folder}/out.xlsx"), "tables end in .csv or .parquet"),
     ],
 )
 def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, arguments, message):
     planted.links().to_csv(tmp_path / "bare.csv", index=False)
+    planted.links().assign(path_loss_db=80.0, input_path_loss_db=80.0).to_csv(
+        tmp_path / "twice.csv", index=False
+    )
     paths = {
         "study": folder / "study.toml",
         "file": folder / "links.csv",
@@ -227,6 +245,7 @@ def test_bad_arguments_are_one_message_and_leave_nothing(folder, ran, tmp_path, 
         "out": folder / "never",
         "result": folder / "out",
         "bare": tmp_path / "bare.csv",
+        "twice": tmp_path / "twice.csv",
     }
     before = sorted(folder.rglob("*"))
     outcome = run(*(argument.format(**paths) for argument in arguments))

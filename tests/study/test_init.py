@@ -204,3 +204,23 @@ def test_the_schema_is_that_of_the_model():
     content = json.loads(out)
     assert content["additionalProperties"] is False
     assert set(content["required"]) == {"version", "scene", "links", "parameters"}
+
+
+def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tmp_path):
+    (tmp_path / "sites.csv").write_text("cell,x,y,z\nA,-30,0,15\nB,60,0,15\n")
+    file = table(
+        tmp_path,
+        x=np.arange(10.0),
+        y=20.0,
+        cell=list("AABBAABBCD"),
+        rssi=[-70, -71, 100, -80, -75, 100, *[-77] * 4],
+    )
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
+    reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
+    assert reasons["links.where"] == "sites.csv lacks C, D: 2 rows are left out"
+    assert reasons["links.missing"] == "far from all other values of rssi: not measured"
+    assert drafted.study.links.missing == (100.0,)
+    assert drafted.study.links.noise_floor_dbm == -80.0
+    links = drafted.study.measurements()
+    assert links.prepared["values that mean not measured (100)"] == 2
+    assert links.path_loss_db.max() < 80.0

@@ -176,3 +176,41 @@ def test_geographic_positions_need_a_scene_with_an_origin(folder):
     content["scene"]["file"] = "bare.xml"
     with pytest.raises(InputError, match=r"scene\.origin = \[longitude, latitude\]"):
         Study.from_content(content, folder / "study.toml").measurements()
+
+
+def test_tables_for_prediction_are_read_like_the_measured_one(folder, tmp_path):
+    """A wide table with an index column: every cell is a link, with or without a value."""
+    plan = study(folder, wide={"rss a": "a", "rss b": "b"}, value="rss")
+    log = pd.read_csv(folder / "log.csv").drop_duplicates(["lon", "lat"])[["phone", "lon", "lat"]]
+    wide = log.assign(**{"Unnamed: 0": range(4), "rss a": [-70.0, np.nan, 100.0, -75.0], "rss b": -80.0})
+    links = plan.places(SourceTable(wide.reset_index(drop=True)))
+    assert len(links) == 8
+    assert links.group_names == ("a p1", "b p1")
+    assert links.frame["rss"].isna().tolist() == [False, False, True, False, True, False, False, False]
+    assert links.tx[1] == pytest.approx([60, 0, 15], abs=0.01)
+    # A table with one row per link is read as well.
+    long = plan.places(SourceTable(pd.read_csv(folder / "log.csv")))
+    assert len(long) == 16
+
+
+def test_the_results_own_table_names_groups_and_carriers(folder):
+    plan = study(folder, frequency="carrier")
+    table = pd.DataFrame(dict(zip(LINK_COLUMNS, (0.0, 0.0, 20.0, 5.0, 20.0, 1.5), strict=True)), index=[0])
+    links = plan.places(SourceTable(table.assign(group="a p1", frequency=28e9)))
+    assert links.group.tolist() == ["a p1"]
+    assert links.frequency.tolist() == [28e9]
+
+
+def test_positions_in_another_unit(folder):
+    """A grid of 0.6 m tiles; the receiver's height is a number, in metres."""
+    metres = {"position": "scene", "transmitters": None, "position_unit": 0.6}
+    plan = study(folder, tx=[0.0, 0.0, 20.0], rx=["column", "row", 1.5], **metres)
+    grid = SourceTable(
+        pd.DataFrame({"column": [5.0, 10.0], "row": 20.0, "site": "a", "phone": "p1", "rsrp": -80.0})
+    )
+    np.testing.assert_allclose(plan.places(grid).rx, [[3.0, 12.0, 1.5], [6.0, 12.0, 1.5]])
+    assert plan.places(grid).tx[0].tolist() == [0.0, 0.0, 20.0]
+    with pytest.raises(InputError, match=r"position_unit = 0\.6 with position = 'geographic'"):
+        study(folder, position_unit=0.6)
+    with pytest.raises(InputError, match="position_unit"):
+        study(folder, tx=[0.0, 0.0, 20.0], rx=["column", "row", 1.5], **{**metres, "position_unit": 0.0})

@@ -80,7 +80,7 @@ def predict(
         names, texts = (PREDICTIONS[:1], ()) if level is None else (PREDICTIONS, TEXTS)
         # A prediction of NaN for the first link shows which columns the measured quantity adds.
         measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
-        _refuse_columns(links_file, first.frame, (*names, *measured, *texts))
+        renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *texts))
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)
         warnings: dict[str, array[int]] = {}
@@ -95,7 +95,7 @@ def predict(
                 measured = as_measured(study, links, predictions)
                 # In the order: predictions, basis, the measured quantity, remark.
                 remark = {} if level is None else {"remark": columns.pop("remark")}
-                append(links.frame.assign(**columns, **measured, **remark))
+                append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
     for warning in sorted(warnings, key=lambda text: (text != NO_PATH, text)):
         _warn(warning if warning == NO_PATH else f"{warning}:", warnings[warning], table.rows)
@@ -135,8 +135,11 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
         typer.echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
-def _refuse_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> None:
-    """Refuse a table that already has a column that would be added."""
-    for name in columns:
-        if name in frame:
-            raise InputError(f"{file}: has a column {name!r} already; rename or remove it")
+def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
+    """New names of the table's columns that have the name of a prediction, such as measured path losses."""
+    renamed = {name: f"input_{name}" for name in columns if name in frame}
+    for name, new in renamed.items():
+        if new in frame:
+            raise InputError(f"{file}: has the columns {name!r} and {new!r}; rename or remove one")
+        typer.echo(f"{file}: its column {name!r} is written as {new!r}", err=True)
+    return renamed

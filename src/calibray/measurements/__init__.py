@@ -4,6 +4,7 @@
 """
 
 from calibray.measurements.links import FREQUENCIES, MIN_DISTANCE, Measurements
+from calibray.measurements.missing_codes import mask_codes
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS
 from calibray.measurements.preparation import (
     Averaging,
@@ -20,7 +21,7 @@ from calibray.measurements.reading import (
     measured_links,
     read_measurements,
 )
-from calibray.measurements.selection import select_rows
+from calibray.measurements.selection import melt, select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import PiecedTable, read_table
 from calibray.measurements.tracks import TRACK_COLUMNS
@@ -46,7 +47,9 @@ __all__ = [
     "Track",
     "links_from_frame",
     "links_from_table",
+    "mask_codes",
     "measured_links",
+    "melt",
     "read_measurements",
     "read_table",
     "select_rows",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -12,12 +12,13 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.measurements.links import FREQUENCIES
+from calibray.measurements.missing_codes import without_codes
 from calibray.measurements.preparation import Quantity
 from calibray.measurements.source_table import SourceTable
 
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
-    "transmitter": r"tx|transmitter|bs|site|cell|ap|gnb|enb|base|anchor",
+    "transmitter": r"tx|transmitter|bs|bts|site|cell|ap|bssid|gnb|enb|gnodeb|enodeb|nodeb|base|anchor|beacon",
     "receiver": r"rx|receiver|ue|phone|mobile|device",
     "receiving device": r"rx|receiver|ue|phone|device|handset",
     "name of a transmitter": r"id|name",
@@ -25,12 +26,14 @@ PATTERNS: Final = {
     "y": r"y|north|northing",
     "longitude": r"lon|lng|long|longitude",
     "latitude": r"lat|latitude",
-    "height": r"z|h|height",
+    "height": r"z|h|height|hgt",
     "altitude or floor": r"alt|altitude|level",
     "path loss": r"pl|loss|pathloss",
     "path gain": r"gain|pathgain",
-    "received power": r"rsrp|rssi|rss|dbm|prx|power|level|rxlev|signal",
-    "another quantity": r"std|sigma|snr|sinr|rsrq|count|n|number|noise|floor|eirp|tx|id|error",
+    "reference signal": r"(n|ss|csi|ssb)?rsrp",
+    "received power": r"(n|ss|csi|ssb)?rsrp|rscp|n?rssi|rss|dbm|prx|power|level|rxlev(el)?|signal|strength",
+    "another quantity": r"std|sigma|n?sinr|snr|cinr|n?rsrq|cqi|count|n|nr?x|ncell|number|noise|floor|eirp|tx|id|error|"
+    r"rtt|rtd|toa|tof|aoa|distance|ecio|ecno|ec|ta|neighbou?r|neigh|nbr|adj|quality|accuracy|asu|bitrate|speed|channel",
     "EIRP": r"eirp",
     "transmitted": r"tx|transmit|transmitted",
     "power": r"power|dbm",
@@ -81,7 +84,7 @@ class ValueColumn:
 
 
 def words(name: object) -> frozenset[str]:
-    """Words of a column's name, in lower case.
+    """Words of a column's name, in lower case; a word in camel case counts as a whole and in parts.
 
     Args:
         name: The name.
@@ -92,8 +95,14 @@ def words(name: object) -> frozenset[str]:
     Example:
         >>> sorted(words("Rx_X [m]"))
         ['m', 'rx', 'x']
+        >>> sorted(words("BSLatitude(deg)"))
+        ['bs', 'bslatitude', 'deg', 'latitude']
     """
-    return frozenset(filter(None, re.split(r"[^a-z0-9]+", str(name).lower())))
+    # Units keep their capitals together: "dBm" is one word.
+    text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", str(name))
+    parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
+    split = (re.split(r"[^a-z0-9]+", spelling.lower()) for spelling in (text, parts))
+    return frozenset(word for spelling in split for word in spelling if word)
 
 
 def matches(name: object, *rows: str) -> bool:
@@ -148,7 +157,7 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
         if x is not None and y is not None:
             return PositionColumns("scene", x, y, height)
         longitude, latitude = _first(names, "longitude"), _first(names, "latitude")
-        if longitude is not None and latitude is not None:
+        if longitude is not None and latitude is not None and _are_degrees(frame[longitude], frame[latitude]):
             return PositionColumns("geographic", longitude, latitude, height)
     return None
 
@@ -176,27 +185,30 @@ def find_value(table: SourceTable) -> ValueColumn:
     kinds: tuple[tuple[str, Quantity], ...] = (
         ("path loss", "path_loss"), ("path gain", "path_gain"), ("received power", "rsrp"),
     )  # fmt: skip
-    candidates: list[tuple[bool, int, str, Quantity]] = []
+    candidates: list[tuple[bool, int, bool, str, Quantity]] = []
     for name in numeric_columns(table.frame):
         rank = next((rank for rank, (row, _) in enumerate(kinds) if matches(name, row)), None)
         if rank is None or matches(name, "another quantity"):
             continue
-        if _is_plausible(table.frame[name], kinds[rank][1]):
-            candidates.append((not matches(name, "decibel"), rank, name, kinds[rank][1]))
+        if _is_plausible(without_codes(table.frame[name]), kinds[rank][1]):
+            # A reference signal has a known bandwidth; RSSI contains interference.
+            secondary = rank == 2 and not matches(name, "reference signal")
+            has_unit = matches(name, "decibel") or not secondary
+            candidates.append((not has_unit, rank, secondary, name, kinds[rank][1]))
     if not candidates:
         raise InputError(
             f"{table.source}: no column looks like path loss, path gain or received power "
             f"({', '.join(map(str, table.frame))}); name it path_loss_db, path_gain_db or rsrp_dbm"
         )
-    candidates.sort(key=lambda candidate: candidate[:2])
-    _, _, name, quantity = candidates[0]
-    median = float(np.nanmedian(table.frame[name]))
+    candidates.sort(key=lambda candidate: candidate[:3])
+    *_, name, quantity = candidates[0]
+    median = float(np.nanmedian(without_codes(table.frame[name])))
     reason = f"its name, and values about {median:.0f}"
     if quantity == "path_loss" and median < 0:
         quantity, reason = "path_gain", f"named a loss, but values are negative, about {median:.0f}: a gain"
     elif quantity == "path_gain" and median > 0:
         quantity, reason = "path_loss", f"named a gain, but values are positive, about {median:.0f}: a loss"
-    others = [candidate[2] for candidate in candidates[1:]]
+    others = [candidate[3] for candidate in candidates[1:]]
     return ValueColumn(name, quantity, reason + (f"; not {', '.join(others)}" if others else ""))
 
 
@@ -216,20 +228,55 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
         transmitters: Names of the transmitters.
 
     Returns:
-        Transmitter by column: columns that are named like it, or whose name ends in its name after a separator. Empty
-        if there are fewer than two.
+        Transmitter by column: columns whose names differ only in the name of the transmitter, between separators. Of
+        several quantities, received power or path loss is chosen. Empty if there are fewer than two.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
         {'rss_a': 'a', 'rss_b': 'b'}
+        >>> list(find_wide_columns(pd.DataFrame(columns=["A RTT(mm)", "B RTT(mm)", "A RSS", "B RSS"]), ["A", "B"]))
+        ['A RSS', 'B RSS']
     """
-    columns = {
-        str(column): name
-        for name in transmitters
-        for column in frame
-        if re.fullmatch(rf"(.*[^a-z0-9])?{re.escape(name.lower())}", str(column).lower())
+    # By the rest of the name, such as " RSS(dBm)" of "AP1 RSS(dBm)".
+    families: dict[tuple[str, str], dict[str, str]] = {}
+    for name in transmitters:
+        pattern = re.compile(rf"(|.*[^a-z0-9]){re.escape(name.lower())}(|[^a-z0-9].*)")
+        for column in frame:
+            if match := pattern.fullmatch(str(column).lower()):
+                families.setdefault((match[1], match[2]), {})[str(column)] = name
+    measured = {
+        rest: columns
+        for rest, columns in families.items()
+        if len(columns) > 1 and not matches(" ".join(rest), "another quantity")
     }
-    return columns if len(columns) > 1 else {}
+    return max(
+        measured.values(),
+        key=lambda columns: (all(_is_named_value(column) for column in columns), len(columns)),
+        default={},
+    )
+
+
+def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
+    """Find columns of a wide table that are named like those of transmitters, but of none in the table of them.
+
+    Args:
+        frame: The table.
+        columns: Transmitter by column, from `find_wide_columns`.
+
+    Returns:
+        The columns.
+
+    Example:
+        >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
+        >>> find_unknown_wide_columns(table, {"rss_a": "a", "rss_b": "b"})
+        ['rss_c']
+    """
+    column, name = next(iter(columns.items()))
+    before, _, after = column.lower().rpartition(name.lower())
+    if not before + after:
+        return []
+    pattern = re.compile(rf"{re.escape(before)}[^ _]+{re.escape(after)}")
+    return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
@@ -258,13 +305,20 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
         transmitters: One row per transmitter.
 
     Returns:
-        The first column of both tables in which every value of the links appears once among the transmitters, or None.
+        The first column of both tables in which every value of the links appears once among the transmitters; else
+        the first that is named like transmitters in which some values appear, or None.
     """
+    partial = None
     for name in transmitters:
         values = set(transmitters[name].astype(str))
-        if name in links and len(values) == len(transmitters) and set(links[name].astype(str)) <= values:
+        if name not in links or len(values) != len(transmitters):
+            continue
+        labels = set(links[name].astype(str))
+        if labels <= values:
             return str(name)
-    return None
+        if partial is None and labels & values and matches(name, "transmitter", "name of a transmitter"):
+            partial = str(name)
+    return partial
 
 
 def find_transmitter_names(transmitters: pd.DataFrame) -> str:
@@ -331,6 +385,15 @@ def find_time(frame: pd.DataFrame) -> str | None:
 def find_distance(frame: pd.DataFrame) -> str | None:
     """Column of distances from transmitter to receiver, or None."""
     return _first(numeric_columns(frame), "distance")
+
+
+def _are_degrees(longitude: pd.Series, latitude: pd.Series) -> bool:
+    """Whether coordinates can be degrees; some tables have metres of a map projection in columns named so."""
+    return bool(longitude.abs().median() <= 180 and latitude.abs().median() <= 90)
+
+
+def _is_named_value(name: str) -> bool:
+    return matches(name, "path loss", "path gain", "received power")
 
 
 def _first(names: Iterable[str], row: str) -> str | None:

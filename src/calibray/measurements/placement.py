@@ -25,8 +25,9 @@ def place_rows(
 
     Args:
         table: The rows.
-        steps: The steps; `frame` and `ground` are used here.
-        tx: Transmitter position: x, y, z [m], or with a frame longitude, latitude [deg] and height [m].
+        steps: The steps; `frame`, `unit_m` and `ground` are used here.
+        tx: Transmitter position: x, y, z (numbers [m], columns in `steps.unit_m`), or with a frame longitude,
+            latitude [deg] and height [m].
         rx: Receiver position, likewise.
 
     Returns:
@@ -51,7 +52,9 @@ def _positions(
 ) -> NDArray[np.float64]:
     """Positions [rows, 3], [m] of one end."""
     if steps.frame is None:
-        positions = table.positions(end, coordinates)
+        # Numbers are metres; columns are in the table's unit.
+        scale = [steps.unit_m if isinstance(coordinate, str) else 1.0 for coordinate in coordinates]
+        positions = table.positions(end, coordinates) * scale
         height = positions[:, 2]
     else:
         longitude, latitude, height = (table.numbers(coordinate) for coordinate in coordinates)

@@ -113,9 +113,11 @@ class Preparation:
         where: Row filter.
         transmitters: One row per transmitter; links get its other columns.
         transmitter: Column of both tables that names the transmitter.
+        missing: Numbers that mean that nothing was measured, in addition to those that are detected.
         noise_floor_dbm: Noise floor [dBm]; missing powers count as below it.
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
-        frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for metres.
+        frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for lengths.
+        unit_m: Length of one unit of columns of positions in the scene's frame [m].
         ground: Height of the ground, if heights are above it.
         averaging: How samples are averaged.
         keep: Columns that averages do not cross, in addition to the transmitter's.
@@ -128,9 +130,11 @@ class Preparation:
     where: str | None = None
     transmitters: SourceTable | None = None
     transmitter: str = "transmitter"
+    missing: Sequence[float] = ()
     noise_floor_dbm: float | None = None
     censored: bool = False
     frame: Frame | None = None
+    unit_m: float = 1.0
     ground: Ground | None = None
     averaging: Averaging | None = None
     keep: Sequence[str] = ()
@@ -144,4 +148,4 @@ class Preparation:
             *(self.track, self.transmitters, self.noise_floor_dbm, self.frame, self.ground),
             *(self.averaging, self.inside),
         )
-        return not self.wide and all(step is None for step in steps)
+        return not self.wide and self.unit_m == 1 and all(step is None for step in steps)

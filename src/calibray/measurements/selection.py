@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
+from calibray.measurements.missing_codes import mask_codes
 from calibray.measurements.preparation import Preparation
 from calibray.measurements.source_table import SourceTable
 from calibray.measurements.tracks import join_track
 from calibray.support.messages import did_you_mean, shortened
+
+NAMED: Final = 20
+"""Largest number of missing transmitters that a message names."""
 
 
 def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> SourceTable:
@@ -23,11 +28,13 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 
     Args:
         table: The rows of the file.
-        steps: The steps; `wide`, `track`, `where`, `transmitters`, `noise_floor_dbm` and `censored` are used here.
+        steps: The steps; `wide`, `track`, `where`, `missing`, `transmitters`, `noise_floor_dbm` and `censored` are
+            used here.
         value: Column of the measured values; with `wide`, the name of the new column of values.
 
     Returns:
-        The rows that remain. Values at or below the noise floor, and missing ones, are set to the floor.
+        The rows that remain, without numbers that mean a missing value (`missing_codes`). Values at or below the
+        noise floor, and missing ones, are set to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -42,7 +49,8 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
         2  5.0        AP 1 -52.0
     """
     if steps.wide:
-        table = _melt(table, steps.wide, value, steps.transmitter)
+        table, _ = mask_codes(table, list(steps.wide), steps.missing)
+        table = melt(table, steps.wide, value, steps.transmitter)
     if steps.track is not None:
         table = join_track(table, steps.track)
     if steps.where is not None:
@@ -53,6 +61,14 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
                 "change the filter"
             )
         table = table.select(mask)
+    if value in table.frame:
+        table, coded = mask_codes(table, [value], steps.missing)
+        if steps.noise_floor_dbm is None and coded.any():
+            if coded.all():
+                raise InputError(
+                    f"{table.source}: column {value!r} holds no measured value; check links.missing"
+                )
+            table = table.select(~coded)
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
     if steps.noise_floor_dbm is not None:
@@ -60,8 +76,24 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     return table
 
 
-def _melt(table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str) -> SourceTable:
-    """One row per link, from a table with one column per transmitter; cells without a value are left out."""
+def melt(
+    table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
+) -> SourceTable:
+    """One row per link, from a table with one column per transmitter.
+
+    Args:
+        table: The table.
+        columns: Transmitter by column.
+        value: Name of the new column of values.
+        transmitter: Name of the new column of transmitters.
+        keep_empty: Whether cells without a value become links, without a value, as for prediction.
+
+    Returns:
+        The links, those of one row together.
+
+    Raises:
+        InputError: A column is missing, not numeric or named like a new one, or no cell has a value.
+    """
     if len(set(columns.values())) != len(columns):
         raise InputError(
             f"wide = {dict(columns)}: two columns have the same transmitter; name each differently"
@@ -72,7 +104,7 @@ def _melt(table: SourceTable, columns: Mapping[str, str], value: str, transmitte
             raise InputError(f"{table.source}: column {name!r} exists already; choose another name")
     values = np.column_stack([table.numbers(name, gaps=True) for name in columns])
     # In row-major order: the links of one row stay together.
-    row, column = np.nonzero(~np.isnan(values))
+    row, column = np.nonzero(~np.isnan(values) | keep_empty)
     if not len(row):
         raise InputError(f"{table.source}: the columns {', '.join(columns)} hold no value")
     frame = table.frame[others].iloc[row].reset_index(drop=True)
@@ -89,9 +121,14 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     if len(set(labels)) != len(labels):
         raise InputError(f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one")
     if unknown := sorted(set(label_of_link) - set(labels)):
+        known = set(labels)
+        lacking = np.array([label not in known for label in label_of_link])
+        cells = ", ".join(map(repr, table.frame.loc[lacking, key].unique().tolist()[:NAMED]))
+        more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
         raise InputError(
-            f"{table.source}: transmitter {unknown[0]!r} is not in {transmitters.source}; "
-            f"{did_you_mean(unknown[0], labels)}"
+            f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
+            f"rows; {did_you_mean(unknown[0], labels)}; add them, or leave their rows out with links.where, as in "
+            f'where = "`{key}` not in [{cells}]"'
         )
     index_of_label = {label: index for index, label in enumerate(labels)}
     joined = transmitters.frame.drop(columns=key).iloc[[index_of_label[label] for label in label_of_link]]

@@ -18,12 +18,14 @@ from calibray.measurements import (
     TRACK_COLUMNS,
     Measurements,
     Preparation,
+    SourceTable,
     Track,
     column_names,
     read_table,
     select_rows,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
+from calibray.measurements.missing_codes import find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study.model import BUNDLED, VERSION
@@ -159,6 +161,7 @@ class LinksDraft:
         if name is not None:
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, "a column of both tables with common values")
+            self._leave_out_unknown_transmitters(name, self._sites, self.transmitters.name)
             return
         name = column_names.find_transmitter_names(self._sites.frame)
         columns = column_names.find_wide_columns(self._table.frame, self._sites.labels(name).tolist())
@@ -169,9 +172,40 @@ class LinksDraft:
             )
         self.section |= {"wide": columns, "transmitter": name}
         self._transmitter_key = name
-        self.assume("links.wide", ", ".join(columns), f"named as in {self.transmitters.name}")
+        reason = f"named as in {self.transmitters.name}"
+        if unknown := column_names.find_unknown_wide_columns(self._table.frame, columns):
+            reason += f", which lacks the transmitters of {', '.join(unknown)}: left out"
+        self.assume("links.wide", ", ".join(columns), reason)
+        codes = find_codes(self._table.frame[list(columns)].apply(pd.to_numeric, errors="coerce"))
+        self._assume_codes(codes, ", ".join(columns))
         steps = Preparation(wide=columns, transmitter=name)
         self._table = select_rows(self._table, steps, column_names.name_melted_values(columns))
+
+    def _leave_out_unknown_transmitters(self, key: str, sites: SourceTable, source: str) -> None:
+        """Draft a filter for rows whose transmitter the table of transmitters lacks."""
+        known = set(sites.frame[key].astype(str))
+        lacking = ~self._table.frame[key].astype(str).isin(known)
+        if not lacking.any():
+            return
+        names = self._table.frame.loc[lacking, key].dropna().unique().tolist()
+        # The known ones: rows without a name are left out too.
+        self._add_filter(f"`{key}` in {sites.frame[key].dropna().tolist()}")
+        named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        reason = f"{source} lacks {named or 'rows without a name'}: {lacking.sum()} rows are left out"
+        self.assume("links.where", self.section["where"], reason)
+        self._table = self._table.select(~lacking.to_numpy())
+
+    def _add_filter(self, condition: str) -> None:
+        """Add a condition to the row filter."""
+        where = self.section.get("where")
+        self.section["where"] = condition if where is None else f"({where}) and {condition}"
+
+    def _assume_codes(self, codes: Sequence[float], columns: str) -> None:
+        """Record numbers that mean that nothing was measured."""
+        if codes:
+            self.section["missing"] = list(codes)
+            listed = ", ".join(f"{code:g}" for code in codes)
+            self.assume("links.missing", listed, f"far from all other values of {columns}: not measured")
 
     def _frequency(self) -> float:
         if self.stated_frequency is not None:
@@ -281,6 +315,8 @@ class LinksDraft:
 
     def _value(self) -> ValueColumn:
         value = column_names.find_value(self._table)
+        codes = find_codes(self._table.frame[value.column])
+        self._assume_codes(codes, value.column)
         power = column_names.find_transmit_power(self._table.frame)
         if value.quantity == "rsrp" and power is not None:
             reason = f"{value.reason}; {power} is the transmitted power"
@@ -305,7 +341,8 @@ class LinksDraft:
         return groups
 
     def _add_noise_floor(self, value: ValueColumn) -> None:
-        column = self._table.frame[value.column]
+        raw = self._table.frame[value.column]
+        column = without_codes(raw)
         if "wide" in self.section or not column.isna().any():
             return
         missing = f"{int(column.isna().sum())} values are missing"
@@ -313,8 +350,8 @@ class LinksDraft:
             floor = float(np.floor(column.min()))
             self.section["noise_floor_dbm"] = floor
             self.assume("links.noise_floor_dbm", f"{floor:g} dBm", f"{missing}, and none is lower")
-        else:
-            self.section["where"] = f"`{value.column}`.notna()"
+        elif raw.isna().any():
+            self._add_filter(f"`{value.column}`.notna()")
             self.assume("links.where", self.section["where"], missing)
 
     def _add_averaging(self, rx: PositionColumns) -> None:

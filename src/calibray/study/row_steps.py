@@ -46,15 +46,14 @@ def row_steps(study: StudyModel) -> Preparation:
     Raises:
         InputError: The scene's place on the globe is unknown, or the scene cannot be read.
     """
-    links, track = study.links, study.links.track
+    links = study.links
     inside = None if links.inside == "keep" else links.inside
     return replace(
         position_steps(study),
-        track=None
-        if track is None
-        else Track(str(study.track_path), track.time, track.longest_gap, track.clock),
+        track=row_track(study),
         wide=links.wide,
         where=links.where,
+        missing=links.missing,
         noise_floor_dbm=links.noise_floor_dbm,
         censored=links.below_floor == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
@@ -62,6 +61,12 @@ def row_steps(study: StudyModel) -> Preparation:
         inside=inside,
         outside=None if inside is None else _move_outside(study),
     )
+
+
+def row_track(study: StudyModel) -> Track | None:
+    """The track that gives rows their positions, or None."""
+    track = study.links.track
+    return None if track is None else Track(str(study.track_path), track.time, track.longest_gap, track.clock)
 
 
 def position_steps(study: StudyModel) -> Preparation:
@@ -81,6 +86,7 @@ def position_steps(study: StudyModel) -> Preparation:
         ground=None if links.heights is None else _ground(study),
         transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
+        unit_m=links.position_unit,
         frame=scene_frame(study) if links.position == "geographic" else None,
     )
 

@@ -141,6 +141,7 @@ class LinksSection(Section):
         quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power with
             unknown transmitted power.
         position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
+        position_unit: Length of one unit of position columns [m], in the scene's frame.
         where: Row filter.
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
@@ -151,6 +152,7 @@ class LinksSection(Section):
         heights: "ground" for heights above the scene's ground; above z = 0 of the scene if absent.
         transmitters: Table with one row per transmitter, relative to the study file's folder.
         transmitter: Column of both tables with the name of the transmitter.
+        missing: Numbers that mean that nothing was measured, in addition to usual ones such as 100 or -999.
         noise_floor_dbm: Noise floor [dBm]; a missing received power counts as below it.
         below_floor: How rows at or below the noise floor are treated: "exclude" leaves them out, "censor" keeps them as
             upper bounds of the received power, which the intervals take into account.
@@ -164,6 +166,7 @@ class LinksSection(Section):
     value: Text
     quantity: Quantity = "path_loss"
     position: Literal["scene", "geographic"] = "scene"
+    position_unit: Annotated[float, Field(gt=0)] = 1.0
     where: Text | None = None
     weight: Text | None = None
     std: Coordinate | None = None
@@ -174,10 +177,20 @@ class LinksSection(Section):
     heights: Literal["ground"] | None = None
     transmitters: Text | None = None
     transmitter: Text = "transmitter"
+    missing: tuple[float, ...] = ()
     noise_floor_dbm: float | None = None
     below_floor: Literal["exclude", "censor"] = "exclude"
     inside: Literal["keep", "drop", "move"] = "keep"
     average: AverageSection | None = None
+
+    @model_validator(mode="after")
+    def _unit_of_lengths(self) -> Self:
+        if self.position == "geographic" and self.position_unit != 1:
+            raise InputError(
+                f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees have no length; "
+                "leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _power_above_its_floor(self) -> Self:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,11 +20,16 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import (
     LINK_COLUMNS,
+    TRACK_COLUMNS,
     Measurements,
+    Preparation,
     SourceTable,
     links_from_table,
+    mask_codes,
     measured_links,
+    melt,
     read_table,
+    select_rows,
 )
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
@@ -32,7 +37,7 @@ from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.engine_keys import split_engine_keys
 from calibray.study.model import StudyModel
-from calibray.study.row_steps import link_columns, position_steps, row_steps
+from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
 from calibray.study.summary import summary
 from calibray.study.toml_file import read_content, refuse_unquoted_names
 from calibray.study.validation_errors import explain
@@ -147,8 +152,9 @@ class Study(StudyModel):
         """Links without measured values, for prediction, with the groups of the offset.
 
         Args:
-            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame; or else with the
-                position columns that ``[links]`` names, in the same units. No row is left out.
+            table: Rows with the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m] in the scene's frame, as in
+                `result-links.csv`; or else rows like those of the study's table, in the same units. No row is left
+                out, and a row of a wide table is one link per transmitter.
 
         Returns:
             One link per row, with carriers if the table has the study's carrier column.
@@ -157,12 +163,28 @@ class Study(StudyModel):
             InputError: A column is missing or malformed, or a position is not finite.
         """
         links, columns = self.links, {*table.frame}
-        group = self.offset_groups or None
-        if columns >= {*LINK_COLUMNS} or not columns & {*links.tx, *links.rx}:
+        group: str | Sequence[str] | None = self.offset_groups or None
+        if columns >= {*LINK_COLUMNS}:
+            # Tables of links that Calibray writes have one column of groups, and one of carriers.
+            if "group" in columns and not columns & {*self.offset_groups}:
+                group = "group"
+            carrier = "frequency" if links.frequency not in columns else links.frequency
+            return links_from_table(table, group, carrier if links.frequency else None)
+        wide = {column: name for column, name in links.wide.items() if column in columns}
+        if wide and links.transmitter not in columns:
+            table, _ = mask_codes(table, list(wide), links.missing)
+            table = melt(table, wide, links.value, links.transmitter, keep_empty=True)
+        steps = position_steps(self)
+        if links.track is not None and links.track.time in columns and not columns & {*TRACK_COLUMNS}:
+            rows, table = len(table), select_rows(table, Preparation(track=row_track(self)))
+            if len(table) < rows:
+                raise InputError(
+                    f"{table.source}: {rows - len(table)} of {rows} rows are at no time of the track, and have no "
+                    "position; remove them"
+                )
+        elif not wide and not columns & {*links.tx, *links.rx}:
             return links_from_table(table, group, links.frequency)
-        return links_from_table(
-            table, group, links.frequency, steps=position_steps(self), tx=links.tx, rx=links.rx
-        )
+        return links_from_table(table, group, links.frequency, steps=steps, tx=links.tx, rx=links.rx)
 
     def held_out(self, links: Measurements) -> NDArray[np.bool_]:
         """Mask of the held-out links [L]: none without ``[holdout]``, or if blocks are held out in turn.
