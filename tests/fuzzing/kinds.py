@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from random import Random
 
-from fuzzing import geometry, inputs, maps, outside, stored, workbooks
+from fuzzing import geometry, inputs, making, maps, outside, stored, workbooks
 from fuzzing.outcome import Case
 from fuzzing.world import World
 
@@ -26,6 +26,7 @@ SHARES = {
     outside.line: 7,
     workbooks.workbook: 5,
     maps.coverage: 3,
+    making.making: 4,
 }
 """Cases of each kind of a hundred or so."""
 

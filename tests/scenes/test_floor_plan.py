@@ -182,7 +182,14 @@ def test_a_senseless_height_of_a_plan_is_refused(tmp_path, height):
 
 
 @pytest.mark.parametrize(
-    "row", ["0,0,1e20,0,brick,,", "0,0,4,0,brick,1e20,", "0,0,4,0,brick,,1e6", "0,0,60000,0,brick,,"]
+    "row",
+    [
+        "0,0," + "9" * 30 + ",0,brick,,",
+        "0,0,1e20,0,brick,,",
+        "0,0,4,0,brick,1e20,",
+        "0,0,4,0,brick,,1e6",
+        "0,0,60000,0,brick,,",
+    ],
 )
 def test_walls_of_impossible_size_are_refused(tmp_path, row):
     (tmp_path / "plan.csv").write_text(f"x0,y0,x1,y1,type,thickness,height\n{row}\n")
@@ -200,3 +207,9 @@ def test_a_compressed_plan_is_refused_without_decompressing_it(tmp_path, ending,
     (tmp_path / f"plan.{ending}").write_bytes(content)
     with pytest.raises(InputError, match=r"is not a table|no column"):
         read_plan(tmp_path / f"plan.{ending}")
+
+
+def test_a_number_of_400_digits_is_refused(tmp_path):
+    (tmp_path / "plan.csv").write_text(f"x0,y0,x1,y1,type\n0,0,{'9' * 400},0,brick\n0,0,4,0,brick\n")
+    with pytest.raises(InputError, match=r"row 2: x1 = 999.*\.\.\..*999 is not a number"):
+        read_plan(tmp_path / "plan.csv")

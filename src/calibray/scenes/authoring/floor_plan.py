@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
-from calibray.support.messages import did_you_mean, first_line
+from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists
 
 OPENINGS: Final = frozenset({"door", "window"})
@@ -129,10 +129,15 @@ def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.flo
     """A column as numbers [n], NaN where it is empty or absent."""
     if name not in frame:
         return np.full(len(frame), np.nan)
-    values = pd.Series(pd.to_numeric(frame[name], errors="coerce")).to_numpy(dtype=np.float64)
+    column = frame[name]
+    if column.dtype == object:
+        # Integers of any length, which pandas keeps as Python's, overflow a float; as text they are infinite.
+        column = column.astype("string")
+    values = pd.Series(pd.to_numeric(column, errors="coerce")).to_numpy(dtype=np.float64, na_value=np.nan)
     if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:
         raise InputError(
-            f"floor plan {path}, row {bad[0] + 2}: {name} = {frame[name].iloc[bad[0]]!r} is not a number; correct it"
+            f"floor plan {path}, row {bad[0] + 2}: {name} = {shortened(repr(frame[name].iloc[bad[0]]))} is not a "
+            "number; correct it"
         )
     return values
 
