@@ -107,3 +107,16 @@ def test_samples_below_the_floor_count_half_or_their_average_is_left_out():
         "of them at or below the noise floor": 6,
         "averages too near the noise floor, left out": 1,
     }
+
+
+def test_scans_of_one_place_are_averaged_and_small_averages_left_out():
+    rows = {"rx_x": [1.0, 1.0, 1.1, 2.0], "power": [-80.0, -90.0, -70.0, -60.0]}
+    places = average(rows, by="place", size=None)
+    assert places.frame["rx_x"].tolist() == [1.0, 1.1, 2.0]
+    assert places.frame["count"].tolist() == [2, 1, 1]
+    np.testing.assert_allclose(places.frame["power"][0], 10 * np.log10((1e-8 + 1e-9) / 2))
+    frame = pd.DataFrame(dict.fromkeys((*TX, *RX), 0.0), index=range(4)).assign(**rows)
+    steps = Preparation(averaging=Averaging("place", minimum_count=2))
+    enough = average_samples(SourceTable(frame), steps, LinkColumns(TX, RX, "power", "rsrp"))
+    assert enough.frame["rx_x"].tolist() == [1.0]
+    assert enough.changes["averages of fewer than 2 samples, left out"] == 2

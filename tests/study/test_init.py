@@ -21,6 +21,7 @@ from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
 from calibray.study.draft import draft
 from calibray.study.draft_text import toml
+from calibray.study.link_checks import count_unknowns
 from calibray.study.schema import schema_text
 
 REPOSITORY = Path(__file__).parents[2]
@@ -224,3 +225,30 @@ def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tm
     links = drafted.study.measurements()
     assert links.prepared["values that mean not measured (100)"] == 2
     assert links.path_loss_db.max() < 80.0
+
+
+def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):
+    plan = tmp_path / "plan.csv"
+    plan.write_text("x0,y0,x1,y1,type\n0,0,12,0,brick\n12,0,12,8,brick\n12,8,0,8,brick\n0,8,0,0,brick\n")
+    scene = str(make_plan_scene(read_plan(plan), tmp_path / "flat", {}).path)
+    (tmp_path / "aps.csv").write_text("ap,x,y,z\na,1,1,2.5\nb,11,7,2.5\n")
+    place = np.repeat(np.arange(4), 6)
+    scans = {"x": 2.0 + place, "y": 3.0, "ap": list("aaabbb") * 4, "rssi": -50.0 - np.arange(24)}
+    file = table(tmp_path, **scans)
+    # Three scans at each place are fewer than a stationary scan: cells, no wider than 5 % of 8 m plus the margin.
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "aps.csv", 2.4e9)
+    assert drafted.study.links.average.size < 1.0
+    # Twenty-one scans at each place.
+    file = table(
+        tmp_path, **{name: np.tile(values, 7) if name != "y" else values for name, values in scans.items()}
+    )
+    words = ("init", scene, file, "--transmitters", tmp_path / "aps.csv", "--frequency", "2.4e9")
+    status, out, err = typed(*words, "-o", tmp_path / "study.toml")
+    assert status == 0, err
+    assert 'average = "place"' in (tmp_path / "study.toml").read_text()
+    assert "8 links" in out
+    assert "8 links for" in err
+    assert "fewer than 5 per unknown" in err
+    study = Study.load(tmp_path / "study.toml")
+    (finding,) = count_unknowns(study, study.measurements())
+    assert "2 offsets" in finding.problem

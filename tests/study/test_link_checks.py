@@ -135,3 +135,10 @@ def test_run_warns_before_it_traces(town):
     assert "Warning: " in result.stderr
     assert "60 of 60 receivers are below the ground; check heights and their datum" in result.stderr
     assert result.exit_code == 2  # and no path leads there
+
+
+def test_averages_that_span_much_of_the_scene_are_named(town):
+    average = {"by": "cell", "size": 20.0}
+    assert "averages span 20 m, " in suspicions(town, links(), links={"average": average})
+    average["size"] = 5.0
+    assert "averages span" not in suspicions(town, links(), links={"average": average})

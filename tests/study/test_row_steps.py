@@ -214,3 +214,17 @@ def test_positions_in_another_unit(folder):
         study(folder, position_unit=0.6)
     with pytest.raises(InputError, match="position_unit"):
         study(folder, tx=[0.0, 0.0, 20.0], rx=["column", "row", 1.5], **{**metres, "position_unit": 0.0})
+
+
+def test_average_by_place_takes_no_size_and_other_averages_need_one(folder):
+    links = study(folder, average="place").measurements()
+    assert links.prepared == {"samples averaged": 16}
+    assert len(links) == 16  # two phones, two sites, four positions
+    assert study(folder, average={"by": "place"}).links == study(folder, average="place").links
+    for average, message in (
+        ({"by": "place", "size": 1.0}, "by = 'place' takes no size"),
+        ({"by": "cell"}, "by = 'cell' needs size"),
+        ({"by": "place", "minimum_count": 0}, "minimum_count"),
+    ):
+        with pytest.raises(InputError, match=message):
+            study(folder, average=average)

@@ -53,9 +53,10 @@ def init(
     check_file(out, inputs)
     with progress_bars(log()) as progress:
         from calibray.reporting.position_plot import save_positions
-        from calibray.reporting.scene_tables import assumptions
+        from calibray.reporting.scene_tables import assumptions, warning_lines
         from calibray.study.draft import draft as draft_study
         from calibray.study.draft_text import SCHEMA_FILE
+        from calibray.study.link_checks import count_unknowns
         from calibray.study.schema import schema_text
         from calibray.tables.text import render
 
@@ -70,6 +71,8 @@ def init(
     with progress_bars(log()) as progress:
         progress("checking positions", 0, None)
         warn(draft.study, measured)
+        if findings := count_unknowns(draft.study, measured):
+            typer.echo(warning_lines(findings), err=True)
         if plot is not None:
             save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs)
     if plot is not None:

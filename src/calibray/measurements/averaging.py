@@ -1,4 +1,4 @@
-"""Average samples to one row per area, in linear power.
+"""Average samples to one row per area or place, in linear power.
 
 Along a street, the power fades by several dB within a wavelength. Ray tracing from one point does not predict that
 fading; it predicts the mean power over some tens of wavelengths (W. C. Y. Lee, "Estimate of local average power of a
@@ -67,7 +67,7 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
     transmitter = [steps.transmitter] if steps.transmitter in table.frame else []
     keys = dict.fromkeys([*steps.keep, *transmitter, *map(str, columns.tx)])
     labels = pd.DataFrame({name: table.column(name) for name in keys})
-    labels[_AREA] = _areas(table, averaging, rx[:2])
+    labels[_AREA] = _areas(table, averaging, rx)
     group = labels.groupby([*keys, _AREA], sort=False, dropna=False).ngroup().to_numpy()
 
     samples = pd.DataFrame({name: table.numbers(name) for name in rx})
@@ -101,17 +101,22 @@ def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns
         std_db=groups["level"].std().to_numpy(),
         count=count.to_numpy(),
     )
-    return averages.keep(~uncertain, "averages too near the noise floor, left out")
+    averages = averages.keep(~uncertain, "averages too near the noise floor, left out")
+    enough = averages.numbers("count") >= averaging.minimum_count
+    return averages.keep(enough, f"averages of fewer than {averaging.minimum_count} samples, left out")
 
 
-def _areas(table: SourceTable, averaging: Averaging, plan: Sequence[str]) -> NDArray[np.int64]:
-    """Number of the cell, stretch or window of every row [rows]; `plan` names the columns of x and y [m]."""
-    if not (np.isfinite(averaging.size) and averaging.size > 0):
+def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArray[np.int64]:
+    """Number of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
+    if averaging.by == "place":
+        positions = np.stack([table.numbers(name) for name in rx], axis=1)
+        return np.unique(positions, axis=0, return_inverse=True)[1].reshape(-1)
+    if averaging.size is None or not (np.isfinite(averaging.size) and averaging.size > 0):
         raise InputError(f"average.size = {averaging.size!r}: must be a finite number greater than 0")
     if averaging.by == "time":
         elapsed = _elapsed(table, str(averaging.time))
         return np.floor((elapsed - elapsed.min()) / averaging.size).astype(np.int64)
-    positions = np.stack([table.numbers(name) for name in plan], axis=1)
+    positions = np.stack([table.numbers(name) for name in rx[:2]], axis=1)
     if averaging.by == "distance":
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         return np.floor(np.cumsum([0.0, *steps]) / averaging.size).astype(np.int64)

@@ -74,16 +74,19 @@ class Averaging:
     """How samples are averaged, in linear power.
 
     Attributes:
-        by: "cell" of a square grid, stretch of "distance" along the rows' order, or window of "time".
-        size: Width or length [m], or duration [s].
+        by: "place" of equal receiver positions, "cell" of a square grid, stretch of "distance" along the rows' order,
+            or window of "time".
+        size: Width or length [m], or duration [s]; not used for "place".
         time: Column of times, for "time".
         unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
+        minimum_count: Averages of fewer samples are left out.
     """
 
-    by: Literal["cell", "distance", "time"]
-    size: float
+    by: Literal["place", "cell", "distance", "time"]
+    size: float | None = None
     time: str | None = None
     unbiased: bool = False
+    minimum_count: int = 1
 
 
 @dataclass(frozen=True)

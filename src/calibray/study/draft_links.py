@@ -28,6 +28,7 @@ from calibray.measurements.column_names import PositionColumns, ValueColumn
 from calibray.measurements.missing_codes import find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
+from calibray.study.link_checks import CELL_SHARE
 from calibray.study.model import BUNDLED, VERSION
 from calibray.study.study import Study
 
@@ -39,6 +40,10 @@ TRANSMITTER_HEIGHT: Final = 10.0
 
 AVERAGING_WAVELENGTHS: Final = 40
 """Width of the cells that fading is averaged over (Lee 1985; see `calibray.measurements.averaging`)."""
+
+PLACE_SAMPLES: Final = 20
+"""Median number of samples at one position from which samples are averaged by position: a stationary scan. The
+logarithm of the mean of 20 samples of Rayleigh fading is biased by 0.1 dB."""
 
 LEVEL_GROUND: Final = 0.5
 """Largest height of the ground that counts as z = 0 [m]."""
@@ -355,7 +360,7 @@ class LinksDraft:
             self.assume("links.where", self.section["where"], missing)
 
     def _add_averaging(self, rx: PositionColumns) -> None:
-        """Average along tracks, and if most positions or some values repeat."""
+        """Average along tracks, and if most positions or some values repeat; by position if scans are stationary."""
         frame, name = self._table.frame, self.section.get("transmitter")
         keys = [rx.x, rx.y, *self.groups, *([name] if name and name not in self.groups else [])]
         keys += [part for part in self.section["tx"] if isinstance(part, str) and part in frame]
@@ -363,10 +368,20 @@ class LinksDraft:
         repeated = frame.duplicated([*keys, self.section["value"]]).any()
         if self.track is None and positions >= len(frame) / 2 and not repeated:
             return
-        size = float(np.clip(round(AVERAGING_WAVELENGTHS * speed_of_light / self.frequency, 1), 1.0, 10.0))
-        self.section["average"] = {"by": "cell", "size": size, "unbiased": True}
         rows = f"{len(frame)} rows " + ("along a track" if self.track else f"at {positions} positions")
+        samples = int(frame.groupby(keys, dropna=False).size().median())
+        if self.track is None and samples >= PLACE_SAMPLES:
+            self.section["average"] = "place"
+            self.assume("links.average", "place", f"{rows}, {samples} at each")
+            return
+        fading = float(np.clip(round(AVERAGING_WAVELENGTHS * speed_of_light / self.frequency, 1), 1.0, 10.0))
+        bounds = self.overhead.bounds
+        largest = float(f"{CELL_SHARE * min(bounds[3:5] - bounds[:2]):.2g}")
+        size = min(fading, largest)
+        self.section["average"] = {"by": "cell", "size": size, "unbiased": True}
         reason = f"{rows}; {AVERAGING_WAVELENGTHS} wavelengths average out fading"
+        if size < fading:
+            reason = f"{rows}; {CELL_SHARE:.0%} of the scene, less than {AVERAGING_WAVELENGTHS} wavelengths"
         self.assume("links.average", f"cells of {size:g} m", reason)
 
     def _add_heights(self, tx: PositionColumns | None, rx: PositionColumns) -> None:

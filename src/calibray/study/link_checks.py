@@ -32,6 +32,12 @@ FAR: Final = 10.0
 MIN_LINKS: Final = 8
 """Number of links below which shares of links prove nothing."""
 
+CELL_SHARE: Final = 0.05
+"""Largest width of the areas that samples are averaged over, as a share of the scene's shorter side."""
+
+LINKS_PER_UNKNOWN: Final = 5
+"""Number of links per unknown below which a fit hardly constrains its unknowns."""
+
 _Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _TURNS: Final[dict[str, _Turn]] = {
     "x and y are swapped": lambda p: p[:, [1, 0, 2]],
@@ -57,8 +63,49 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
         InputError: All links are far from the scene, the scene cannot be read, or shapely or trimesh is not installed.
     """
     overhead = SceneSurfaces.read(study.scene_source)
-    checks = (*_positions(overhead, links), *_levels(study, links), *_angles(study, links))
+    checks = (
+        *_positions(overhead, links),
+        *_levels(study, links),
+        *_angles(study, links),
+        *_averages(study, overhead),
+    )
     return tuple(Finding("warning", links.source, problem, remedy) for problem, remedy in checks)
+
+
+def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
+    """Check that the links are many enough for the unknowns of a study.
+
+    Args:
+        study: The study.
+        links: Its links.
+
+    Returns:
+        The suspicion and its remedy, if there are fewer than `LINKS_PER_UNKNOWN` links per unknown.
+    """
+    offsets = len(links.group_names) if links.group is not None else 1
+    unknowns = len(study.parameters) + offsets
+    if len(links) >= LINKS_PER_UNKNOWN * unknowns:
+        return ()
+    problem = (
+        f"{len(links)} links for {unknowns} unknowns ({len(study.parameters)} parameters, {offsets} offsets), fewer "
+        f"than {LINKS_PER_UNKNOWN} per unknown"
+    )
+    remedy = "calibrate fewer parameters, or measure at more positions"
+    if study.links.average is not None and study.links.average.by != "place":
+        remedy = f"average over smaller areas (links.average.size), {remedy}"
+    return (Finding("warning", links.source, problem, remedy),)
+
+
+def _averages(study: StudyModel, overhead: SceneSurfaces) -> Iterator[tuple[str, str]]:
+    average = study.links.average
+    if average is None or average.size is None or average.by == "time":
+        return
+    largest = CELL_SHARE * float(np.min(overhead.bounds[3:5] - overhead.bounds[:2]))
+    if average.size > 2 * largest:
+        yield (
+            f"averages span {average.size:g} m, {average.size / largest * CELL_SHARE:.0%} of the scene's shorter side",
+            f"set links.average.size to {largest:.2g} m or less",
+        )
 
 
 def _positions(overhead: SceneSurfaces, links: Measurements) -> Iterator[tuple[str, str]]:

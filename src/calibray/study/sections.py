@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic.dataclasses import dataclass as checked
 
 from calibray.errors import InputError
@@ -94,16 +94,26 @@ class AverageSection(Section):
     """``[links.average]``: samples close together are averaged to one link, in linear power.
 
     Attributes:
-        by: "cell" of a square grid, "distance" travelled in the order of the rows, or window of "time".
-        size: Width or length [m], or duration [s].
+        by: "place" of equal receiver positions, "cell" of a square grid, "distance" travelled in the order of the
+            rows, or window of "time".
+        size: Width or length [m], or duration [s]; required except for "place".
         time: Column of times, for "time" only.
         unbiased: Whether to correct the bias of the logarithm of a mean of few samples.
+        minimum_count: Averages of fewer samples are left out.
     """
 
-    by: Literal["cell", "distance", "time"]
-    size: Annotated[float, Field(gt=0)]
+    by: Literal["place", "cell", "distance", "time"]
+    size: Annotated[float, Field(gt=0)] | None = None
     time: Text | None = None
     unbiased: bool = False
+    minimum_count: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _sized(self) -> Self:
+        if (self.by == "place") != (self.size is None):
+            remedy = "takes no size; leave it out" if self.by == "place" else "needs size, in m or s"
+            raise InputError(f"links.average: by = {self.by!r} {remedy}")
+        return self
 
     @model_validator(mode="after")
     def _timed(self) -> Self:
@@ -111,6 +121,17 @@ class AverageSection(Section):
             remedy = "needs time, the column of times" if self.by == "time" else "takes no time; leave it out"
             raise InputError(f"links.average: by = {self.by!r} {remedy}")
         return self
+
+
+def _section_of_place(value: Any) -> Any:
+    """``average = "place"`` is short for ``average = { by = "place" }``."""
+    return {"by": "place"} if value == "place" else value
+
+
+_Average = Annotated[
+    AverageSection | None,
+    BeforeValidator(_section_of_place, json_schema_input_type=AverageSection | Literal["place"] | None),
+]
 
 
 class TrackSection(Section):
@@ -181,7 +202,7 @@ class LinksSection(Section):
     noise_floor_dbm: float | None = None
     below_floor: Literal["exclude", "censor"] = "exclude"
     inside: Literal["keep", "drop", "move"] = "keep"
-    average: AverageSection | None = None
+    average: _Average = None
 
     @model_validator(mode="after")
     def _unit_of_lengths(self) -> Self:
