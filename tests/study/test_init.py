@@ -10,6 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from calibray.cli.app import app
@@ -252,3 +254,39 @@ def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):
     study = Study.load(tmp_path / "study.toml")
     (finding,) = count_unknowns(study, study.measurements())
     assert "2 offsets" in finding.problem
+
+
+INJECTION = '\n\n[engine]\nname = "command"\ncommand = ["sh", "-c", "touch pwned"]\n#'
+
+
+@pytest.mark.parametrize("breaks", ["\n", "\r\n", "\r", "\x85", "\u2028", '"\n', "'\n", '"""\n'])
+def test_the_name_of_a_column_never_becomes_toml(scene, tmp_path, breaks):
+    """The reasons, which quote names of columns, are comments of the study."""
+    attack = INJECTION.replace("\n", breaks)
+    frequency, loss = f"frequency_hz{attack}", f"path loss dB{attack}"
+    file = table(tmp_path, **{"x": [0.0, 5.0], "y": [-20.0, -25.0], "z": 1.5, frequency: 3.5e9, loss: [90.0, 91.0],
+                              "device": ["a", f"b{attack}"]})  # fmt: skip
+    status, out, err = typed("init", scene, file, "--tx", "0,0,12", "-o", tmp_path / "study.toml")
+    assert status in (0, 2), err
+    # No line of what is printed begins with a part of a name.
+    assert not any(
+        line.lstrip().startswith(("[engine]", "command", "name =")) for line in (out + err).splitlines()
+    )
+    if status == 0:
+        study = Study.load(tmp_path / "study.toml")
+        assert study.engine.name == "replay"
+        assert loss in (study.links.value, study.links.value.replace("\r\n", "\n"))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(), st.text(), st.text(max_size=20), st.floats(allow_nan=False))
+def test_a_draft_says_what_was_drafted_whatever_the_names(value, reason, key, number):
+    content = {"version": 1, "links": {"value": value, key: [value, number, True], "where": {key: 3}}}
+    reasons = {"links": reason, "links.value": reason, f"links.{key}": reason}
+    try:
+        text = toml(content, reasons)
+    except InputError:  # a lone surrogate, which no TOML file can contain
+        assert any("\ud800" <= letter <= "\udfff" for letter in value + key)
+        return
+    assert tomllib.loads(text) == content
+    assert "[engine]" not in text.splitlines()

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from calibray.cli import INTERRUPTED
 from calibray.cli.cache import cache
 from calibray.cli.compare import compare
+from calibray.cli.console import echo
 from calibray.cli.demo import demo
 from calibray.cli.doctor import doctor
 from calibray.cli.export import export
@@ -75,10 +76,10 @@ class Commands(TyperGroup):
             with ensure_interruption():
                 return super().invoke(ctx)
         except InputError as error:
-            typer.echo(f"Error: {error}", err=True)
+            echo(f"Error: {error}", err=True)
             raise typer.Exit(2) from error
         except EngineError as error:
-            typer.echo(f"Error: {error}", err=True)
+            echo(f"Error: {error}", err=True)
             raise typer.Exit(1) from error
         except MemoryError as error:
             typer.echo("Error: not enough memory; end other programs, or use fewer links at once", err=True)
@@ -87,7 +88,7 @@ class Commands(TyperGroup):
             raise
         except OSError as error:
             file = "" if error.filename is None else f"{error.filename}: "
-            typer.echo(
+            echo(
                 f"Error: {file}cannot be read or written ({error.strerror or error}); check permissions and disk space",
                 err=True,
             )
@@ -95,8 +96,8 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             # The command itself reports what was kept. Report here an error that occurred during the interruption.
             if isinstance(error.__cause__, (InputError, EngineError)):
-                typer.echo(f"Error: {error.__cause__}", err=True)
-            typer.echo("Interrupted", err=True)
+                echo(f"Error: {error.__cause__}", err=True)
+            echo("Interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from error
 
 
@@ -118,7 +119,7 @@ def _print_version(requested: bool) -> None:
     if requested:
         from importlib import metadata
 
-        typer.echo(f"calibray {metadata.version('calibray')}")
+        echo(f"calibray {metadata.version('calibray')}")
         raise typer.Exit
 
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from calibray.cli.console import echo
+
 
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all cached files.")] = False,
@@ -29,10 +31,10 @@ def cache(
         for path in (path for paths in kept.values() for path in paths):
             path.unlink(missing_ok=True)
         removed = ", ".join(f"{len(paths)} {name}" for name, paths in kept.items())
-        typer.echo(f"Removed {removed}, {sum(size.values()):.1f} MB", err=True)
+        echo(f"Removed {removed}, {sum(size.values()):.1f} MB", err=True)
         return
     rows = [
         ("folder", "none: CALIBRAY_CACHE is empty" if folder is None else str(folder)),
         *((name, f"{len(paths)}, {size[name]:.1f} MB") for name, paths in kept.items()),
     ]
-    typer.echo(render(Table("", (Column(), numbers()), tuple(rows))))
+    echo(render(Table("", (Column(), numbers()), tuple(rows))))

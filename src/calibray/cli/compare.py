@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Overwrite, echo, log
 
 
 def compare(
@@ -56,7 +56,7 @@ def compare(
     check_outputs(out, FILES, Study.load(study_file).files(), overwrite)
     parsed = parse_methods(names, budget)
     calls = seeds * sum(method.budget for method in parsed)
-    typer.echo(
+    echo(
         f"{seeds * len(parsed):,} runs with {calls:,} RT calls in total; runs kept in {out} are not repeated",
         err=True,
     )
@@ -66,7 +66,7 @@ def compare(
             names, seeds=seeds, budget=budget, out=out, workers=workers, progress=progress,
         )  # fmt: skip
     write(comparison, out)
-    typer.echo(render(table(comparison), optimum_text(comparison)))
+    echo(render(table(comparison), optimum_text(comparison)))
     for name, seed, failure in comparison.failures():
-        typer.echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
-    typer.echo(f"Written to {out}: {', '.join(FILES)}", err=True)
+        echo(f"Warning: {name}, seed {seed}: {failure}", err=True)
+    echo(f"Written to {out}: {', '.join(FILES)}", err=True)

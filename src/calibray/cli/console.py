@@ -23,6 +23,19 @@ def log() -> Console:
     return Console(stderr=True, highlight=False)
 
 
+def echo(text: str, err: bool = False, nl: bool = True) -> None:
+    """Print text, with control characters escaped: names in it come from files and must not steer the terminal.
+
+    Args:
+        text: The text, of several lines if need be.
+        err: Print to stderr.
+        nl: Whether to end with a line break.
+    """
+    from calibray.support.messages import printable
+
+    typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
+
+
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]

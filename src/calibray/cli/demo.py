@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Overwrite, echo, log
 
 
 def demo(
@@ -39,6 +39,6 @@ def demo(
         finished = run_demo(engine, seed, progress)
         progress("writing", 0, None)
         page = write_demo(finished, out)
-    typer.echo(render(*finished.tables()) + "\n")
-    typer.echo(f"Written to {out}: {', '.join(FILES)}, and a folder for each method", err=True)
-    typer.echo(f"Report: {page}")
+    echo(render(*finished.tables()) + "\n")
+    echo(f"Written to {out}: {', '.join(FILES)}, and a folder for each method", err=True)
+    echo(f"Report: {page}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Overwrite, echo, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def _machine() -> None:
     with progress_bars(log()) as progress:
         progress("checking Dr.Jit, Sionna RT and JAX", 0, None)
         diagnosis = examine()
-    typer.echo(render(diagnosis.table()))
+    echo(render(diagnosis.table()))
     if not diagnosis.usable:
         raise typer.Exit(1)
 
@@ -67,7 +67,7 @@ def _scene(subject: str, plot: Path | None, overwrite: bool) -> None:
             raise InputError(f"--plot draws the antennas of a study: {subject} is a scene, name a study file")
         source = subject if study is None else study.scene_source
         check = check_scene(source, progress)
-    typer.echo(render(*scene_tables.findings(check), scene_tables.objects(check)))
+    echo(render(*scene_tables.findings(check), scene_tables.objects(check)))
     if plot is not None and study is not None:
         _draw(study, plot, overwrite)
     if any(finding.severity == "error" for finding in check.findings):
@@ -80,4 +80,4 @@ def _draw(study: Study, plot: Path, overwrite: bool) -> None:
 
     links = study.measurements()
     save_positions(plot, study.scene_source, links.tx, links.rx, study.files(), overwrite)
-    typer.echo(f"Written to {plot}", err=True)
+    echo(f"Written to {plot}", err=True)

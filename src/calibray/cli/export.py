@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite
+from calibray.cli.console import Overwrite, echo
 
 
 def export(
@@ -31,5 +31,5 @@ def export(
     result = Result.load(folder)
     names = write(result, out, copy, overwrite)
     if warning := scene_alone_text(result):
-        typer.echo(f"Note: {warning}", err=True)
-    typer.echo(f"Written to {out}: {', '.join(names)}", err=True)
+        echo(f"Note: {warning}", err=True)
+    echo(f"Written to {out}: {', '.join(names)}", err=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import log
+from calibray.cli.console import echo, log
 from calibray.errors import InputError
 
 
@@ -65,9 +65,9 @@ def init(
             scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track
         )
         measured = draft.study.measurements()
-    typer.echo(render(assumptions(draft)))
+    echo(render(assumptions(draft)))
     counts = [f"{number} {cause}" for cause, number in measured.prepared.items()]
-    typer.echo("\n" + ", ".join([f"{len(measured)} links", *counts]))
+    echo("\n" + ", ".join([f"{len(measured)} links", *counts]))
     with progress_bars(log()) as progress:
         progress("checking positions", 0, None)
         warn(draft.study, measured)
@@ -76,12 +76,12 @@ def init(
         if plot is not None:
             save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs)
     if plot is not None:
-        typer.echo(f"Written to {plot}", err=True)
+        echo(f"Written to {plot}", err=True)
     schema = out.parent / SCHEMA_FILE
     if not schema.exists():
         write_text(schema, schema_text())
     write_text(out, draft.text)
-    typer.echo(f"Written to {out}; next: calibray run {out} --out result", err=True)
+    echo(f"Written to {out}; next: calibray run {out} --out result", err=True)
 
 
 def _position(text: str) -> list[float]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite
+from calibray.cli.console import Overwrite, echo
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,13 +42,13 @@ def ledger(
         check_table(out, (), overwrite)
     with closing(open_ledger(folder)) as store:
         if forget_failed:
-            typer.echo(f"Removed {store.forget_failures()} failed calls", err=True)
+            echo(f"Removed {store.forget_failures()} failed calls", err=True)
         table = store.table(path_loss=out is not None)
     if out is not None:
         write_table(out, table)
-        typer.echo(f"Written to {out}: {len(table)} calls", err=True)
+        echo(f"Written to {out}: {len(table)} calls", err=True)
     else:
-        typer.echo(render(calls_table(table)))
+        echo(render(calls_table(table)))
 
 
 def calls_table(frame: pd.DataFrame) -> Table:

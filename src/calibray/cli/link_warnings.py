@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import typer
-
+from calibray.cli.console import echo
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ def warn(study: Study, links: Measurements) -> None:
     from calibray.study.link_checks import examine
 
     if missing := [name for name in ("shapely", "trimesh") if find_spec(name) is None]:
-        typer.echo(
+        echo(
             f"Positions were not checked against the scene: {missing[0]} is not installed; "
             "run pip install 'calibray[scenes]'",
             err=True,
@@ -43,4 +42,4 @@ def warn(study: Study, links: Measurements) -> None:
             return
         raise
     if findings:
-        typer.echo(warning_lines(findings), err=True)
+        echo(warning_lines(findings), err=True)

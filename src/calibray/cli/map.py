@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 
@@ -102,12 +102,12 @@ def map(
         progress("writing", 0, None)
         names = coverage.save(target, inputs, overwrite)
     reached = np.isfinite(coverage.path_loss_db)
-    typer.echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
+    echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
     if len(names) < len(FILES):
-        typer.echo(
+        echo(
             "map.tif was not written: rasterio is not installed; run pip install 'calibray[scenes]'", err=True
         )
-    typer.echo(f"Written to {target}: {', '.join(names)}", err=True)
+    echo(f"Written to {target}: {', '.join(names)}", err=True)
 
 
 def _samples(text: str) -> int | Literal["auto"]:

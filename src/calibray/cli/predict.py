@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -104,11 +104,13 @@ def predict(
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
     """A function that prints tables as CSV, with a header before the first."""
+    from calibray.support.output_files import csv_text
+
     header = True
 
     def append(table: pd.DataFrame) -> None:
         nonlocal header
-        typer.echo(table.to_csv(index=False, header=header), nl=False)
+        typer.echo(csv_text(table, header=header), nl=False)
         header = False
 
     yield append
@@ -132,7 +134,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables.text import rows_text
 
     if rows:
-        typer.echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:

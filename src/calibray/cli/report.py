@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Overwrite, echo, log
 
 
 def report(
@@ -39,4 +39,4 @@ def report(
             overwrite=overwrite,
             progress=progress,
         )
-    typer.echo(f"Written to {file}", err=True)
+    echo(f"Written to {file}", err=True)

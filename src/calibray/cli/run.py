@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, StudyFile, log
+from calibray.cli.console import Overwrite, StudyFile, echo, log
 
 if TYPE_CHECKING:
     from calibray.calibration.result import Result
@@ -73,14 +73,14 @@ def run(
             with open_workers(workers, scheduler) as pool:
                 result = calibrate(setup, out=out, workers=pool, progress=progress, overwrite=overwrite)
     except KeyboardInterrupt:
-        typer.echo(_kept_text(out), err=True)
+        echo(_kept_text(out), err=True)
         raise
     if as_json:
-        typer.echo(json.dumps(result.content(), indent=2))
+        echo(json.dumps(result.content(), indent=2))
     else:
-        typer.echo(render(tables.heading(result), *tables.tables(result)))
+        echo(render(tables.heading(result), *tables.tables(result)))
     names = [*FILES, *_write_report(result, out, figures, overwrite)]
-    typer.echo(f"Written to {out}: {', '.join(names)}", err=True)
+    echo(f"Written to {out}: {', '.join(names)}", err=True)
 
 
 def _kept_text(out: Path) -> str:
@@ -113,7 +113,7 @@ def _write_report(result: Result, out: Path, figures: bool, overwrite: bool) -> 
         with progress_bars(log()) as progress:
             page.report(result, out / page.FILE, figures=folder, overwrite=overwrite, progress=progress)
     except Exception as error:
-        typer.echo(
+        echo(
             f"Warning: the report was not written ({error}); try again with: calibray report {out}", err=True
         )
         return []

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import Overwrite, log
+from calibray.cli.console import Overwrite, echo, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -208,7 +208,7 @@ def _print(made: MadeScene) -> None:
     from calibray.reporting.scene_tables import contents
     from calibray.tables.text import render
 
-    typer.echo(render(contents(made)))
+    echo(render(contents(made)))
 
 
 def _make(
@@ -241,7 +241,7 @@ def _make(
     if terrain is not None:
         bounds = buildings.bounds + margin * np.array([-1, -1, 1, 1])
         surface, frame = lower_origin(read_terrain(terrain, frame, bounds, spacing), frame)
-    typer.echo(f"Making a scene with {len(buildings)} buildings", err=True)
+    echo(f"Making a scene with {len(buildings)} buildings", err=True)
     progress("making", 0, None)
     return make_scene(
         buildings,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import typer
+from calibray.cli.console import echo
 
 
 def schema() -> None:
     """Print the JSON schema of study files, with which editors complete and check them."""
     from calibray.study.schema import schema_text
 
-    typer.echo(schema_text(), nl=False)
+    echo(schema_text(), nl=False)

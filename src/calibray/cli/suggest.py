@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, echo, log
 
 
 def suggest(
@@ -50,7 +50,7 @@ def suggest(
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
         suggestion = suggest_links(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
-    typer.echo(
+    echo(
         json.dumps(suggestion.to_dict("records"), indent=2)
         if as_json
         else render(*suggestion_tables(suggestion))

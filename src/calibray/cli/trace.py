@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, log
+from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, echo, log
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,13 +62,13 @@ def trace(
                 )
                 if out is not None:
                     paths.save(out, overwrite)
-    typer.echo(render(trace_tables.overview(paths, links.row, setup.enclosed)))
+    echo(render(trace_tables.overview(paths, links.row, setup.enclosed)))
     if check and study.trace.adaptive:
-        typer.echo("\n" + trace_tables.last_round(paths.settings, study.fidelity.tolerance_db))
+        echo("\n" + trace_tables.last_round(paths.settings, study.fidelity.tolerance_db))
     if change is not None:
-        typer.echo("\n" + render(*trace_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
+        echo("\n" + render(*trace_tables.convergence(change, links.row, study.fidelity.tolerance_db)))
     if out is not None:
-        typer.echo(f"Written to {out}", err=True)
+        echo(f"Written to {out}", err=True)
 
 
 def _trace(
@@ -83,7 +83,7 @@ def _trace(
 
     study, links, tracer = setup.study, setup.links, setup.tracer
     if announcement := tracer.plan(links).announcement(len(links)):
-        typer.echo(announcement, err=True)
+        echo(announcement, err=True)
     paths = tracer.trace(links, progress)
     if out is not None:
         paths.save(out, overwrite)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, log
+from calibray.cli.console import Overwrite, Scheduler, StudyFile, Workers, echo, log
 
 
 def validate(
@@ -59,8 +59,8 @@ def validate(
             check_outputs(out, (VALIDATION_FILE,), study.files(), overwrite)
         with open_workers(workers, scheduler) as pool:
             validation = run_validation(study, blocks=blocks, by=by, workers=pool, progress=progress)
-    typer.echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
+    echo(json.dumps(validation.content(), indent=2) if as_json else render(*validation.summary()))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         write_validation(validation, study, out, validation.content())
-        typer.echo(f"Written to {out / VALIDATION_FILE}", err=True)
+        echo(f"Written to {out / VALIDATION_FILE}", err=True)

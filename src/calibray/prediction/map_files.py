@@ -23,7 +23,7 @@ from calibray.scenes.building_outlines import footprints
 from calibray.scenes.triangles import Triangles
 from calibray.support.extras import library
 from calibray.support.figure_style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write
-from calibray.support.output_files import check_outputs, replacing
+from calibray.support.output_files import check_outputs, csv_text, write_bytes, write_text
 
 FILES: Final = ("map.tif", "map.png", "map.csv")
 GEOTIFF, PICTURE, TABLE = FILES
@@ -110,8 +110,7 @@ class CoverageMap:
         names = FILES if find_spec("rasterio") else FILES[1:]
         try:
             target.mkdir(parents=True, exist_ok=True)
-            with replacing(target / TABLE) as partial:
-                self.table().to_csv(partial, index=False, float_format="%.8g")
+            write_text(target / TABLE, csv_text(self.table(), "%.8g"))
             write(figure(self), target / PICTURE)
             if GEOTIFF in names:
                 geotiff(self, target / GEOTIFF)
@@ -156,8 +155,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
                 receiver_height_m=f"{coverage.height:g}",
                 **({} if coverage.level is None else {"interval_level": f"{coverage.level:g}"}),
             )
-        with replacing(path) as partial:
-            partial.write_bytes(memory.read())
+        write_bytes(path, memory.read())
 
 
 @styled()

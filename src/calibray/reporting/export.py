@@ -20,7 +20,8 @@ from calibray.result.record import Record
 from calibray.result.wording import scene_alone_text
 from calibray.scenes import Scene, export_scene, read_scene
 from calibray.scenes.export import exported_names
-from calibray.support.output_files import check_outputs, write_text
+from calibray.support.messages import printable
+from calibray.support.output_files import check_outputs, csv_text, write_text
 from calibray.tracing.settings import TraceSettings
 
 FILES: Final = (
@@ -86,8 +87,8 @@ def export(
     content = {
         "load_scene.py": script.read_text(encoding="utf-8"),
         "calibration.json": _json(_calibration(result)),
-        "links.csv": _links(result).assign(**positions, **group).to_csv(index=False, float_format="%.9g"),
-        "materials.csv": materials.to_csv(index=False, float_format="%.9g"),
+        "links.csv": csv_text(_links(result).assign(**positions, **group), "%.9g"),
+        "materials.csv": csv_text(materials, "%.9g"),
         "materials.json": _json({row["material"]: _without_unknown(row) for row in rows}),
         "materials.m": matlab(materials, study.scene.frequency),
     }
@@ -229,9 +230,5 @@ def _json(content: dict[str, Any]) -> str:
 
 def _quoted(text: str) -> str:
     """A text as a literal of MATLAB and Octave, with unprintable characters escaped."""
-    escaped = "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode()
-        for character in text
-    )
-    doubled = escaped.replace("'", "''")
+    doubled = printable(text).replace("'", "''")
     return f"'{doubled}'"

@@ -33,6 +33,7 @@ from calibray.support.messages import shortened
 from calibray.support.output_files import (
     check_outputs,
     check_unchanged,
+    csv_text,
     exists,
     file_digest,
     is_unchanged_output,
@@ -146,8 +147,8 @@ def write(
             study.scene_source, study.scene.frequency, study.overrides, study.objects
         )
         export_scene(scene, record.scene_materials, target / SCENE_FILE)
-        write_text(target / LINKS_FILE, record.links.to_csv(index=False, float_format="%.10g"))
-        write_text(target / HISTORY_FILE, record.history.to_csv(index=False, float_format="%.9g"))
+        write_text(target / LINKS_FILE, csv_text(record.links, "%.10g"))
+        write_text(target / HISTORY_FILE, csv_text(record.history, "%.9g"))
         # A validation of an earlier calibration does not belong to this result.
         (target / VALIDATION_FILE).unlink(missing_ok=True)
         if record.held_out is not None:

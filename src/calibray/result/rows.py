@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
-from calibray.support.output_files import exists
+from calibray.support.output_files import exists, without_formula_mark
 
 LINKS: Final = {
     "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",
@@ -45,7 +45,7 @@ def read_rows(folder: Path, name: str, columns: dict[str, str]) -> pd.DataFrame:
         raise InputError(f"{file}: does not exist; give the --out folder of `calibray run`")
     try:
         # Group labels such as 7 or NA must stay text.
-        table = pd.read_csv(file, converters={"group": str})
+        table = pd.read_csv(file, converters={"group": without_formula_mark})
     except (OSError, ValueError) as error:
         raise InputError(
             f"{file}: is not a table of `calibray run` ({str(error).splitlines()[0]}); give its --out folder"

@@ -54,6 +54,30 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
     return f"{text[:half]}...{text[-half:]}"
 
 
+def printable(text: str, keep: str = "") -> str:
+    r"""Escape the characters of a text that a terminal or an editor would interpret: names come from files.
+
+    Args:
+        text: The text.
+        keep: Characters that stay, for instance line breaks.
+
+    Returns:
+        The text with control, formatting and line-breaking characters as escape sequences of Python.
+
+    Example:
+        >>> printable("RSS\x1b[2J\n[engine]")
+        'RSS\\x1b[2J\\n[engine]'
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        character
+        if character.isprintable() or character in keep
+        else character.encode("unicode_escape", "surrogatepass").decode()
+        for character in text
+    )
+
+
 def first_line(error: Exception) -> str:
     """The first line of an error's message, or its type if it has none.
 

@@ -18,7 +18,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final, NoReturn
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, NoReturn
 
 from calibray.errors import InputError
 from calibray.support.messages import shortened
@@ -34,6 +34,9 @@ PATH_SEAL: Final = b"calibray/paths sha256 "  # start of a path file
 STALE_SECONDS: Final = 60.0  # age at which an unfinished file is removed if its process has ended
 
 _UNFINISHED: Final = re.compile(r"\.([0-9]{1,10})-[0-9a-f]{32}" + re.escape(PARTIAL))  # with the process
+_FORMULA: Final = re.compile(
+    "'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20].", re.DOTALL
+)  # computed by spreadsheets; or marked
 _SIGNATURE_LINE: Final = re.compile(rb"[0-9a-f]{64}  ")  # start of each line of a signature file
 # Windows has neither flag: its links need special rights, and it has no FIFO in a folder.
 _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
@@ -372,6 +375,45 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
         append(table)
 
 
+def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool = True) -> str:
+    """A table as CSV without its index; texts that a spreadsheet would compute are marked by an apostrophe.
+
+    Args:
+        table: The table.
+        float_format: Format of the numbers, for instance "%.9g"; all digits if None.
+        header: Whether the first line names the columns.
+
+    Returns:
+        The lines, each with a line feed at its end.
+    """
+    safe = table.set_axis([formula_free(name) for name in table.columns], axis=1)
+    for number, kind in enumerate(table.dtypes):  # by position, since names may repeat
+        if kind.kind not in "biufcmM":
+            safe.isetitem(number, table.iloc[:, number].astype(object).map(formula_free, na_action="ignore"))
+    return safe.to_csv(index=False, header=header, float_format=float_format, lineterminator="\n")
+
+
+def formula_free(cell: Any) -> Any:
+    """Mark a text that a spreadsheet would take for a formula; numbers and other texts stay.
+
+    Example:
+        >>> formula_free("=HYPERLINK(1)"), formula_free("-80.5"), formula_free("- east")
+        ("'=HYPERLINK(1)", '-80.5', "'- east")
+    """
+    if not (isinstance(cell, str) and _FORMULA.match(cell)):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
+
+
+def without_formula_mark(cell: str) -> str:
+    """Remove the mark that `formula_free` adds."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
 @contextmanager
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     """Write a CSV or Parquet file in parts and move it into place once it is complete.
@@ -395,7 +437,11 @@ def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
 @contextmanager
 def _csv(partial: Path, _: Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     with partial.open("w", encoding="utf-8") as stream:
-        yield lambda table: table.to_csv(stream, index=False, header=stream.tell() == 0, lineterminator="\n")
+
+        def append(table: pd.DataFrame) -> None:
+            stream.write(csv_text(table, header=stream.tell() == 0))
+
+        yield append
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
+from calibray.support.messages import printable
 from calibray.tables import html as markup
 from calibray.tables import text as plain
 from calibray.tables.table import Table
@@ -98,8 +99,4 @@ def _fitted(parts: Iterable[Table | str]) -> Iterator[Table | str]:
 
 def _short(text: str, length: int) -> str:
     """Text on one line of limited length, with line breaks and control characters escaped."""
-    cut = text if len(text) <= length else f"{text[: length - 3]}..."
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode()
-        for character in cut
-    )
+    return printable(text if len(text) <= length else f"{text[: length - 3]}...")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from calibray.support.messages import printable
 from calibray.tables.table import Table
 
 _RULES = {"left": "---", "right": "---:"}
@@ -23,5 +24,5 @@ def render(table: Table) -> str:
 
 
 def _line(cells: Iterable[str]) -> str:
-    escaped = (cell.replace("|", r"\|") for cell in cells)
+    escaped = (printable(cell).replace("|", r"\|") for cell in cells)
     return f"| {' | '.join(escaped)} |"

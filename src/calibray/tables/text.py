@@ -1,4 +1,4 @@
-"""Tables as plain text, for terminals, files and pipes."""
+"""Tables as plain text, for terminals, files and pipes. Control characters are escaped, since names come from files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
+from calibray.support.messages import printable
 from calibray.tables.table import Table
 
 LISTED: Final = 12
@@ -38,7 +39,9 @@ def render(*parts: Table | str) -> str:
         ───────────────
         tracing   0.3 s
     """
-    return "\n\n".join(part if isinstance(part, str) else _lines(part) for part in parts if part)
+    return "\n\n".join(
+        printable(part, "\n") if isinstance(part, str) else _lines(part) for part in parts if part
+    )
 
 
 def rows_text(rows: Sequence[int]) -> str:
@@ -81,11 +84,11 @@ def _lines(table: Table) -> str:
         show_header=table.headed, pad_edge=False, show_edge=False,
     )  # fmt: skip
     for column, heading in zip(table.columns, table.headings, strict=True):
-        grid.add_column(Text(heading), justify=column.align, no_wrap=True)
+        grid.add_column(Text(printable(heading)), justify=column.align, no_wrap=True)
     for row in table.rows:
-        grid.add_row(*map(Text, row))
+        grid.add_row(*(Text(printable(cell)) for cell in row))
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
     with console.capture() as shown:
         console.print(grid)
     lines = [line.rstrip() for line in shown.get().splitlines()]
-    return "\n".join([table.title, *lines] if table.titled else lines)
+    return "\n".join([printable(table.title), *lines] if table.titled else lines)
