@@ -1,4 +1,4 @@
-"""What no linter looks at: that every test runs.
+"""What no linter looks at: that every test runs, and that files are written and text is printed in one way.
 
 That imports go one way, and who may import what, import-linter holds; that docstrings tell what is raised, and that
 nothing is asserted, ruff: see `pyproject.toml` and `make lint`.
@@ -55,3 +55,71 @@ def test_every_test_is_collected():
 )
 def test_a_lost_test_is_found(source, file, lost):
     assert uncollected_tests(source, file) == lost
+
+
+SOURCES = TESTS.parent / "src" / "calibray"
+WRITERS = {"write_text", "write_bytes", "to_csv", "tofile", "savefig", "copyfile", "copy", "copytree"}
+"""Methods and functions that write a file, or a CSV text."""
+
+PRIVATE = ("support/output_files.py", "engines/external/", "engines/ledger/", "scenes/shapes.py")
+"""Where files are written otherwise: the writer itself, exchange in private folders, and SQLite."""
+
+
+def foreign_writes(source: str) -> list[int]:
+    """Lines that write a file by its final name, or a table without marking formulas."""
+    lines = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        function = node.func
+        called = function.attr if isinstance(function, ast.Attribute) else ""
+        if isinstance(function, ast.Name) and function.id in ("open", "copyfile", "copytree"):
+            called = function.id
+        words = [part.id for part in ast.walk(node) if isinstance(part, ast.Name)]
+        modes = [part.value for part in node.args if isinstance(part, ast.Constant)]
+        opens = called == "open" and any(isinstance(mode, str) and set("wax+") & set(mode) for mode in modes)
+        of_an_object = called == "copy" and "shutil" not in words
+        if (called in WRITERS or opens) and "partial" not in words and not of_an_object:
+            lines.append(node.lineno)
+    return lines
+
+
+def test_files_are_written_in_one_way():
+    """Everything goes through `support.output_files`: no link is followed, and no foreign file replaced."""
+    written = {
+        str(path.relative_to(SOURCES)): foreign_writes(path.read_text()) for path in SOURCES.rglob("*.py")
+    }
+    assert {name: lines for name, lines in written.items() if lines and not name.startswith(PRIVATE)} == {}
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ('path.write_text("x")', 1),
+        ('path.open("a")', 1),
+        ('path.open("rb")', 0),
+        ('table.to_csv("x")', 1),
+        ("shutil.copyfile(a, b)", 1),
+        ("copyfile(a, b)", 1),
+        ('open("x", "w")', 1),
+        ("frame.copy()", 0),
+        ('partial.write_bytes(b"")', 0),
+        ('write_text(path, "x")', 0),
+    ],
+)
+def test_a_foreign_write_is_noticed(source, count):
+    assert len(foreign_writes(source)) == count
+
+
+def test_commands_print_in_one_way():
+    """`console.echo` escapes control characters; data go out unchanged, as CSV."""
+    printed = {
+        path.name: [
+            line for line in path.read_text().splitlines() if "typer.echo(" in line or " print(" in line
+        ]
+        for path in (SOURCES / "cli").glob("*.py")
+    }
+    assert {name: len(lines) for name, lines in printed.items() if lines} == {
+        "console.py": 1,
+        "predict.py": 1,
+    }

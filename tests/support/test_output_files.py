@@ -8,6 +8,7 @@ import time
 from types import SimpleNamespace
 
 import h5py
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -19,8 +20,10 @@ from calibray.support.output_files import (
     check_outputs,
     check_table,
     check_unchanged,
+    csv_text,
     is_unchanged_output,
     replacing,
+    without_formula_mark,
     write_table,
     write_text,
 )
@@ -215,3 +218,38 @@ def test_nothing_but_a_file_is_replaced_even_unchecked(tmp_path, kind):
     with pytest.raises(InputError, match=r"output file .*: is a"):
         write_text(file, "one")
     assert precious.read_text() == "years of work"
+
+
+def test_texts_that_a_spreadsheet_would_compute_are_marked(tmp_path):
+    attack = '=HYPERLINK("http://localhost")'
+    texts = [
+        attack,
+        "+1+1",
+        "-1+1",
+        "@SUM(1)",
+        "\t=1",
+        "\r=1",
+        "\uff1d1",
+        "'=1",
+        "east",
+        "-80.5",
+        "-",
+        "1e5",
+        "",
+    ]
+    table = pd.DataFrame({attack: texts, "value": [-float(k) for k in range(len(texts))]})
+    write_table(tmp_path / "a.csv", table)
+    read = pd.read_csv(tmp_path / "a.csv", dtype=str, keep_default_na=False)
+    assert list(read) == [f"'{attack}", "value"]
+    assert read["value"].tolist() == [str(-float(k)) for k in range(len(texts))]
+    marked = read[f"'{attack}"].tolist()
+    assert marked == [f"'{text}" for text in texts[:8]] + texts[8:]
+    assert [without_formula_mark(text) for text in marked] == texts
+    assert table.columns[0] == attack  # the caller's table stays
+
+
+def test_a_table_without_texts_is_written_by_pandas_alone():
+    table = pd.DataFrame({"a": [1.5, np.nan], "b": [True, False], "c": [None, 2.25], "a b": ["x", None]})
+    assert csv_text(table, "%.1f") == table.to_csv(index=False, float_format="%.1f")
+    twice = pd.concat([table, table], axis=1)
+    assert csv_text(twice) == twice.to_csv(index=False)

@@ -21,7 +21,7 @@ from calibray.comparison.problem import ComparisonProblem
 from calibray.errors import InputError
 from calibray.fitting.search import rounds
 from calibray.optimizers import METHODS, Optimizer
-from calibray.support.output_files import exists
+from calibray.support.output_files import append_text, exists
 
 LIMITS: Final = {"seeds": 10_000, "workers": 1_000, "budget": 1_000_000}
 """Largest accepted numbers; a comparison with more would not end in useful time."""
@@ -216,8 +216,8 @@ class RunFile:
     def add(self, run: MethodRun) -> MethodRun:
         """Append a run to the file, and return it."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write("\n" * self._torn + json.dumps({"problem": self._problem, **asdict(run)}) + "\n")
+        line = json.dumps({"problem": self._problem, **asdict(run)})
+        append_text(self._path, "\n" * self._torn + line + "\n")
         self._torn = False
         self._runs[run.method, run.budget, run.seed] = run
         return run

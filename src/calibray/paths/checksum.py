@@ -51,16 +51,16 @@ def seal(path: str | Path) -> None:
         raise InputError(f"{target}: cannot be sealed ({error.strerror}); name a path file") from None
 
 
-def write_checksum(path: Path) -> str:
+def write_checksum(partial: Path) -> str:
     """Write the checksum into the empty user block of an HDF5 file.
 
     Args:
-        path: The file, with a user block of `BLOCK` bytes.
+        partial: The unfinished file, with a user block of `BLOCK` bytes.
 
     Returns:
         The checksum in hexadecimal.
     """
-    with path.open("r+b") as file:
+    with partial.open("r+b") as file:
         file.seek(BLOCK)
         block = _block(file)
         file.seek(0)

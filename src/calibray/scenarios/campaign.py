@@ -17,6 +17,7 @@ from calibray.scenarios.district import lamp_positions, scene_objects
 from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
 from calibray.scenes import write_scene
+from calibray.support.output_files import write_bytes
 from calibray.tracing.default_tracer import trace
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}
@@ -42,7 +43,7 @@ def generate(folder: Path, seed: int = SEED) -> None:
     truth = world(seed)
     write_model(folder, truth)
     table = links_csv(truth, measure(truth, seed))
-    (folder / "links.csv").write_bytes(table.encode("ascii"))
+    write_bytes(folder / "links.csv", table.encode("ascii"))
 
 
 def write_model(folder: Path, truth: World) -> None:
@@ -54,8 +55,8 @@ def write_model(folder: Path, truth: World) -> None:
     """
     study = demo_study_path().read_bytes()
     write_scene(folder / "scene", scene_objects(truth.buildings), MODEL_MATERIALS)
-    (folder / "study.toml").write_bytes(study)
-    (folder / "truth.json").write_bytes(truth_json(truth).encode("ascii"))
+    write_bytes(folder / "study.toml", study)
+    write_bytes(folder / "truth.json", truth_json(truth).encode("ascii"))
 
 
 def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:

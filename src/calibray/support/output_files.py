@@ -9,6 +9,7 @@ link, then moved into place in one step.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import os
 import re
@@ -369,6 +370,17 @@ def write_bytes(path: Path, content: bytes) -> None:
         partial.write_bytes(content)
 
 
+def append_text(path: Path, text: str) -> None:
+    """Append to a file of finished work, which is made if it does not exist.
+
+    Raises:
+        InputError: The file is a link, a device or a folder.
+    """
+    check_replaceable(path, overwrite=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | _NO_LINK, 0o666), "ab") as stream:
+        stream.write(text.encode("utf-8"))
+
+
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
     """Write a CSV or Parquet file, without the index, and move it into place; errors as for `growing_table`."""
     with growing_table(path) as append:
@@ -386,11 +398,21 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
     Returns:
         The lines, each with a line feed at its end.
     """
-    safe = table.set_axis([formula_free(name) for name in table.columns], axis=1)
+    names = [formula_free(name) for name in table.columns]
+    safe, returns = table.set_axis(names, axis=1), any("\r" in str(name) for name in names)
     for number, kind in enumerate(table.dtypes):  # by position, since names may repeat
         if kind.kind not in "biufcmM":
-            safe.isetitem(number, table.iloc[:, number].astype(object).map(formula_free, na_action="ignore"))
-    return safe.to_csv(index=False, header=header, float_format=float_format, lineterminator="\n")
+            cells = table.iloc[:, number].astype(object).map(formula_free, na_action="ignore")
+            returns = returns or any(isinstance(cell, str) and "\r" in cell for cell in cells)
+            safe.isetitem(number, cells)
+    return safe.to_csv(
+        index=False,
+        header=header,
+        float_format=float_format,
+        lineterminator="\n",
+        # Python's writer does not quote a carriage return, which readers take for the end of a line.
+        quoting=csv.QUOTE_NONNUMERIC if returns else csv.QUOTE_MINIMAL,
+    )
 
 
 def formula_free(cell: Any) -> Any:
