@@ -27,7 +27,8 @@ ROWS = np.arange(2, 32)
 
 def result() -> Result:
     """A calibration of four parameters with an offset per half and a hold-out, one link without a path."""
-    return Result.load(GOLDEN / "result")
+    # The golden files are edited by hand.
+    return Result.load(GOLDEN / "result", allow_changed_inputs=True)
 
 
 def bare_result() -> Result:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +30,27 @@ def test_the_program_answers_for_every_candidate_and_link(tmp_path):
     assert isinstance(engine, Engine)
     assert engine.path_loss(CANDIDATES) == pytest.approx(programs.expected(CANDIDATES, planted.links()))
     assert engine.calls == len(programs.calls(tmp_path)) == 3
+
+
+def test_a_study_says_what_it_runs_before_it_does_so(tmp_path, caplog):
+    """Once, with the whole command, and escaped: the study may be somebody else's."""
+    spoken = "import pathlib; pathlib.Path('started').touch()"
+    study = programs.study(tmp_path, spoken)
+    engine = engines.make(study.replace())
+    assert "runs a program" not in caplog.text
+    for _ in range(2):
+        engine.path_loss(CANDIDATES[:1])
+    messages = [record.getMessage() for record in caplog.records if "runs a program" in record.getMessage()]
+    (message,) = messages
+    assert str(study.path) in message
+    assert shlex.join(study.engine.command) in message
+    caplog.clear()
+    hidden = programs.study(tmp_path, command=[sys.executable, "-c", "raise SystemExit\x1b[2K\n# harmless"])
+    with pytest.raises(EngineError):
+        engines.make(hidden).path_loss(CANDIDATES[:1])
+    text = next(record.getMessage() for record in caplog.records if "runs a program" in record.getMessage())
+    assert text.isprintable()
+    assert r"\x1b[2K\n# harmless" in text
 
 
 def test_the_request_holds_the_whole_problem(tmp_path):

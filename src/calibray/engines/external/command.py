@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from threading import Event
-from typing import final
+from typing import Final, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,10 @@ from calibray.engines.external.program import POLL, ExternalProgram, Outcome
 from calibray.engines.protocol import Answer, check_candidates, gather
 from calibray.engines.section import OpenedStudy
 from calibray.errors import EngineError
+from calibray.support.messages import printable
 from calibray.support.progress import Progress
+
+_LOG: Final = logging.getLogger(__name__)
 
 
 @final
@@ -60,6 +64,12 @@ class Command:
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
         """Answer candidates, each as soon as its call ends; see `Answering.answers`."""
+        if not self.calls:
+            # A study comes from somebody: whoever starts it sees what runs on this machine.
+            _LOG.warning(
+                "%s runs a program in %s: %s", printable(str(self._source)), printable(str(self._program.folder)),
+                printable(shlex.join(self._program.words)),
+            )  # fmt: skip
         stop = stop or Event()
         requests = [self._request(candidate) for candidate in candidates]
         executor = self._executor
