@@ -25,12 +25,13 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from distributed import Client, LocalCluster
 
 import calibray as cb
 from calibray import engines
 from calibray.engines import ChunkedReplay, InProcess, Workers
 from calibray.engines.cluster.chunks import chunk_size, cut, seconds_to_trace
-from calibray.engines.cluster.dask_workers import DaskWorkers, local_cluster
+from calibray.engines.cluster.dask_workers import DaskWorkers
 from calibray.engines.kinds.replay import trace_and_replay
 from calibray.fitting.methods import choose
 from calibray.fitting.problem import Problem
@@ -115,7 +116,14 @@ def speed_up(links: int, work: Work) -> None:
         with (
             tempfile.TemporaryDirectory() as cache,
             pinned(CALIBRAY_CACHE=cache, JAX_COMPILATION_CACHE_DIR=None),
-            local_cluster(workers) as client,
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
+            ) as cluster,
+            Client(cluster) as client,
         ):
             # Dr.Jit and XLA would take every core for a single worker.
             for core, worker in enumerate(client.scheduler_info()["workers"]):

@@ -1,9 +1,8 @@
-"""The workers of a Dask cluster, local or behind a scheduler."""
+"""The workers of a Dask cluster behind a scheduler."""
 
 from __future__ import annotations
 
 import logging
-import os
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence, Sized
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
 
 SCHEDULER_WAIT = 30.0
 """Longest wait for a scheduler to answer [s]."""
-
-ALWAYS_ALLOWED: Final = 8
-"""Worker processes that may be asked for on any machine, however few cores it has."""
 
 POLL: Final = 0.5
 """Interval between checks for dead workers [s]."""
@@ -232,59 +228,6 @@ def scheduler_client(scheduler: str) -> Iterator[Client]:
         _refuse(scheduler, str(error))
     with client:
         yield client
-
-
-@contextmanager
-def local_cluster(workers: int) -> Iterator[Client]:
-    """Start Dask workers on this machine, each with its share of the processor cores.
-
-    Args:
-        workers: Number of processes.
-
-    Yields:
-        Dask's client; the processes end with it.
-
-    Raises:
-        InputError: There are more processes than this machine can use, or Dask is not installed.
-    """
-    most = max(os.cpu_count() or 1, ALWAYS_ALLOWED)
-    if workers > most:
-        raise InputError(
-            f"--workers {workers}: must be at most {most}, because each is a process that keeps a core busy; use more "
-            "machines and --scheduler"
-        )
-    _require_dask("--workers")
-    import dask
-    from distributed import Client, LocalCluster
-
-    from calibray.engines.cluster.cores import Cores
-
-    # The study states how large chunks are; with a memory limit Dask would kill a worker with a large chunk.
-    # Without an address Dask would serve HTTP on port 8787. It cannot be told not to, so that its servers get a free
-    # port of this machine alone and no page, and are closed once the cluster has started.
-    options = {
-        "threads_per_worker": 1,
-        "processes": True,
-        "memory_limit": 0,
-        "dashboard_address": "127.0.0.1:0",
-        "scheduler_kwargs": {"dashboard": False},
-    }
-    no_pages = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-    with (
-        dask.config.set(no_pages),
-        # `DaskWorkers` reports dead workers itself.
-        LocalCluster(n_workers=workers, silence_logs=logging.ERROR, **options) as cluster,
-        Client(cluster) as client,
-    ):
-        cluster.scheduler.http_server.stop()
-        client.run(_stop_http_server)
-        client.register_plugin(Cores(workers))
-        yield client
-
-
-def _stop_http_server(dask_worker: Any) -> None:
-    """Close the HTTP server of a worker; Dask passes the worker by the argument's name."""
-    dask_worker.http_server.stop()
 
 
 def _require_dask(option: str) -> None:

@@ -12,7 +12,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, final
 
-from calibray.engines.cluster.dask_workers import Answered, DaskWorkers, local_cluster, scheduler_client
+from calibray.engines.cluster.dask_workers import Answered, DaskWorkers, scheduler_client
+from calibray.engines.cluster.local_workers import LocalWorkers
 from calibray.errors import InputError
 from calibray.support.cache_folder import cache_folder
 from calibray.support.memory import available_memory
@@ -152,9 +153,8 @@ def open_workers(workers: int | None = None, scheduler: str | None = None) -> It
         elif workers is not None:
             # Processes and threads start on first use: an engine needs one of them. Each thread starts one external
             # program after the other and waits for it.
-            yield DaskWorkers(
-                lambda: opened.enter_context(local_cluster(workers)),
-                lambda: opened.enter_context(ThreadPoolExecutor(workers)),
-            )
+            local = LocalWorkers(workers, lambda: opened.enter_context(ThreadPoolExecutor(workers)))
+            opened.callback(local.close)
+            yield local
         else:
             yield None
