@@ -12,7 +12,6 @@ from pathlib import Path
 import distributed
 import numpy as np
 import pandas as pd
-import psutil
 import pytest
 
 import planted
@@ -20,7 +19,6 @@ import programs
 import two_ray
 from calibray import calibrate, coverage_map, engines
 from calibray.engines.cluster.chunks import for_each_chunk
-from calibray.engines.cluster.dask_workers import local_cluster
 from calibray.errors import InputError
 from calibray.measurements import Measurements, links_from_frame
 from calibray.study import Setup
@@ -138,21 +136,3 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
         engines.open_workers(scheduler="tcp://127.0.0.1:9"),
     ):
         pass
-
-
-def test_local_workers_serve_no_pages_and_listen_on_this_machine_only():
-    """Dask opens its dashboard's port, 8787, on all interfaces even if the dashboard is switched off."""
-    with local_cluster(2) as client:
-        process = psutil.Process()
-        listening = [
-            connection.laddr
-            for member in (process, *process.children(recursive=True))
-            for connection in member.net_connections(kind="tcp")
-            if connection.status == psutil.CONN_LISTEN
-        ]
-        assert client.cluster is not None
-        served = [client.cluster.scheduler.http_server.port]
-        served += client.run(lambda dask_worker: dask_worker.http_server.port).values()
-    assert listening
-    assert {address.ip for address in listening} <= {"127.0.0.1", "::1"}
-    assert not {address.port for address in listening} & {8787, *served}

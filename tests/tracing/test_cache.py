@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -61,3 +62,37 @@ def test_a_folder_that_cannot_be_written_is_done_without(
     monkeypatch.setenv(caching.CACHE_VARIABLE, "")
     cache.store_trace("d", synthetic.program(synthetic.EVERY_KIND))
     assert cache.load_trace("d") is None
+
+
+def test_a_link_or_a_file_that_others_can_write_to_is_not_used(entry, caplog):
+    assert cache.load_trace("d") is not None
+    entry.chmod(0o666)
+    with caplog.at_level(logging.WARNING):
+        assert cache.load_trace("d") is None
+    assert "others can write to it" in caplog.text
+    entry.chmod(0o600)
+    assert cache.load_trace("d") is not None
+    hidden = entry.rename(entry.with_name("hidden.h5"))
+    entry.symlink_to(hidden)
+    assert cache.load_trace("d") is None
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
+def test_a_trace_that_another_user_planted_is_not_used(entry, caplog):
+    """Its seal, a plain digest, is right: anybody can compute it."""
+    os.chown(entry, 65534, 65534)
+    with caplog.at_level(logging.WARNING):
+        assert cache.load_trace("d") is None
+    assert "belongs to another user" in caplog.text
+    cache.store_trace("d", synthetic.program(synthetic.EVERY_KIND))
+    assert entry.stat().st_uid == 0
+    assert cache.load_trace("d") is not None
+
+
+def test_a_stored_trace_is_used_whatever_the_umask(entry):
+    old = os.umask(0)
+    try:
+        cache.store_trace("e", synthetic.program(synthetic.EVERY_KIND))
+    finally:
+        os.umask(old)
+    assert cache.load_trace("e") is not None

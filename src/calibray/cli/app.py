@@ -82,7 +82,7 @@ class Commands(TyperGroup):
             echo(f"Error: {error}", err=True)
             raise typer.Exit(1) from error
         except MemoryError as error:
-            typer.echo("Error: not enough memory; end other programs, or use fewer links at once", err=True)
+            echo("Error: not enough memory; end other programs, or use fewer links at once", err=True)
             raise typer.Exit(1) from error
         except BrokenPipeError:
             raise

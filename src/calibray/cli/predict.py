@@ -143,5 +143,5 @@ def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) 
     for name, new in renamed.items():
         if new in frame:
             raise InputError(f"{file}: has the columns {name!r} and {new!r}; rename or remove one")
-        typer.echo(f"{file}: its column {name!r} is written as {new!r}", err=True)
+        echo(f"{file}: its column {name!r} is written as {new!r}", err=True)
     return renamed

@@ -1,6 +1,7 @@
 """Stored traces: the same scene, links, antennas, settings and versions are traced once.
 
-Traces lie in Calibray's cache folder (`support.cache_folder`). A damaged one is removed, with a warning in the log.
+Traces lie in Calibray's cache folder (`support.cache_folder`). A damaged one is removed, with a warning in the log. If
+several users share the folder, each uses only the traces that the user or root has written.
 """
 
 from __future__ import annotations
@@ -8,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import re
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -27,6 +30,7 @@ from calibray.support.cache_folder import cache_folder
 from calibray.tracing.settings import Antenna, TraceSettings
 
 _FILE_NAME: Final = re.compile(r"[0-9a-f]{64}\.h5")
+_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -73,17 +77,42 @@ def trace_digest(
 
 
 def load_trace(digest: str) -> Paths | None:
-    """Load the trace with a fingerprint; None if there is none. A file that cannot be read is removed."""
+    """Load the trace with a fingerprint; None if there is none, or if another user may have written it.
+
+    A file that cannot be read is removed.
+    """
     path = _path(digest)
-    if path is None or not path.is_file():
+    if path is None:
         return None
     try:
-        return Paths.load(path)
-    except InputError as error:
-        _LOG.warning("Stored trace removed, tracing again: %s", error)
-        with suppress(OSError):
-            path.unlink()
+        stream = os.fdopen(os.open(path, os.O_RDONLY | _NO_LINK), "rb")
+    except OSError:  # there is none, or a link
         return None
+    with stream:
+        if not _is_trusted(os.fstat(stream.fileno())):
+            _LOG.warning("%s: belongs to another user, or others can write to it; tracing again", path)
+            return None
+        # Whoever else may write to a shared folder could put another file there after the check, so that the open one
+        # is read where the system has a name for it.
+        opened = Path(f"/proc/self/fd/{stream.fileno()}")
+        try:
+            return Paths.load(opened if opened.exists() else path)
+        except InputError as error:
+            _LOG.warning(
+                "Stored trace removed, tracing again: %s", str(error).replace(str(opened), str(path))
+            )
+            with suppress(OSError):
+                path.unlink()
+            return None
+
+
+def _is_trusted(status: os.stat_result) -> bool:
+    """Whether a file is the user's or root's, and nobody else can write to it: the paths in it become results."""
+    if not stat.S_ISREG(status.st_mode):
+        return False
+    if not hasattr(os, "geteuid"):  # Windows keeps other users out of a user's folders
+        return True
+    return status.st_uid in (os.geteuid(), 0) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def store_trace(digest: str, paths: Paths) -> None:
@@ -93,6 +122,7 @@ def store_trace(digest: str, paths: Paths) -> None:
         with suppress(OSError, InputError):
             path.parent.mkdir(parents=True, exist_ok=True)
             paths.save(path)
+            path.chmod(0o644)  # whatever the umask: a file that others can write to is not read
 
 
 def stored_traces() -> list[Path]:
