@@ -72,7 +72,7 @@ def init(
         progress("checking positions", 0, None)
         warn(draft.study, measured)
         if findings := count_unknowns(draft.study, measured):
-            typer.echo(warning_lines(findings), err=True)
+            echo(warning_lines(findings), err=True)
         if plot is not None:
             save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs)
     if plot is not None:
