@@ -266,7 +266,7 @@ def chosen_model_text(record: Record) -> str:
     if model.name == Model.CALIBRATED or model.residual_db is None or calibrated_db is None:
         return ""
     return (
-        f"On held-out links the prediction model {model.name!r} has an RMSE of {model.residual_db:.2f} dB, the "
+        f"On held-out links the prediction model {str(model.name)!r} has an RMSE of {model.residual_db:.2f} dB, the "
         f"calibrated model {calibrated_db:.2f} dB."
     )
 
