@@ -202,10 +202,10 @@ def _read_parquet(path: Path) -> SourceTable:
     with _open_parquet(path) as file:
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
         _check_size(path, groups, LARGEST_TABLE, "the table")
-        try:
-            frame = file.read().to_pandas()
-        except Exception as error:
-            raise _damaged(path, error) from None
+    try:
+        frame = pd.read_parquet(path, engine="pyarrow")
+    except Exception as error:
+        raise _damaged(path, error) from None
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 

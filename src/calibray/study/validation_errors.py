@@ -132,14 +132,16 @@ def _keys(model: Any, path: Sequence[str | int]) -> list[str]:
     """The keys of a model at a path, of all kinds of tables that it may have there."""
     models = [model]
     for part in path:
-        models = [
-            table
-            for known in models
-            for table in _tables(
-                _annotations(known).get(str(part)) if _annotations(known) else get_args(known)[1]
-            )
-        ]
+        models = [table for known in models for table in _tables(_annotation(known, str(part)))]
     return list(dict.fromkeys(key for known in models for key in _annotations(known)))
+
+
+def _annotation(model: Any, key: str) -> Any:
+    """The type of a key of a model, or of any key of a mapping; None if it is neither."""
+    if annotations := _annotations(model):
+        return annotations.get(key)
+    arguments = get_args(model)
+    return arguments[1] if len(arguments) > 1 else None
 
 
 def _annotations(model: Any) -> dict[str, Any]:
