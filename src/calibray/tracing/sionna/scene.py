@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,16 +63,15 @@ def _temporary_folder(path: Path) -> TemporaryDirectory[str]:
 
 
 def _load(xml: str, path: Path) -> rt.Scene:
-    resolver = mi.file_resolver()
+    # Mitsuba looks for relative names in the working directory first, where another scene may have meshes of the same
+    # names: it gets absolute ones, of the files whose bytes the fingerprint of a trace covers.
+    root, folder = ElementTree.fromstring(xml), path.parent.resolve()
+    for filename in root.iterfind(".//string[@name='filename']"):
+        filename.set("value", str(folder / filename.get("value", "")))
     try:
-        search = mi.FileResolver(resolver)
-        search.append(str(path.parent.resolve()))
-        mi.set_file_resolver(search)
-        return load_scene_from_string(xml)
+        return load_scene_from_string(ElementTree.tostring(root, encoding="unicode"))
     except (RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"{path}: Sionna RT cannot load the scene: {' '.join(str(error).split())}") from None
-    finally:
-        mi.set_file_resolver(resolver)
 
 
 def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
