@@ -265,7 +265,7 @@ def ply_bytes(mesh: Mesh) -> bytes:
     Returns:
         The content of the file.
     """
-    is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 1e-4
+    is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4
     name, stored = ("double", "<f8") if is_coarse else ("float", "<f4")
     header = (
         "ply\nformat binary_little_endian 1.0\n"
