@@ -142,7 +142,7 @@ def test_the_command_writes_a_map(folder, coverage, tmp_path):
     assert again.exit_code == 2
     refused = CliRunner().invoke(app, ["map", str(folder), "--samples", "many"])
     assert refused.exit_code == 2
-    assert '--samples many: must be a whole number, or "auto"' in refused.stderr
+    assert '--samples many: must be a whole number or "auto"' in refused.stderr
 
 
 def test_an_adaptive_number_of_rays_finds_the_study_s_paths(result, coverage):

@@ -8,6 +8,7 @@ import pytest
 import calibray as cb
 from calibray.errors import InputError
 from calibray.scenes import Scene, export_scene, read_scene
+from calibray.scenes.export import exported_names
 
 CANYON = "sionna:simple_street_canyon"
 FREQUENCY = 3.5e9
@@ -74,5 +75,6 @@ def test_a_split_scene_traces_like_the_whole_one_and_one_object_can_change_separ
     assert set(np.flatnonzero(moved)) == via_object
     export_scene(scene, changed, tmp_path / "scene.xml")
     exported = read_scene(tmp_path / "scene.xml", FREQUENCY)
-    assert exported.materials[name] == changed[name]
-    assert material_names(exported)[name.removeprefix("own/")] == name
+    written = exported_names(changed)[name]
+    assert exported.materials[written] == changed[name]
+    assert material_names(exported)[name.removeprefix("own/")] == written

@@ -215,7 +215,7 @@ def test_parameters_of_measured_buildings_stay_weakly_identified():
         return verdicts(draws, lambda points: points * 50.0, Axes(["walls"], *ends), 3.0, seen=lean)[0]
 
     assert told(means, seen).name == "weakly identified"
-    assert "buildings that were measured" in reason_text(told(means, seen).reason)
+    assert "for the measured buildings" in reason_text(told(means, seen).reason)
     assert told(means, seen).pieces == told(means, None).pieces
     assert told(means, None).name == "not identifiable"
     assert told(means, means).name == "not identifiable"
