@@ -89,7 +89,7 @@ def mask_codes(
     }
     present = ", ".join(f"{code:g}" for code in codes if (values == code).any())
     table = table.assign(**changed).note(f"values that mean not measured ({present})", int(coded.sum()))
-    return table, coded.any(axis=1)
+    return table, np.asarray(coded.any(axis=1))
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:

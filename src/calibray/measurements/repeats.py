@@ -70,5 +70,5 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
     names += [name for name in (columns.frequency, columns.tx_power_dbm) if isinstance(name, str)]
     if steps.transmitter in table.frame:
         names.append(steps.transmitter)
-    names += [name for name in table.frame if column_names.matches(name, "time")]
+    names += [str(name) for name in table.frame if column_names.matches(str(name), "time")]
     return list(dict.fromkeys(names))

@@ -404,7 +404,7 @@ def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool 
         if kind.kind not in "biufcmM":
             cells = table.iloc[:, number].astype(object).map(formula_free, na_action="ignore")
             returns = returns or any(isinstance(cell, str) and "\r" in cell for cell in cells)
-            safe.isetitem(number, cells)
+            safe.isetitem(number, cells.to_numpy())
     return safe.to_csv(
         index=False,
         header=header,
