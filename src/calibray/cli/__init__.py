@@ -7,10 +7,9 @@ import os
 import sys
 from typing import NoReturn
 
-__all__ = ["main"]
+from calibray.support.interruption import INTERRUPTED
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
+__all__ = ["main"]
 
 
 def main() -> None:

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
-from calibray.cli import INTERRUPTED
 from calibray.cli.cache import cache
 from calibray.cli.compare import compare
 from calibray.cli.console import echo
@@ -30,7 +29,7 @@ from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate
 from calibray.errors import EngineError, InputError
-from calibray.support.interruption import ensure_interruption
+from calibray.support.interruption import INTERRUPTED, ensure_interruption
 from calibray.support.memory import check_address_space
 
 LONGEST: Final = 4096

@@ -10,6 +10,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
+INTERRUPTED: Final = 130
+"""Exit status after Ctrl-C: 128 plus the number of the signal, as in shells."""
+
 GRACE: Final = 1.0
 """Time that an interruption may take to reach the code that saves results, before it is raised again [s]."""
 
