@@ -125,7 +125,7 @@ def test_every_child_is_gone_after_timeout_and_end(tmp_path, script, timeout):
 
 CALIBRAY = """
 import os, sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], os.path.dirname(sys.argv[1])]
 from pathlib import Path
 from test_external_program import request, shell
 for line in sys.stdin:
