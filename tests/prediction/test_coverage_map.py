@@ -20,6 +20,7 @@ from calibray.errors import InputError
 from calibray.prediction import batches
 from calibray.prediction.map_files import CoverageMap, geotiff
 from calibray.reporting.link_map import footprints
+from calibray.result import FittedTerm, PredictionModel
 from calibray.scenes import Triangles, ground_heights
 from changed import changed
 
@@ -51,7 +52,10 @@ def result(folder) -> cb.Result:
     content["scene"]["origin"] = list(ORIGIN)
     draws = {name: [0.9 * value, 1.2 * value] for name, value in loaded.parameters.items()}
     study = cb.Study.from_content(content, loaded.study.path)
-    return changed(loaded, study=study, draws=draws)
+    fallback = PredictionModel(
+        "log-distance", None, (FittedTerm("slope", "log_distance", "", {"": 40.0}),), 9.0
+    )
+    return changed(loaded, study=study, draws=draws, fallback=replace(fallback, sizes_db=(9.0,) * 9))
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +74,15 @@ def links(x, y, z=1.5):
 
 def test_a_cell_equals_the_prediction_at_its_centre(result, coverage):
     assert coverage.path_loss_db.shape == (3, 4)
-    column, row = np.array([0, 2, 3]), np.array([0, 1, 2])
+    predicted = np.isfinite(coverage.path_loss_db)
+    assert 0 < coverage.no_path.sum() < predicted.sum() < predicted.size
+    row, column = (ends[::2] for ends in np.nonzero(predicted))
     predictions = result.predict_interval(links(coverage.x[column], coverage.y[row]))
     for name in ("path_loss_db", "lower_db", "upper_db"):
         layer = getattr(coverage, name)[row, column]
         assert layer == pytest.approx(predictions[name].to_numpy(float), abs=0.05, nan_ok=True)
-    reached = np.isfinite(coverage.path_loss_db)
-    assert 0 < reached.sum() < reached.size
-    assert (np.isfinite(coverage.lower_db) <= reached).all()
+    assert predictions.basis.str.startswith("no path").tolist() == coverage.no_path[row, column].tolist()
+    assert (np.isfinite(coverage.lower_db) <= predicted).all()
     inside = np.isfinite(coverage.upper_db)
     assert (coverage.lower_db < coverage.path_loss_db)[inside].all()
 
@@ -87,7 +92,8 @@ def test_the_geotiff_has_the_position_of_the_scene(result, coverage, tmp_path):
     assert names == ("map.tif", "map.png", "map.csv")
     table = pd.read_csv(tmp_path / "map.csv")
     with rasterio.open(tmp_path / "map.tif") as file:
-        assert file.descriptions == ("path_loss_db", "lower_db", "upper_db")
+        assert file.descriptions == ("path_loss_db", "lower_db", "upper_db", "no_path")
+        assert (file.read(4)[::-1] == coverage.no_path).all()
         assert file.bounds.right - file.bounds.left == pytest.approx(120)
         # The scene's origin is 57 m from the western and southern edges of the map.
         east, north = transformer("EPSG:4326", file.crs.to_wkt()).transform(*ORIGIN)
@@ -108,7 +114,7 @@ def test_a_map_is_written_into_a_folder_of_any_name(coverage, tmp_path):
     folder.mkdir()
     geotiff(coverage, folder / "map.tif")
     with rasterio.MemoryFile((folder / "map.tif").read_bytes()) as memory, memory.open() as file:
-        assert file.count == len(coverage.layers)
+        assert file.count == len(coverage.layers) + 1
 
 
 def test_the_position_of_the_transmitter_has_no_path_loss(result, coverage, monkeypatch):
@@ -134,9 +140,11 @@ def test_the_command_writes_a_map(folder, coverage, tmp_path):
     run = CliRunner().invoke(app, ["map", str(folder), *map(str, ["--tx", *TX, *options, "--out", tmp_path])])
     assert run.exit_code == 0, run.output
     table = pd.read_csv(tmp_path / "map.csv")
-    assert list(table) == ["x_m", "y_m", "z_m", "received_power_dbm"]
-    assert table.received_power_dbm.to_numpy() == pytest.approx(
-        30 - coverage.path_loss_db.reshape(-1), abs=0.05
+    assert list(table) == ["x_m", "y_m", "z_m", "received_power_dbm", "basis"]
+    # The stored result has no fallback.
+    reached = (np.isfinite(coverage.path_loss_db) & ~coverage.no_path).reshape(-1)
+    assert table.received_power_dbm[reached].to_numpy() == pytest.approx(
+        30 - coverage.path_loss_db.reshape(-1)[reached], abs=0.05
     )
     again = CliRunner().invoke(app, ["map", str(folder), "--column", "half"])
     assert again.exit_code == 2

@@ -139,8 +139,8 @@ def test_embedded_data_equal_the_result(html, result):
     table = result.links
     assert links["row"] == table.row.tolist()
     assert links["measured"] == pytest.approx(table.measured_db.tolist(), abs=0.0051)
-    after = [np.inf if value is None else value for value in links["after"]]
-    assert after == pytest.approx(table.after_db.tolist(), abs=0.0051)
+    predicted = [np.inf if value is None else value for value in links["predicted"]]
+    assert predicted == pytest.approx(table.predicted_db.tolist(), abs=0.0051)
     assert sum(links["held"]) == table.held_out.sum() > 0
     words = " ".join(html.words.split())
     assert f"RMSE {result.holdout_rmse_db:.2f} dB" in words

@@ -90,9 +90,11 @@ def test_prediction_adds_the_offset_of_the_group(result):
     assert east - west > 5
 
 
-def test_prediction_where_no_path_leads_is_infinite(result):
-    predicted = result.predict(planted.links(blocked=True))
-    assert np.flatnonzero(np.isinf(predicted)).tolist() == [planted.INSIDE]
+def test_the_fallback_predicts_where_no_path_leads(result):
+    links = planted.links(blocked=True)
+    assert np.isfinite(result.predict(links)).all()
+    without = replace(result, prediction=replace(result.prediction, fallback=None))
+    assert np.flatnonzero(np.isinf(without.predict(links))).tolist() == [planted.INSIDE]
 
 
 @pytest.mark.parametrize(

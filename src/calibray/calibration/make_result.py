@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.measurements import Measurements
 from calibray.paths import Paths
+from calibray.prediction.fallback import fill_missing
 from calibray.prediction.residual_field import calibration_residuals
 from calibray.result.held_out import Model
 from calibray.result.prediction_model import ResidualField
@@ -32,6 +33,7 @@ from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
+from calibray.validation.fallback import fit_fallback
 from calibray.validation.held_out_statistics import choose, compare
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
@@ -146,7 +148,15 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             validation, _rmse(problem, models.initial, validation.judged), fitted
         )
     chosen = fit_prediction_model(problem, trail, name, residuals)
-    table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db)
+    table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
+    prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table))
+    if chosen.model.parameters is not None:
+        without_path = ~table["has_path"].to_numpy(bool)
+        fallback = fit_fallback(problem, without_path, *_log_distance_errors(problem, models, validation))
+        prediction = replace(prediction, fallback=fallback)
+        predictions = pd.DataFrame({"path_loss_db": chosen.path_loss_db, "basis": table["basis"]})
+        predictions = fill_missing(prediction, study, links, predictions)
+        table = table.assign(predicted_db=predictions["path_loss_db"], basis=predictions["basis"])
     return Result(
         study=study,
         fit=Fit(
@@ -176,7 +186,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             ),
         ),
         nuisance=_nuisance(problem, coefficients[0]),
-        prediction=Prediction(chosen.model, chosen.materials, _residual_field(problem, table)),
+        prediction=prediction,
         cost=Cost(
             rt_calls=trail.rt_calls,
             ledger_hits=trail.ledger_hits,
@@ -265,6 +275,20 @@ def _choice_on_held_out_links(
     basis = f"errors of {objective.num_counted} calibration links"
     freedom = max(objective.num_counted - len(problem.parameters), 1)
     return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, freedom, np.zeros(0))
+
+
+def _log_distance_errors(
+    problem: Problem, models: Models, validation: Validation | None
+) -> tuple[NDArray[np.float64], str]:
+    """Residuals of the log-distance model on held-out links with a path [n], [dB], and what these links are."""
+    if validation is not None:
+        basis = f"errors on {len(validation.labels)} blocks held out in turn"
+        return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
+    links = problem.setup.links
+    judged = problem.setup.held_out & np.isfinite(models.calibrated)
+    judged &= True if links.censored is None else ~links.censored
+    errors = (models.log_distance - problem.objective.measured)[judged]
+    return errors, f"errors of {len(errors)} links held out"
 
 
 def _on_blocks(

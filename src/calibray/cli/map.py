@@ -67,7 +67,10 @@ def map(
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv."""
+    """Predict path loss over an area and write map.tif (GeoTIFF), map.png and map.csv.
+
+    Where no path leads, the log-distance model predicts; these cells are hatched.
+    """
     from calibray.cli.progress_bars import progress_bars
 
     target = out or folder
@@ -101,8 +104,12 @@ def map(
             )
         progress("writing", 0, None)
         names = coverage.save(target, inputs, overwrite)
-    reached = np.isfinite(coverage.path_loss_db)
-    echo(f"{reached.size:,} cells, {int(reached.sum()):,} with a path", err=True)
+    predicted, without_path = int(np.isfinite(coverage.path_loss_db).sum()), int(coverage.no_path.sum())
+    echo(
+        f"{coverage.z.size:,} cells: {predicted - without_path:,} predicted by the model, {without_path:,} without a "
+        f"path by the log-distance model (hatched), {coverage.z.size - predicted:,} blank (inside buildings)",
+        err=True,
+    )
     if len(names) < len(FILES):
         echo(
             "map.tif was not written: rasterio is not installed; run pip install 'calibray[scenes]'", err=True

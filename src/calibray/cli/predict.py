@@ -22,10 +22,7 @@ PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
 """Columns that `predict` adds, those after the first only with --level. Other measured quantities add more."""
 
 TEXTS: Final = ("basis", "remark")
-"""Text columns that are added with --level."""
-
-NO_PATH: Final = "no path leads to"
-"""The warning about links without a path."""
+"""Text columns that are added, the remark only with --level."""
 
 
 def predict(
@@ -51,8 +48,8 @@ def predict(
         float | None,
         typer.Option(
             metavar="P",
-            help="Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db, "
-            "upper_db and basis, and a remark where an antenna is inside a building or outside the scene.",
+            help="Add the interval that contains a measurement with this probability, such as 0.9: columns lower_db "
+            "and upper_db, and a remark where an antenna is inside a building or outside the scene.",
         ),
     ] = None,
     workers: Workers = None,
@@ -60,7 +57,10 @@ def predict(
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Predict path loss at new links with the calibrated scene."""
+    """Predict path loss at new links with the calibrated scene.
+
+    The column basis says what predicted: where no path leads, the log-distance model.
+    """
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
@@ -77,7 +77,7 @@ def predict(
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))
-        names, texts = (PREDICTIONS[:1], ()) if level is None else (PREDICTIONS, TEXTS)
+        names, texts = (PREDICTIONS[:1], TEXTS[:1]) if level is None else (PREDICTIONS, TEXTS)
         # A prediction of NaN for the first link shows which columns the measured quantity adds.
         measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
         renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *texts))
@@ -97,8 +97,8 @@ def predict(
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
-    for warning in sorted(warnings, key=lambda text: (text != NO_PATH, text)):
-        _warn(warning if warning == NO_PATH else f"{warning}:", warnings[warning], table.rows)
+    for warning in sorted(warnings, key=lambda text: (not text.startswith("no path"), text)):
+        _warn(warning, warnings[warning], table.rows)
 
 
 @contextmanager
@@ -120,9 +120,13 @@ def _collect_warnings(
     warnings: dict[str, array[int]], row: NDArray[np.int64], predictions: pd.DataFrame
 ) -> None:
     """Add the rows of links without a path, and of links with remarks, to the warnings."""
-    without_path = ~(predictions["path_loss_db"].to_numpy() < float("inf"))
-    rows: dict[str, list[int]] = {NO_PATH: row[without_path].tolist()}
-    for number, remarks in zip(row.tolist(), predictions["remark"].tolist(), strict=True):
+    from calibray.result.prediction_model import NO_PATH
+
+    rows: dict[str, list[int]] = {}
+    bases = predictions["basis"].where(predictions["basis"].str.startswith(NO_PATH), "").tolist()
+    for number, basis, remarks in zip(row.tolist(), bases, predictions["remark"].tolist(), strict=True):
+        if basis:
+            rows.setdefault(basis, []).append(number)
         for remark in filter(None, remarks.split(", ")):
             rows.setdefault(remark, []).append(number)
     for warning, numbers in rows.items():
@@ -134,7 +138,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables.text import rows_text
 
     if rows:
-        echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        echo(f"Warning: {warning}: {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:

@@ -21,7 +21,9 @@ from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import batch_size, predict_links
 from calibray.prediction.map_files import CoverageMap
+from calibray.prediction.position_checks import INSIDE, is_indoors, locate
 from calibray.prediction.predict import as_links, open_for_links
+from calibray.result.prediction_model import NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.study import Study
@@ -95,7 +97,7 @@ def coverage_map(
     rx = np.stack([east, north, z], axis=-1).reshape(-1, 3)
     cells = np.flatnonzero(np.linalg.norm(rx - transmitter, axis=1) > MIN_DISTANCE)
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
-    layers = np.full((3, len(rx)), np.nan)
+    layers, no_path = np.full((3, len(rx)), np.nan), np.zeros(len(rx), dtype=bool)
     size = batch_size(setup, workers)
     for start in range(0, len(cells), size):
         batch = cells[start : start + size]
@@ -105,10 +107,18 @@ def coverage_map(
         predictions = predict_links(result, setup, level, batch_progress, workers)
         for layer, name in enumerate(names):
             layers[layer, batch] = predictions[name]
+        no_path[batch] = predictions["basis"].str.startswith(NO_PATH)
+    # Outdoors, the log-distance model does not apply inside buildings.
+    without_scene = no_path | (result.prediction.model.parameters is None)
+    if without_scene.any() and not is_indoors(result, triangles):
+        inside = np.zeros(len(rx), dtype=bool)
+        inside[without_scene] = locate(triangles, rx[without_scene]) == INSIDE
+        layers[:, inside], no_path[inside] = np.nan, False
     path_loss, lower, upper = layers.reshape(3, *z.shape)
     return CoverageMap(
-        transmitter, height, cell, x, y, z, path_loss, lower, upper, level, power_dbm, frame, triangles
-    )
+        transmitter, height, cell, x, y, z, path_loss, lower, upper, no_path.reshape(z.shape), level, power_dbm,
+        frame, triangles,
+    )  # fmt: skip
 
 
 def _transmitter(result: Record, tx: Sequence[float] | None) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import Frame, parse_crs
 from calibray.errors import InputError
+from calibray.result.prediction_model import NO_PATH
 from calibray.scenes.building_outlines import footprints
 from calibray.scenes.triangles import Triangles
 from calibray.support.extras import library
@@ -33,6 +34,9 @@ POWER_COLORS: Final = "viridis"
 WIDTH_COLORS: Final = "cividis"
 """Matplotlib's colour scales that keep their order for colour-blind readers and in grey; strong signals are bright."""
 
+QUANTILES: Final = (0.02, 0.98)
+"""Quantiles of the cells' values at which the colour scale ends, so that few extreme values do not flatten it."""
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -46,9 +50,11 @@ class CoverageMap:
         x: Eastings of the cells' centres, ascending [nx], [m].
         y: Northings of the cells' centres, ascending [ny], [m].
         z: Heights of the receivers [ny, nx], [m].
-        path_loss_db: Path loss with nuisances [ny, nx], [dB]; +inf without a path, NaN at the transmitter.
-        lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a path or without a level.
+        path_loss_db: Path loss with nuisances [ny, nx], [dB]; that of the log-distance model where no path leads. NaN
+            at the transmitter, and inside buildings where no path leads.
+        lower_db: Lower end of the interval [ny, nx], [dB]; NaN without a prediction or without a level.
         upper_db: Upper end of the interval [ny, nx], [dB].
+        no_path: Cells predicted by the log-distance model, since no path leads there [ny, nx].
         level: Probability that the interval contains a measurement; None for a map without interval.
         power_dbm: Transmitted power of a map of received power [dBm]; None for a map of path loss.
         frame: Position of the scene on the globe; None where it is unknown.
@@ -64,6 +70,7 @@ class CoverageMap:
     path_loss_db: NDArray[np.float64]
     lower_db: NDArray[np.float64]
     upper_db: NDArray[np.float64]
+    no_path: NDArray[np.bool_]
     level: float | None
     power_dbm: float | None
     frame: Frame | None
@@ -85,9 +92,10 @@ class CoverageMap:
         return best if self.level is None else best | interval
 
     def table(self) -> pd.DataFrame:
-        """One row per cell, from south to north and west to east: x_m, y_m, z_m and the layers."""
+        """One row per cell, from south to north and west to east: x_m, y_m, z_m, the layers and the basis."""
         x, y = np.meshgrid(self.x, self.y)
-        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers}
+        predicted = np.where(self.no_path, NO_PATH, np.where(np.isfinite(self.path_loss_db), "model", ""))
+        columns = {"x_m": x, "y_m": y, "z_m": self.z, **self.layers, "basis": predicted}
         return pd.DataFrame({name: values.reshape(-1) for name, values in columns.items()})
 
     def save(
@@ -122,7 +130,7 @@ class CoverageMap:
 
 
 def geotiff(coverage: CoverageMap, path: Path) -> None:
-    """Write a map as a GeoTIFF with one band per layer, north up; cells without a path have no data.
+    """Write a map as a GeoTIFF, north up: one band per layer, then 1 where no path leads, else 0.
 
     Args:
         coverage: The map. Without a frame, coordinates are those of the scene, and no reference system is declared.
@@ -132,7 +140,7 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
         InputError: rasterio is not installed, or the frame's projection is unknown.
     """
     rasterio = library("rasterio", "scenes")
-    frame, bands = coverage.frame, coverage.layers
+    frame, bands = coverage.frame, {**coverage.layers, "no_path": coverage.no_path.astype(float)}
     west, north = coverage.x[0] - coverage.cell / 2, coverage.y[-1] + coverage.cell / 2
     georeference: dict[str, Any] = {}
     if frame is not None:
@@ -149,7 +157,8 @@ def geotiff(coverage: CoverageMap, path: Path) -> None:
                 finite = np.where(np.isfinite(values), values, np.nan)
                 file.write(finite[::-1].astype("float32"), number)
                 file.set_band_description(number, name)
-                file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
+                if name != "no_path":
+                    file.set_band_unit(number, "dBm" if name.endswith("dbm") else "dB")
             file.update_tags(
                 tx_m=" ".join(f"{coordinate:g}" for coordinate in coverage.tx),
                 receiver_height_m=f"{coverage.height:g}",
@@ -177,7 +186,7 @@ def figure(coverage: CoverageMap) -> Figure:
     if ends:
         lower, upper = ends
         half = (upper - lower) / 2
-        panels.append((f"Half of the {coverage.level:.0%} interval [dB]", half, WIDTH_COLORS))
+        panels.append((f"Half of the {100 * coverage.level:g} % interval [dB]", half, WIDTH_COLORS))
     rows, columns = coverage.z.shape
     side_by_side = len(panels) == 1 or columns < 2 * rows
     size = np.array([7.0, float(np.clip(5.6 * rows / columns, 2.5, 9.0)) + 0.9])
@@ -201,11 +210,19 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     south, north = coverage.y[0] - half, coverage.y[-1] + half
     finite = np.where(np.isfinite(values), values, np.nan)
     low, high = _range(finite)
+    label = f"{label}\ncolours: {low:.3g} to {high:.3g} (2 to 98 % of the cells); values outside have the end colour"
     axes.set_facecolor(LINE)
     image = axes.imshow(
         finite, extent=(west, east, south, north), origin="lower", cmap=colors, vmin=low, vmax=high,
         interpolation="nearest", zorder=1,
     )  # fmt: skip
+    if coverage.no_path.any():
+        # Two points per cell, so that the hatched area ends near the edges of cells.
+        cells = np.kron(coverage.no_path, np.ones((2, 2)))
+        ends = [
+            (middle[:, None] + np.array([-half, half]) / 2).ravel() for middle in (coverage.x, coverage.y)
+        ]
+        axes.contourf(*ends, cells, levels=[0.5, 1.5], colors="none", hatches=["////"], zorder=2)
     for loop in footprints(coverage.triangles, west, south, east, north):
         axes.add_patch(PathPatch(Outline(np.vstack([loop, loop[:1]])), fill=False, ec=INK, lw=0.5, zorder=2))
     axes.plot(*coverage.tx[:2], "^", ms=10, mfc=ORANGE, mec=PAPER, mew=1.2, zorder=4, clip_on=False)
@@ -220,17 +237,17 @@ def _panel(axes: Axes, coverage: CoverageMap, values: NDArray[np.float64], label
     if isinstance(figure, Figure):
         bar = figure.colorbar(image, ax=axes, label=label, shrink=0.8, extend="both")
         bar.outline.set_edgecolor(FAINT)  # pyright: ignore[reportCallIssue]
-    if np.isnan(finite).any():
-        axes.annotate(
-            "grey: no path", (1, 1.01), xycoords="axes fraction", ha="right", color=FAINT, fontsize=8
-        )
+    hatched = "hatched: no path, log-distance model" if coverage.no_path.any() else ""
+    blank = "grey: no prediction, inside a building or at the transmitter" if np.isnan(finite).any() else ""
+    if key := "\n".join(filter(None, (hatched, blank))):
+        axes.annotate(key, (1, 1.01), xycoords="axes fraction", ha="right", color=FAINT, fontsize=8)
 
 
 def _range(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Ends of the colour scale: the 1 % and 99 % quantiles, at least 1 dB apart."""
+    """Ends of the colour scale: the 2 % and 98 % quantiles, at least 1 dB apart."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0
-    low, high = np.quantile(finite, [0.01, 0.99])
+    low, high = np.quantile(finite, QUANTILES)
     middle, half = (low + high) / 2, max((high - low) / 2, 0.5)
     return float(middle - half), float(middle + half)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,9 @@ INSIDE: Final = "inside a building"
 
 CLEARANCE: Final = 0.05
 """Height above an antenna from which a surface counts as above it [m]."""
+
+PAIRS: Final = 5_000_000
+"""Triangles times points that are compared at a time; each pair takes some 100 bytes."""
 
 POSITION_COLUMNS: Final = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z")
 """Columns of a table of links with the positions of both ends [m]."""
@@ -37,10 +41,7 @@ def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
     triangles, links = read_triangles(setup.scene), setup.links
     if not len(triangles.face):
         return np.full(len(links), "")
-    indoors = False
-    if set(POSITION_COLUMNS) <= set(result.links):
-        measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)
-        indoors = bool(np.mean(locate(triangles, measured[:, 3:]) == INSIDE) > 0.5)
+    indoors = is_indoors(result, triangles)
     by_end = []
     for end, points in (("transmitter", links.tx), ("receiver", links.rx)):
         locations = locate(triangles, points).tolist()
@@ -52,6 +53,22 @@ def remarks(result: Record, setup: Setup) -> NDArray[np.str_]:
         )
     joined = [", ".join(filter(None, ends)) for ends in zip(*by_end, strict=True)]
     return np.array(joined, dtype=np.str_)
+
+
+def is_indoors(result: Record, triangles: Triangles) -> bool:
+    """Whether most calibrated receivers are inside a building.
+
+    Args:
+        result: The calibration.
+        triangles: Its scene.
+
+    Returns:
+        True if they are; False if their positions are unknown.
+    """
+    if not set(POSITION_COLUMNS) <= set(result.links):
+        return False
+    receivers = result.links[list(POSITION_COLUMNS[3:])].to_numpy(float)
+    return bool(np.mean(locate(triangles, receivers) == INSIDE) > 0.5)
 
 
 def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_]:
@@ -67,41 +84,53 @@ def locate(triangles: Triangles, points: NDArray[np.float64]) -> NDArray[np.str_
     Returns:
         The location of every point [n], one of `BEYOND`, `UNDER` and `INSIDE`; empty in the open.
     """
+    if not len(triangles.face):
+        return np.full(len(points), "")
+    # Sorted by x.
     unique, inverse = np.unique(points, axis=0, return_inverse=True)
     corners = triangles.corners
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    scene_low, scene_high = low.min(axis=0), high.max(axis=0)
-    location = np.full(len(unique), "", dtype="<U20")
-    for index, point in enumerate(unique):
-        if (point[:2] < scene_low[:2]).any() or (point[:2] > scene_high[:2]).any():
-            location[index] = BEYOND
-            continue
-        near = ((low[:, :2] <= point[:2]) & (point[:2] <= high[:, :2])).all(axis=1)
-        crossed, height = _crossed_triangles(corners[near], point)
-        ground = triangles.ground[near][crossed]
-        above = height > point[2] + CLEARANCE
-        if (ground.any() and above[ground].all()) or point[2] < scene_low[2] - CLEARANCE:
-            location[index] = UNDER
-        elif np.count_nonzero(above & ~ground) % 2:
-            location[index] = INSIDE
+    scene_low, scene_high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    over_building, ground, ground_below = (np.zeros(len(unique), dtype=int) for _ in range(3))
+    for batch, point, height in _crossed_triangles(corners, unique):
+        above = height > unique[point, 2] + CLEARANCE
+        is_ground = triangles.ground[batch]
+        np.add.at(over_building, point, above & ~is_ground)
+        np.add.at(ground, point, is_ground)
+        np.add.at(ground_below, point, is_ground & ~above)
+    beyond = ((unique[:, :2] < scene_low[:2]) | (unique[:, :2] > scene_high[:2])).any(axis=1)
+    under = ((ground > 0) & (ground_below == 0)) | (unique[:, 2] < scene_low[2] - CLEARANCE)
+    location = np.select([beyond, under, over_building % 2 == 1], [BEYOND, UNDER, INSIDE], "")
     return location[inverse.reshape(-1)]
 
 
 def _crossed_triangles(
-    corners: NDArray[np.float64], point: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Indices of the triangles that a vertical line through a point crosses, and the heights [m]."""
-    origin, side_u, side_v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = side_u[:, 0] * side_v[:, 1] - side_u[:, 1] * side_v[:, 0]
-    not_vertical = np.flatnonzero(np.abs(area) > 1e-12)
-    origin, side_u, side_v, area = (
-        origin[not_vertical], side_u[not_vertical], side_v[not_vertical], area[not_vertical],
-    )  # fmt: skip
-    # The line is moved by a fraction of a micrometre: through an edge shared by two triangles it would cross both.
-    east, north = (point[:2] + np.array([3.1e-7, 1.7e-7]) - origin[:, :2]).T
-    # Barycentric coordinates of the line in the plane z = 0.
-    u = (east * side_v[:, 1] - north * side_v[:, 0]) / area
-    v = (north * side_u[:, 0] - east * side_u[:, 1]) / area
-    crossed = (u >= 0) & (v >= 0) & (u + v < 1)
-    height = origin[:, 2] + u * side_u[:, 2] + v * side_v[:, 2]
-    return not_vertical[crossed], height[crossed]
+    corners: NDArray[np.float64], points: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
+    """Triangles that vertical lines through points cross, in batches: triangle, point and height [m] of each crossing.
+
+    The points [n, 3] are sorted by x.
+    """
+    # The lines are moved by a fraction of a micrometre: through an edge shared by two triangles they would cross both.
+    x, y = points[:, 0] + 3.1e-7, points[:, 1] + 1.7e-7
+    low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
+    first = np.searchsorted(x, low[:, 0], "left")
+    count = np.searchsorted(x, high[:, 0], "right") - first
+    batch = np.cumsum(count) // PAIRS
+    for members in np.split(np.arange(len(corners)), np.flatnonzero(np.diff(batch)) + 1):
+        triangle = np.repeat(members, count[members])
+        start = np.cumsum(count[members]) - count[members]
+        point = np.arange(len(triangle)) + np.repeat(first[members] - start, count[members])
+        near = (low[triangle, 1] <= y[point]) & (y[point] <= high[triangle, 1])
+        triangle, point = triangle[near], point[near]
+        origin = corners[triangle, 0]
+        side_u, side_v = corners[triangle, 1] - origin, corners[triangle, 2] - origin
+        area = side_u[:, 0] * side_v[:, 1] - side_u[:, 1] * side_v[:, 0]
+        vertical = np.abs(area) <= 1e-12
+        area = np.where(vertical, 1.0, area)
+        east, north = x[point] - origin[:, 0], y[point] - origin[:, 1]
+        # Barycentric coordinates of the line in the plane z = 0.
+        u = (east * side_v[:, 1] - north * side_v[:, 0]) / area
+        v = (north * side_u[:, 0] - east * side_u[:, 1]) / area
+        crossed = (u >= 0) & (v >= 0) & (u + v < 1) & ~vertical
+        height = origin[:, 2] + u * side_u[:, 2] + v * side_v[:, 2]
+        yield triangle[crossed], point[crossed], height[crossed]

@@ -13,6 +13,7 @@ from scipy.special import stdtrit
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.measurements import Measurements, SourceTable
+from calibray.prediction.fallback import fill_missing, without_scene
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
@@ -44,14 +45,14 @@ def predict(
         allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
-        Path loss with nuisances [links], [dB]; +inf for a link without a path.
+        Path loss with nuisances [links], [dB]; that of the fallback for a link that no path reaches.
 
     Raises:
         InputError: A column is missing, a position cannot be used, a group has no calibrated offset, or a file of the
             scene or an antenna changed since the calibration.
     """
     setup = open_for_links(result, as_links(result, links), allow_changed_inputs=allow_changed_inputs)
-    return _path_loss(result, setup, progress)
+    return interval(result, setup, None, progress)["path_loss_db"].to_numpy()
 
 
 def predict_interval(
@@ -75,9 +76,10 @@ def predict_interval(
         allow_changed_inputs: Predict although a file of the scene or an antenna changed since the calibration.
 
     Returns:
-        One row per link: path_loss_db, lower_db, upper_db [dB] and basis, the source of the interval. Without a path,
-        path loss is infinite and the interval missing. If the study measured another quantity, the three follow in
-        it. The last column is a remark on ends beyond the scene, under the ground or inside a building.
+        One row per link: path_loss_db, lower_db, upper_db [dB] and basis, the source of the interval. Where no path
+        leads, basis begins with "no path", and the log-distance model predicts. If the study measured another quantity,
+        the three follow in it. The last column is a remark on ends beyond the scene, under the ground or inside a
+        building.
 
     Raises:
         InputError: What `predict` refuses except unknown groups, the level is not between 0 and 1, or the
@@ -154,14 +156,17 @@ def interval(
         progress: Called with the stage "tracing" after every launch.
 
     Returns:
-        One row per link: path_loss_db and, with a level, lower_db, upper_db and basis.
+        One row per link: path_loss_db and basis and, with a level, lower_db and upper_db.
 
     Raises:
         InputError: The level is not between 0 and 1, or the calibration had too few links to estimate the size of
             residuals.
     """
     if level is None:
-        return pd.DataFrame({"path_loss_db": _path_loss(result, setup, progress)})
+        path_loss_db = _path_loss(result, setup, progress)
+        basis = np.full(len(path_loss_db), str(result.prediction.model.name), dtype=object)
+        table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
+        return fill_missing(result.prediction, result.study, setup.links, table)
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
@@ -193,16 +198,17 @@ def interval(
     link_basis = np.where(
         known_share > NEAR_SHARE, np.char.add(link_basis, ", near measured links"), link_basis
     )
-    half_width = np.where(np.isfinite(best), factor * total_db, np.nan)
+    half_width = factor * total_db
     best = best + field_db
-    return pd.DataFrame(
+    table = pd.DataFrame(
         {
             "path_loss_db": best,
             "lower_db": best - half_width,
             "upper_db": best + half_width,
-            "basis": np.where(np.isfinite(best), link_basis, "no path"),
+            "basis": link_basis.astype(object),
         }
     )
+    return fill_missing(result.prediction, result.study, links, table, level, half_width)
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
@@ -270,9 +276,7 @@ def _modelled(
     """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
     prediction, links, names = result.prediction, setup.links, setup.parameters.names
     if prediction.model.parameters is None:
-        # The log-distance model consists of nuisances, apart from the free-space rise over carriers.
-        carrier = result.study.scene.frequency if links.frequency is None else links.frequency
-        return 20 * np.log10(np.full((1, len(links)), carrier) / result.study.scene.frequency)
+        return without_scene(result.study, links)[None]
     values = np.array([[prediction.model.parameters[name] for name in names]])
     if draws:
         values = np.vstack([values, np.stack([draws[name] for name in names], axis=1)])

@@ -90,9 +90,10 @@ def diagnostics_table(result: Record) -> Table:
 
 def _calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
     """The calibration links with a path, and their residuals [dB]."""
-    residuals = residual(result.links)
-    mask = np.isfinite(residuals) & ~result.links["held_out"].to_numpy(bool)
-    return result.links[mask], residuals[mask]
+    residuals, links = residual(result.links), result.links
+    used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
+    mask = used & np.isfinite(residuals) & ~links["held_out"].to_numpy(bool)
+    return links[mask], residuals[mask]
 
 
 def _ends(links: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

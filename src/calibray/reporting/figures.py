@@ -171,8 +171,9 @@ def residual_over_distance(survey: Survey) -> Figure:
     figure, axes = residual_figure("Distance [m]")
     residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (
-        (~held_out, BLUE, "o", "calibration links"),
-        (held_out, ORANGE, "^", "held out"),
+        (~held_out & survey.has_path, BLUE, "o", "calibration links"),
+        (held_out & survey.has_path, ORANGE, "^", "held out"),
+        (~survey.has_path, FAINT, "s", "no path: log-distance model"),
     ):
         shown = mask & np.isfinite(residuals)
         if shown.any():
@@ -196,7 +197,7 @@ def residual_by_group(survey: Survey) -> Figure:
     Returns:
         The figure: quartiles as a box, the median as a line, and whiskers that contain 90 % of the links.
     """
-    frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db}).dropna()
+    frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db})[survey.has_path].dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])
     figure, axes = plain_figure("Calibrated - measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))

@@ -37,8 +37,13 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured path loss [L], [dB]; NaN without a path."""
+        """Predicted minus measured path loss [L], [dB]; NaN without a prediction."""
         return residual(self.table)
+
+    @property
+    def has_path(self) -> NDArray[np.bool_]:
+        """Whether a path leads to a link [L]; otherwise the log-distance model predicts it."""
+        return self.table["has_path"].to_numpy(bool)
 
 
 def residual(table: pd.DataFrame) -> NDArray[np.float64]:
@@ -48,7 +53,7 @@ def residual(table: pd.DataFrame) -> NDArray[np.float64]:
         table: A result's links.
 
     Returns:
-        Residuals [L], [dB]; NaN for links without a path.
+        Residuals [L], [dB]; those of the fallback for links without a path, NaN without a prediction.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
     return np.where(np.isfinite(difference), difference, np.nan)

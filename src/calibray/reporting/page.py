@@ -264,9 +264,10 @@ def _worst(result: Record, links: Survey | None) -> Table:
         numbers("Row"),
         *([Column("group")] if grouped else []),
         numbers("measured", "dB"),
-        numbers("calibrated", "dB"),
+        numbers("predicted", "dB"),
         numbers("residual", "dB"),
         Column("held out"),
+        Column("path"),
     )
     residuals = residual(result.links)
     order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]
@@ -274,8 +275,9 @@ def _worst(result: Record, links: Survey | None) -> Table:
     for link in order[np.isfinite(residuals[order])]:
         row = result.links.iloc[int(link)]
         group = [str(links.group[link])] if links is not None and links.group is not None else []
-        cells = (f"{row['measured_db']:.1f}", f"{row['after_db']:.1f}", f"{residuals[link]:+.1f}")
-        rows.append((str(row["row"]), *group, *cells, "yes" if row["held_out"] else "no"))
+        cells = (f"{row['measured_db']:.1f}", f"{row['predicted_db']:.1f}", f"{residuals[link]:+.1f}")
+        marks = ("yes" if row[name] else "no" for name in ("held_out", "has_path"))
+        rows.append((str(row["row"]), *group, *cells, *marks))
     return Table("", columns, tuple(rows))
 
 
@@ -287,7 +289,7 @@ def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
     moving, fixed = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
     count = len(residuals)
     position = layout.project(moving).round(1).tolist()
-    color, held_out = ramp(residuals, limit), links.table["held_out"].to_numpy(bool)
+    color, held_out, lost = ramp(residuals, limit), links.table["held_out"].to_numpy(bool), ~links.has_path
     # The largest residuals are drawn last, on top.
     order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
     return {
@@ -296,7 +298,10 @@ def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
         "limit": f"{limit:g}",
         "ramp": ", ".join(RAMP),
         "ends": ("receivers", "transmitters") if by_rx else ("transmitters", "receivers"),
-        "links": [(*position[link], color[link], bool(held_out[link])) for link in order],
+        "links": [
+            (*position[link], color[link], "lost" if lost[link] else "held" if held_out[link] else "")
+            for link in order
+        ],
         "masts": np.unique(layout.project(fixed).round(1), axis=0).tolist(),
         "bar": layout.bar * layout.scale,
     }
@@ -340,9 +345,10 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
             "group": [] if links.group is None else [index[name] for name in links.group],
             **{
                 name: _rounded(links.table[f"{name}_db"].to_numpy(float))
-                for name in ("measured", "before", "after")
+                for name in ("measured", "before", "predicted")
             },
             "held": links.table["held_out"].astype(int).tolist(),
+            "lost": (~links.has_path).astype(int).tolist(),
             "color": ramp(residuals, ramp_limit(residuals)),
         },
         "groups": names,

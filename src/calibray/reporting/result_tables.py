@@ -86,6 +86,8 @@ def links(result: Record) -> Table:
     treatment = (
         f"counted with a path loss of {result.study.objective.ceiling_db:g} dB" if censored else "left out"
     )
+    if not censored and result.prediction.fallback is not None:
+        treatment += ", predicted by the log-distance model"
     rows = [
         *((cause, str(number), "") for cause, number in result.provenance.rows.items()),
         ("calibration links", str(count["calibrated_on"]), ""),

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
+
+NO_PATH: Final = "no path"
+"""Beginning of the column `basis` of predictions where no path leads."""
 
 
 @dataclass(frozen=True)

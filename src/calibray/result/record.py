@@ -126,11 +126,13 @@ class Prediction:
         model: The model: the one that held-out links choose, or the calibrated one if no links were held out.
         materials: All materials of the scene at its carrier with the model's parameters; None if it uses no scene.
         residual_field: The correlated part of its residuals; None where they are uncorrelated.
+        fallback: The model for links that no path reaches; None if the model uses no scene.
     """
 
     model: PredictionModel
     materials: dict[str, Material] | None
     residual_field: ResidualField | None = None
+    fallback: PredictionModel | None = None
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ class Record:
         cost: RT calls, replays and time.
         provenance: The inputs of the calibration.
         links: One row per link: row in the source file, path loss measured, before, after, of the log-distance model,
-            of the prediction model (predicted) and of its scene alone [dB],
+            of the prediction model (predicted; of its fallback without a path) and of its scene alone [dB],
             has_path, held_out, change on tracing again [dB]; positions tx_x to rx_z [m]; where they apply: group,
             frequency [Hz], path loss with the nuisances alone [dB], the values in the
             measured quantity, leverage, depth, and whether the link is censored or expected near the noise floor.

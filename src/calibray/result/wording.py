@@ -179,8 +179,8 @@ def _unreached_links(values: dict[str, Any]) -> str:
     trials = zip(values["switches"], values["reached"], strict=True)
     reached = ", ".join(f"{switch} reaches {count:.0f}" for switch, count in trials)
     text = (
-        f"{values['links']:,} of {values['of']:,} links have no path. They count in no RMSE, and nothing is fitted to "
-        "them."
+        f"{values['links']:,} of {values['of']:,} links have no path. They count in no RMSE, and no material is fitted "
+        "to them."
     )
     if max(values["reached"], default=0.0) == 0:
         return f"{text} No setting of [trace] reaches any of {values['sample']} that were tried: check their positions."
@@ -293,7 +293,12 @@ def prediction_text(record: Record) -> str:
         )
     terms = [term.name for term in model.terms]
     added = f" and the fitted {', '.join(terms)}" if terms else ""
-    return f"Predictions, maps and exports use the model {str(model.name)!r}: {source}{added}."
+    fallback = record.prediction.fallback
+    text = f"Predictions, maps and exports use the model {str(model.name)!r}: {source}{added}."
+    if fallback is None:
+        return text
+    error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
+    return f"{text} Where no path leads, predictions use the log-distance model{error}, and are marked."
 
 
 def scene_alone_text(record: Record) -> str:

@@ -103,29 +103,42 @@ def fit_prediction_model(
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
-        _fitted_terms(objective, modelled, setup.study),
+        fitted_terms(objective, modelled, setup.study),
         residuals.rms_db,
         residuals.basis,
         residuals.links,
-        _quantiles(np.sort(np.abs(residuals.errors_db))),
+        quantiles(np.sort(np.abs(residuals.errors_db))),
     )
     materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
 
 
-def _quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
-    """All absolute errors, or quantiles of them where there are many, ascending."""
+def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:
+    """Absolute errors as they are stored with a model.
+
+    Args:
+        absolute_errors: The errors, ascending [n], [dB].
+
+    Returns:
+        All of them, or `MOST_ERRORS` quantiles of them where there are more, ascending.
+    """
     if len(absolute_errors) > MOST_ERRORS:
         absolute_errors = np.quantile(absolute_errors, (np.arange(MOST_ERRORS) + 0.5) / MOST_ERRORS)
     return tuple(absolute_errors.tolist())
 
 
-def _fitted_terms(
+def fitted_terms(
     objective: Objective, path_loss_db: NDArray[np.float64], study: Study
 ) -> tuple[FittedTerm, ...]:
-    """Nuisance terms with the coefficients that fit best to a path loss without nuisance [links], [dB].
+    """Nuisance terms with the coefficients that fit best.
 
-    Groups whose coefficient no link determines are left out.
+    Args:
+        objective: The objective, which has the terms.
+        path_loss_db: Modelled path loss without nuisance [links], [dB].
+        study: The study.
+
+    Returns:
+        The terms. Groups whose coefficient no link determines are left out.
     """
     coefficients = objective.coefficients(path_loss_db[None])[0]
     terms, first = [], 0

@@ -19,10 +19,11 @@
   };
   // Adding 0 removes the sign of a negative zero.
   const fixed = (value) => (Math.round(10 * value) / 10 + 0).toFixed(1);
-  const decibel = (value) => (value === null ? "no path" : `${fixed(value)} dB`);
-  const signed = (value) => (value === null ? "no path" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
+  const decibel = (value) => (value === null ? "none" : `${fixed(value)} dB`);
+  const signed = (value) => (value === null ? "none" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
   const links = data.links, count = links.row.length;
-  const residual = links.after.map((after, i) => (after === null ? null : after - links.measured[i]));
+  const residual = links.predicted.map((predicted, i) => (predicted === null ? null : predicted - links.measured[i]));
+  const marks = (i) => (links.held[i] ? ", held out" : "") + (links.lost[i] ? ", no path: log-distance model" : "");
   const tx = decode(data.solid.tx, Uint16Array), rx = decode(data.solid.rx, Uint16Array);
   // The end with more positions represents the link: receivers, or transmitters if there are more of these.
   const places = (ends) => new Set(Array.from({ length: count }, (_, i) => ends.slice(3 * i, 3 * i + 3).join())).size;
@@ -79,7 +80,7 @@
     const size = (i) => (residual[i] === null ? Infinity : Math.abs(residual[i]));
     if (order.value === "residual") index.sort((a, b) => size(b) - size(a));
     list.replaceChildren(...index.map((i) => {
-      const option = make("option", `${title(i)}: ${signed(residual[i])}${links.held[i] ? ", held out" : ""}`);
+      const option = make("option", `${title(i)}: ${signed(residual[i])}${marks(i)}`);
       option.value = i;
       return option;
     }));
@@ -89,16 +90,16 @@
     const end = (which) => metres(which, i).map(fixed).join(", ");
     const facts = [
       ["measured", decibel(links.measured[i])], ["before calibration", decibel(links.before[i])],
-      ["calibrated", decibel(links.after[i])], ["calibrated − measured", signed(residual[i])],
-      ["held out", links.held[i] ? "yes" : "no"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
+      ["predicted", decibel(links.predicted[i])], ["predicted − measured", signed(residual[i])],
+      ["held out", links.held[i] ? "yes" : "no"], ["basis", links.lost[i] ? "no path: log-distance model" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
     ];
     const box = byId("facts");
     box.replaceChildren();
     make("h3", title(i), box);
     const terms = make("dl", undefined, box);
     for (const [name, value] of facts) { make("dt", name, terms); make("dd", value, terms); }
-    byId("map-text").textContent = `${title(i)}: measured ${decibel(links.measured[i])}, calibrated ${decibel(links.after[i])}, ` +
-      `residual ${signed(residual[i])}${links.held[i] ? ", held out" : ""}.`;
+    byId("map-text").textContent = `${title(i)}: measured ${decibel(links.measured[i])}, predicted ${decibel(links.predicted[i])}, ` +
+      `residual ${signed(residual[i])}${marks(i)}.`;
   };
   const tabulate = () => {
     const body = byId("paths");
