@@ -77,7 +77,9 @@ def test_run_prints_the_result(folder, ran):
     assert lines[0] == "study.toml: method auto, engine replay, seed 3"
     assert cells["calibration links"][-1] == "9"
     assert cells["held out"][-1] == "2"
-    assert cells["without a path"][-5:] == ["1", "row", f"{LOST_ROW},", "left", "out"]
+    assert " ".join(cells["without a path"]).endswith(
+        f"1 row {LOST_ROW}, left out, predicted by the log-distance model"
+    )
     assert f"row {LOST_ROW}: check the positions" in next(line for line in lines if "receiver inside" in line)
     for name, value in result.parameters.items():
         assert cells[name][2] == f"{value:.4g}"
@@ -186,12 +188,15 @@ def test_predict_adds_a_column_to_the_table(folder, ran, tmp_path):
     outcome = run("predict", folder / "out", tmp_path / "new.csv")
     assert outcome.exit_code == 0, outcome.output
     predicted = pd.read_csv(io.StringIO(outcome.stdout))
-    assert predicted.columns.tolist() == [*table.columns, "path_loss_db"]
+    assert predicted.columns.tolist() == [*table.columns, "path_loss_db", "basis"]
     pd.testing.assert_frame_equal(predicted[table.columns], table)
-    expected = Result.load(folder / "out").links.after_db
+    expected = Result.load(folder / "out").links.predicted_db
     assert predicted.path_loss_db.to_numpy() == pytest.approx(expected.to_numpy(), abs=1e-3)
     lost = f"1 of 12 links, row {LOST_ROW}\n"
-    assert outcome.stderr == f"Warning: no path leads to {lost}Warning: receiver inside a building: {lost}"
+    assert outcome.stderr == (
+        f"Warning: no path leads to {lost}Warning: receiver inside a building: {lost}"
+        "The log-distance model predicts the links without a path; see the column basis\n"
+    )
 
 
 @pytest.mark.parametrize("name", ["out.csv", "out.parquet"])

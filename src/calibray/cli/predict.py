@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 PREDICTIONS: Final = ("path_loss_db", "lower_db", "upper_db")
 """Columns that `predict` adds, those after the first only with --level. Other measured quantities add more."""
 
+UNREACHED: Final = "no path leads to"
+"""The warning about links without a path."""
+
 TEXTS: Final = ("basis", "remark")
 """Text columns that are added, the remark only with --level."""
 
@@ -97,8 +100,10 @@ def predict(
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))
                 _collect_warnings(warnings, links.row, predictions)
-    for warning in sorted(warnings, key=lambda text: (not text.startswith("no path"), text)):
-        _warn(warning, warnings[warning], table.rows)
+    for warning in sorted(warnings, key=lambda text: (text != UNREACHED, text)):
+        _warn(warning if warning == UNREACHED else f"{warning}:", warnings[warning], table.rows)
+    if UNREACHED in warnings and result.prediction.fallback is not None:
+        echo("The log-distance model predicts the links without a path; see the column basis", err=True)
 
 
 @contextmanager
@@ -123,10 +128,9 @@ def _collect_warnings(
     from calibray.result.prediction_model import NO_PATH
 
     rows: dict[str, list[int]] = {}
-    bases = predictions["basis"].where(predictions["basis"].str.startswith(NO_PATH), "").tolist()
-    for number, basis, remarks in zip(row.tolist(), bases, predictions["remark"].tolist(), strict=True):
-        if basis:
-            rows.setdefault(basis, []).append(number)
+    if len(unreached := row[predictions["basis"].str.startswith(NO_PATH).to_numpy(bool)]):
+        rows[UNREACHED] = unreached.tolist()
+    for number, remarks in zip(row.tolist(), predictions["remark"].tolist(), strict=True):
         for remark in filter(None, remarks.split(", ")):
             rows.setdefault(remark, []).append(number)
     for warning, numbers in rows.items():
@@ -138,7 +142,7 @@ def _warn(warning: str, rows: Sequence[int], count: int) -> None:
     from calibray.tables.text import rows_text
 
     if rows:
-        echo(f"Warning: {warning}: {len(rows)} of {count} links, {rows_text(rows)}", err=True)
+        echo(f"Warning: {warning} {len(rows)} of {count} links, {rows_text(rows)}", err=True)
 
 
 def _renamed_columns(file: Path, frame: pd.DataFrame, columns: tuple[str, ...]) -> dict[str, str]:
