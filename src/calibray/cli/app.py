@@ -40,15 +40,7 @@ class Commands(TyperGroup):
     """Commands that report expected failures by a message and an exit status, without a traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse overlong and empty arguments, then parse.
-
-        Args:
-            ctx: Context of the command.
-            args: The command line.
-
-        Returns:
-            The remaining arguments.
-        """
+        """Refuse overlong and empty arguments, then parse."""
         for argument in args:
             if len(argument) > LONGEST:
                 ctx.fail(f"an argument has {len(argument)} characters, but the most is {LONGEST}")
@@ -58,13 +50,7 @@ class Commands(TyperGroup):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command.
-
-        Args:
-            ctx: Context of the command, with the parsed command line.
-
-        Returns:
-            The value that the command returns.
+        """Run the command, and turn errors into exit statuses.
 
         Raises:
             typer.Exit: 2 on bad input; 1 when an engine failed or a file could not be read or written; 130 on Ctrl-C.

@@ -24,13 +24,7 @@ def log() -> Console:
 
 
 def echo(text: str, err: bool = False, nl: bool = True) -> None:
-    """Print text, with control characters escaped: names in it come from files and must not steer the terminal.
-
-    Args:
-        text: The text, of several lines if need be.
-        err: Print to stderr.
-        nl: Whether to end with a line break.
-    """
+    """Print text, with control characters escaped: names in it come from files and must not steer the terminal."""
     from calibray.support.messages import printable
 
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)

@@ -52,14 +52,7 @@ def ledger(
 
 
 def calls_table(frame: pd.DataFrame) -> Table:
-    """The RT calls of a ledger.
-
-    Args:
-        frame: A ledger's table, without the columns of links.
-
-    Returns:
-        One row per call; the last column is the first line of its message.
-    """
+    """The RT calls of a ledger, one row per call; the last column is the first line of its message."""
     from pandas.api.types import is_numeric_dtype
 
     from calibray.tables import Column, Table, numbers

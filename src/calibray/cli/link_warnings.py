@@ -15,10 +15,6 @@ if TYPE_CHECKING:
 def warn(study: Study, links: Measurements) -> None:
     """Print warnings about suspicious links to stderr.
 
-    Args:
-        study: The study.
-        links: Its links.
-
     Raises:
         InputError: The links are far from the scene, or the scene cannot be read.
     """

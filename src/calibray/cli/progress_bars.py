@@ -24,14 +24,9 @@ STARTING: Final = "starting"
 
 @contextmanager
 def progress_bars(console: Console, every: float | None = None) -> Iterator[Progress]:
-    """Show progress by stage: bars on a terminal, else lines.
+    """Show progress by stage: bars on a terminal, else lines, at least `every` seconds apart.
 
-    Args:
-        console: The console.
-        every: Time between two lines [s]; `LINE_INTERVAL` if None.
-
-    Yields:
-        A function of the stage, the amount done and the total (None if unknown).
+    Yields a function of the stage, the amount done and the total (None if unknown).
     """
     display = _bars(console) if console.is_terminal else _lines(console, every or LINE_INTERVAL)
     with display as report, interruption.ensure_interruption():
@@ -115,16 +110,7 @@ def _lines(console: Console, every: float) -> Iterator[Progress]:
 
 
 def line(stage: str, done: int, total: int | None, seconds: float) -> str:
-    """Progress as one line of text.
-
-    Args:
-        stage: The stage.
-        done: The amount done.
-        total: The total amount; None if unknown.
-        seconds: Time since the stage began [s].
-
-    Returns:
-        Stage, share, rate, time and remaining time, as far as they are known.
+    """Stage, share, rate, time and remaining time as one line, as far as they are known.
 
     Example:
         >>> line("tracing", 30, 120, 15.0)

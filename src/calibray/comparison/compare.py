@@ -99,14 +99,7 @@ def compare(
 
 
 def parse_methods(names: Sequence[str], budget: int) -> tuple[BudgetedMethod, ...]:
-    """Parse methods with their budgets; duplicates are left out.
-
-    Args:
-        names: Methods, each with the common budget or another one as in "gwo@600".
-        budget: The common budget [RT calls].
-
-    Returns:
-        The methods.
+    """Parse methods, as in "gwo@600", or with the common budget; duplicates are left out.
 
     Raises:
         InputError: The list is empty, a method is unknown, or a budget is invalid.

@@ -53,14 +53,9 @@ class Comparison:
     found_by: str
 
     def excess(self, name: str, calls: int) -> NDArray[np.float64]:
-        """Excess of a method's runs after a number of RT calls; a run that ended earlier keeps its last value.
+        """Excess [seeds], [dB], after a number of RT calls; a run that ended earlier keeps its last value.
 
-        Args:
-            name: The method.
-            calls: Number of RT calls.
-
-        Returns:
-            Excess [seeds], [dB]; +inf before the first evaluation.
+        It is +inf before the first evaluation.
         """
         return np.array([run.at(calls) for run in self.runs[name]]) - self.optimum
 
@@ -76,10 +71,9 @@ class Comparison:
     def table(self) -> pd.DataFrame:
         """One row per method: excesses after some RT calls, and RT calls to some excesses.
 
-        Returns:
-            Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to
-            an excess over all runs (empty if half of them or more never reached it) and how many reached it; failed
-            runs; median seconds per run.
+        Median, quartiles and worst excess after 30, 60 and 225 RT calls and at the end; the median RT calls to an
+        excess over all runs (empty if half of them or more never reached it) and how many reached it; failed runs;
+        median seconds per run.
         """
         return pd.DataFrame([self._row(method) for method in self.methods])
 
@@ -90,11 +84,7 @@ class Comparison:
         ]
 
     def history(self) -> pd.DataFrame:
-        """Every improvement of every run, and its end.
-
-        Returns:
-            Columns method, seed, call, best_db, failure; one row per improvement, and one for the last RT call.
-        """
+        """Every improvement of every run, and its last RT call: columns method, seed, call, best_db, failure."""
         parts = [
             pd.DataFrame(
                 {
@@ -143,14 +133,7 @@ class Comparison:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """A quantile of values that may be infinite.
-
-    Args:
-        values: Numbers [n], some of them +inf.
-        share: Between 0 and 1.
-
-    Returns:
-        Linear interpolation between order statistics; +inf if an infinite one takes part.
+    """A quantile of values [n], by linear interpolation; +inf if an infinite order statistic takes part.
 
     Example:
         >>> import numpy as np
@@ -164,14 +147,7 @@ def quantile(values: NDArray[np.float64], share: float) -> float:
 
 
 def table(comparison: Comparison) -> Table:
-    """The table of a comparison.
-
-    Args:
-        comparison: The comparison.
-
-    Returns:
-        One row per method: median excesses, and RT calls to an excess with the number of runs that reached it.
-    """
+    """One row per method: median excesses, and RT calls to an excess with the number of runs that reached it."""
     records = comparison.table().to_dict("records")
     rows = tuple(_cells({str(key): value for key, value in record.items()}) for record in records)
     return Table("", COLUMNS, rows)

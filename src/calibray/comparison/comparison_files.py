@@ -20,12 +20,7 @@ FLOOR_DB: Final = 1e-4
 
 
 def write(comparison: Comparison, folder: Path) -> None:
-    """Write a comparison's tables and figure.
-
-    Args:
-        comparison: The comparison.
-        folder: An existing folder.
-    """
+    """Write a comparison's tables and figure into an existing folder."""
     write_table(folder / FILES[0], comparison.table())
     write_table(folder / FILES[1], comparison.history())
     write_figure(figure(comparison), folder / FILES[2])
@@ -33,14 +28,7 @@ def write(comparison: Comparison, folder: Path) -> None:
 
 @styled()
 def figure(comparison: Comparison) -> Figure:
-    """Excess over RT calls: the median of each method and the band between its quartiles.
-
-    Args:
-        comparison: The comparison.
-
-    Returns:
-        The figure.
-    """
+    """Excess over RT calls: the median of each method and the band between its quartiles."""
     drawing, axes = plain_figure("RT calls", "Excess RMSE [dB]", width=8.0)
     last = max(method.budget for method in comparison.methods)
     colors = iter(PALETTE * (1 + len(comparison.methods) // len(PALETTE)))

@@ -36,15 +36,9 @@ CHEAP_DEPTH: Final = 2
 
 
 def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = None) -> Demo:
-    """Run the experiment.
+    """Run the experiment on "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
 
-    Args:
-        engine: "replay" (trace once) or "retrace" (trace for every RT call, as in the paper).
-        seed: Seed of the methods.
-        progress: Called with every stage, which begins with the name of the method.
-
-    Returns:
-        The experiment.
+    `progress` is called with every stage, which begins with the name of the method.
 
     Raises:
         InputError: The engine or the seed is invalid.
@@ -77,12 +71,7 @@ def run_demo(engine: str = "replay", seed: int = 0, progress: Progress | None = 
 def write_demo(demo: Demo, out: Path) -> Path:
     """Write the experiment: its record, figures, a folder for each method, and the report of `auto`.
 
-    Args:
-        demo: The experiment.
-        out: Folder to write into; created if needed.
-
-    Returns:
-        The report, an HTML file.
+    Returns the report, an HTML file.
     """
     out.mkdir(parents=True, exist_ok=True)
     black_box = {method: demo.results[method] for method in METHODS}

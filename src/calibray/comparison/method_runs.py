@@ -51,14 +51,7 @@ class BudgetedMethod:
 
     @staticmethod
     def parse(name: str, budget: int) -> BudgetedMethod:
-        """Parse a method with its budget.
-
-        Args:
-            name: A method, or `METHOD@CALLS` with another budget than the common one.
-            budget: The common budget [RT calls].
-
-        Returns:
-            The method.
+        """Parse a method, as in "gwo@600", or with the common budget [RT calls].
 
         Raises:
             InputError: The method is unknown, or the budget is no whole number or too small.
@@ -85,14 +78,7 @@ class BudgetedMethod:
         return self.method, self.budget, seed
 
     def optimizer(self, problem: ComparisonProblem, seed: int) -> Optimizer:
-        """Make the optimizer of a run.
-
-        Args:
-            problem: The problem.
-            seed: The run's seed.
-
-        Returns:
-            An optimizer that keeps to the budget, or stops by itself.
+        """Make the optimizer of a run, which keeps to the budget or stops by itself.
 
         Raises:
             InputError: The method does not fit the problem, or its library is not installed.
@@ -151,16 +137,7 @@ class MethodRun:
 
 
 def run_optimizer(problem: ComparisonProblem, key: RunKey, make: Callable[[], Optimizer]) -> MethodRun:
-    """Run an optimizer to its end.
-
-    Args:
-        problem: The problem.
-        key: Key of the run.
-        make: Makes the optimizer.
-
-    Returns:
-        The run; an error ends it and its message is recorded.
-    """
+    """Run an optimizer to its end; an error ends it and its message is recorded."""
     calls: list[int] = []
     best: list[float] = []
     evaluations, failure, started = 0, "", time.perf_counter()
@@ -227,11 +204,7 @@ class RunFile:
 def code_fingerprint(method: str | None = None) -> str:
     """Digest of the code of the optimizers; runs of different code are not comparable.
 
-    Args:
-        method: Digest only the module of this method and all optimizer modules that it imports; None for all methods.
-
-    Returns:
-        The first digits of a SHA-256 in hexadecimal.
+    With a method, only its module and all optimizer modules that it imports are digested.
     """
     folder = Path(optimizers.__file__).parent
     files = set(folder.rglob("*.py")) if method is None else set()

@@ -54,13 +54,7 @@ class ComparisonProblem:
 
 
 def study_problem(path: str | Path) -> ComparisonProblem:
-    """Make a problem of a study on its stored paths, which are traced if they are not in the cache.
-
-    Args:
-        path: The study file.
-
-    Returns:
-        The problem.
+    """Make a problem of a study file on its stored paths, which are traced if they are not in the cache.
 
     Raises:
         InputError: The study cannot be used, or its engine is an external program.

@@ -93,15 +93,8 @@ def compress(
 ) -> Compressed:
     """Compress a program for given parameters within their bounds, for path loss by the sum of powers.
 
-    Args:
-        paths: The path program.
-        parameters: The parameters that vary, and their bounds.
-        tolerance_db: Largest error of a link's path loss [dB].
-        seed: Seed of the candidates.
-        progress: Called with "compressing", links done and all links.
-
-    Returns:
-        The compressed program and its error.
+    The largest error of a link's path loss is `tolerance_db` [dB]. `progress` is called with "compressing", links done
+    and all links. Returns the compressed program and its error.
 
     Raises:
         InputError: The tolerance is not a positive number, or a parameter's material is not in the paths.
@@ -161,9 +154,8 @@ def _evaluate_all(
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], float]:
     """Evaluate the whole program.
 
-    Returns:
-        Power of every link at each set of candidates [n, L]; share of every path in its link's power, summed over the
-        ranking candidates [P]; largest error of a tabulated coefficient.
+    Power of every link at each set of candidates [n, L]; share of every path in its link's power, summed over the
+    ranking candidates [P]; largest error of a tabulated coefficient.
     """
     plan = layout(paths, np.float32, intervals, phases=False)
     totals, errors = [], []
@@ -244,15 +236,10 @@ def _fit_link(
 def sparse_weights(
     share: NDArray[np.float64], bound: float, first: NDArray[np.int64] | None = None
 ) -> NDArray[np.float64]:
-    """Sparse weights w >= 0 with sum_p w_p share_p = 1 in every row, within a bound.
+    """Sparse weights w >= 0 [P] with sum_p w_p share_p = 1 in every row of `share` [n, P].
 
-    Args:
-        share: Share of every path in the link's power at every candidate [n, P].
-        bound: Largest residual of a row.
-        first: Paths to begin with; none if None.
-
-    Returns:
-        The weights [P], most of them 0; the bound is exceeded if non-negative weights cannot meet it.
+    Each row's residual is within the bound, unless non-negative weights cannot meet it. The search begins with the
+    paths `first`.
     """
     norm = np.linalg.norm(share, axis=0)
     unit = share / np.where(norm > 0, norm, 1.0)

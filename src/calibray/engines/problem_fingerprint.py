@@ -15,17 +15,11 @@ from calibray.tracing.cache import mesh_files
 
 
 def fingerprint(study: OpenedStudy) -> str:
-    """Fingerprint of the problem that an engine solves for each candidate.
+    """Fingerprint (SHA-256, in hexadecimal) of the problem that an engine solves for each candidate.
 
     Method, seed, measured values, bounds and start values do not count: studies that differ only in these share their
     calls. Re-tracing counts the tracer's versions. An external program's version is unknown, so its command line
     counts.
-
-    Args:
-        study: The opened study, with its engine.
-
-    Returns:
-        SHA-256 in hexadecimal.
     """
     links, parameters, radio = study.links, study.parameters, study.radio
     free = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}

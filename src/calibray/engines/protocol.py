@@ -36,13 +36,7 @@ class Engine(Protocol):
         ...
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Path loss of every link for candidates.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB]; +inf where a link has no path.
+        """Path loss [n, L], [dB], for candidates [n, d] in the fields' units; +inf where a link has no path.
 
         Raises:
             InputError: The candidates have another width, or a value is not finite or unphysical.
@@ -67,13 +61,7 @@ class Differentiable(Engine, Protocol):
     def path_loss_and_jacobian(
         self, candidates: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Path loss of every link, and its derivatives by the parameters.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-
-        Returns:
-            Path loss [n, L], [dB], and derivatives [n, L, d], [dB] per unit of the parameter.
+        """Path loss [n, L], [dB], and its derivatives by the parameters [n, L, d], [dB] per unit.
 
         Raises:
             InputError: The candidates have another width, or a value is not finite or unphysical.
@@ -98,26 +86,14 @@ class Chunked(Differentiable, Protocol):
         ...
 
     def reducing(self, reductions: Sequence[Reduction]) -> Reduced:
-        """A function that reduces every chunk's path loss on its worker, so that little data comes back.
+        """A function of candidates that reduces every chunk's path loss on its worker, so that little data comes back.
 
-        Args:
-            reductions: One for every chunk, sent to its worker once.
-
-        Returns:
-            The function of candidates in the fields' units.
+        There is one reduction for every chunk, sent to its worker once.
         """
         ...
 
     def traced_with(self, materials: Mapping[str, Material], progress: Progress | None = None) -> Chunked:
-        """The same engine on paths traced with other materials.
-
-        Args:
-            materials: Constants in place of the scene's, by material name.
-            progress: Called with "tracing" after every chunk.
-
-        Returns:
-            Another engine.
-        """
+        """The same engine on paths traced with other materials; progress is called after every chunk."""
         ...
 
 
@@ -152,15 +128,10 @@ class Answering(Engine, Protocol):
         ...
 
     def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
-        """Answer candidates, each as soon as its call ends.
+        """Answer candidates [n, d], in the fields' units, each as soon as its call ends.
 
-        Args:
-            candidates: Parameter values [n, d], in the fields' units.
-            stop: Set from outside to begin no further call, and to stop running calls where possible; answers that have
-                already arrived are still given.
-
-        Yields:
-            The answers, in the order in which they arrive.
+        After `stop` is set from outside no further call begins, and running calls are stopped where possible; answers
+        that have already arrived are still given.
 
         Raises:
             InputError: A value is unphysical.
@@ -171,15 +142,9 @@ class Answering(Engine, Protocol):
 
 
 def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> NDArray[np.float64]:
-    """Collect the path loss of a batch from its answers, in any order.
+    """Collect the path loss [n, L], [dB], of a batch of answers; +inf for all links of a candidate that failed.
 
-    Args:
-        answers: One answer per candidate.
-        shape: Number of candidates n and of links L.
-        first: Whether this is the first batch. If all of it fails, the engine itself must be at fault.
-
-    Returns:
-        Path loss [n, L], [dB]; +inf for all links of a candidate that failed.
+    If all of the first batch fails, the engine itself must be at fault.
 
     Raises:
         EngineError: Every candidate of the first batch failed.
@@ -196,14 +161,7 @@ def gather(answers: Iterable[Answer], shape: tuple[int, int], first: bool) -> ND
 
 
 def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Convert candidates to an array, and refuse those that cannot be evaluated.
-
-    Args:
-        candidates: Parameter values [n, d].
-        width: Number of parameters d.
-
-    Returns:
-        The values [n, d].
+    """Candidates [n, d] as an array; those that cannot be evaluated are refused.
 
     Raises:
         InputError: The shape differs, or a value is not finite.

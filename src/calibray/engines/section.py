@@ -141,14 +141,7 @@ class EngineSection(Section, ABC):
 
     @abstractmethod
     def answers_by(self, study: OpenedStudy) -> list[str] | None:
-        """What the answers depend on besides the study: versions or a command line, for the ledger's fingerprint.
-
-        Args:
-            study: The opened study.
-
-        Returns:
-            The texts; None if answers are not kept in a ledger.
-        """
+        """Versions or a command line, which the answers depend on; None if answers are not kept in a ledger."""
 
     @abstractmethod
     def open(
@@ -158,16 +151,9 @@ class EngineSection(Section, ABC):
         progress: Progress | None,
         workers: Workers | None,
     ) -> Engine:
-        """The engine over all links of a study.
+        """The engine over all links of a study, on `paths` if they are already traced.
 
-        Args:
-            study: The opened study.
-            paths: Paths of its links, if they are already traced.
-            progress: Called as the work proceeds.
-            workers: Run the calls of a batch if the kind is `external`; keep chunks of links if it is `chunked`.
-
-        Returns:
-            The engine.
+        Workers run the calls of a batch if the kind is `external`, and keep chunks of links if it is `chunked`.
 
         Raises:
             InputError: The study does not suit this kind of engine.

@@ -46,70 +46,33 @@ _COSINE: Final = (
 
 
 def multiply(a: Pair, b: Pair) -> Pair:
-    """Product of two complex numbers.
-
-    Args:
-        a: First factor, (real, imaginary) [...].
-        b: Second factor [...].
-
-    Returns:
-        The product [...].
-    """
+    """Product of two complex numbers, each (real, imaginary) [...]."""
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
 def divide(a: Pair, b: Pair) -> Pair:
-    """Quotient of two complex numbers.
-
-    Args:
-        a: Dividend, (real, imaginary) [...].
-        b: Divisor [...].
-
-    Returns:
-        The quotient [...].
-    """
+    """Quotient of two complex numbers, each (real, imaginary) [...]."""
     inverse = 1 / (b[0] * b[0] + b[1] * b[1])
     return (a[0] * b[0] + a[1] * b[1]) * inverse, (a[1] * b[0] - a[0] * b[1]) * inverse
 
 
 def squared_magnitude(value: Pair) -> jax.Array:
-    """Squared magnitude of a complex number.
-
-    Args:
-        value: (real, imaginary) [...].
-
-    Returns:
-        The squared magnitude [...].
-    """
+    """Squared magnitude [...] of a complex number, (real, imaginary) [...]."""
     return value[0] * value[0] + value[1] * value[1]
 
 
 def safe_sqrt(value: jax.Array) -> jax.Array:
-    """Square root whose derivative at 0 is 0 instead of infinity.
-
-    Args:
-        value: At least 0 [...].
-
-    Returns:
-        The root [...].
-    """
+    """Square root of numbers >= 0 [...], whose derivative at 0 is 0 instead of infinity."""
     positive = value > 0
     # The inner selection keeps the infinite derivative out of the branch that is not taken.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
 def materialize(values: Values, positive: jax.Array) -> Values:
-    """The same values, computed once and stored.
+    """The same values, computed once and stored; `positive` is any positive number known at run time only.
 
     XLA on CPU fuses a computation into each of its uses, so it repeats sines and exponentials many times over; it also
     drops `optimization_barrier`. It cannot fuse across a branch on a value that is unknown when it compiles.
-
-    Args:
-        values: Arrays.
-        positive: Any positive number that is known at run time only.
-
-    Returns:
-        The values.
     """
     return jax.lax.cond(
         positive > 0, lambda kept: kept, lambda kept: jax.tree.map(jnp.negative, kept), values
@@ -118,17 +81,11 @@ def materialize(values: Values, positive: jax.Array) -> Values:
 
 @jax.custom_jvp
 def cosine_and_sine(angle: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    """Cosine and sine of many angles at once.
+    """Cosine and sine of many angles [...], [rad], at once.
 
     In double precision, XLA on CPU calls the system's functions for one number after the other, some 30 ns for both.
-    The same polynomials without a branch are vectorized and take 2 ns.
-
-    Args:
-        angle: Angles [...], [rad].
-
-    Returns:
-        Cosine and sine [...], each within 2.3e-16 of the true value; beyond a million turns within the effect of the
-        angle's own rounding.
+    The same polynomials without a branch are vectorized and take 2 ns. Each result is within 2.3e-16 of the true value;
+    beyond a million turns within the effect of the angle's own rounding.
     """
     angle_as_given = jnp.asarray(angle)
     angle = angle_as_given.astype(jnp.float64)

@@ -77,17 +77,7 @@ def _statistics(
 def statistics(
     program: GroupedProgram, power: jax.Array, departure: jax.Array, arrival: jax.Array
 ) -> ChannelStatistics:
-    """Statistics of every link from its paths' powers.
-
-    Args:
-        program: The program.
-        power: Power gain of every path [P].
-        departure: Azimuth of departure of every path [P], [rad].
-        arrival: Azimuth of arrival of every path [P], [rad].
-
-    Returns:
-        The statistics.
-    """
+    """Statistics of every link from the powers of its paths [P] and their azimuths [P], [rad]."""
     link, delay = program.phases
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=program.num_links)
     link_power = total(power)
@@ -145,16 +135,7 @@ def power_delay_profile(
 
 
 def delay_profile(program: GroupedProgram, power: jax.Array, edges: jax.Array) -> jax.Array:
-    """Power of every link by delay, from its paths' powers.
-
-    Args:
-        program: The program.
-        power: Power gain of every path [P].
-        edges: Edges of the delay bins, increasing [n + 1], [s].
-
-    Returns:
-        Power gains [L, n].
-    """
+    """Power gains of every link by delay [L, n], from path powers [P] and increasing bin edges [n + 1], [s]."""
     link, delay = program.phases
     num_bins = edges.shape[0] - 1
     index = jnp.searchsorted(edges, delay, side="right") - 1

@@ -105,13 +105,9 @@ class CoefficientTables:
 def coefficient_arguments(
     paths: Paths,
 ) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.float64]]:
-    """Material, mode and cosine of incidence of every coefficient of a path program.
+    """Material, mode and cosine of incidence of every coefficient of a path program [J] each.
 
-    Args:
-        paths: The path program.
-
-    Returns:
-        The three arrays (each [J]), first of all interactions, then of the n-faces of diffracting wedges.
+    First those of all interactions, then those of the n-faces of diffracting wedges.
     """
     wedge = np.flatnonzero(paths.kind == Kind.DIFFRACTION)
     kind, material = (np.concatenate([column, column[wedge]]) for column in (paths.kind, paths.material))
@@ -122,15 +118,7 @@ def coefficient_arguments(
 
 
 def spacing_roots(table: NDArray[np.float64], wavelength: float) -> NDArray[np.int64]:
-    """The root of the cosine in which the nodes of each material are evenly spaced.
-
-    Args:
-        table: Material constants [M, 8].
-        wavelength: [m].
-
-    Returns:
-        6 for metals, else 2 [M].
-    """
+    """The root of the cosine, 6 for metals and else 2 [M], in which each material's nodes are evenly spaced."""
     loss = loss_term(jnp.asarray(table[:, FIELD_COLUMN["conductivity"]]), jnp.asarray(wavelength))
     return np.where(np.asarray(loss) > _METAL_LOSS, 6, 2)
 
@@ -144,19 +132,10 @@ def table_layout(
     intervals: Intervals,
     dtype: type,
 ) -> TableLayout:
-    """Find the position of every coefficient in the tables.
+    """Find the position of every coefficient [J] in the tables, with `spacing_roots` `root` [M].
 
-    Args:
-        material: Material of every coefficient [J].
-        mode: Its mode [J].
-        cosine: Its cosine of incidence [J].
-        root: `spacing_roots` [M].
-        steps: Coefficients at each step of each group, of any shape; J where there is none, whose coefficient is 1.
-        intervals: Intervals of the rows.
-        dtype: Precision of the fractions.
-
-    Returns:
-        The positions.
+    `steps` are the coefficients at each step of each group, of any shape; J where there is none, whose coefficient is
+    1.
     """
     rows, row = np.unique(material.astype(np.int64) * len(Mode) + mode, return_inverse=True)
     row = row.reshape(-1)
@@ -183,16 +162,7 @@ def table_layout(
 
 
 def fill_tables(layout: TableLayout, table: jax.Array, wavelength: jax.Array) -> CoefficientTables:
-    """Compute the coefficients at all nodes.
-
-    Args:
-        layout: The layout of the tables.
-        table: Material constants [M, 8].
-        wavelength: [m].
-
-    Returns:
-        The tables.
-    """
+    """Compute the coefficients at all nodes, of materials with constants [M, 8] at a wavelength [m]."""
     te, tm = coefficients_of_materials(
         layout.cosine,
         table,
@@ -219,15 +189,10 @@ def _cubics(value: jax.Array) -> jax.Array:
 
 
 def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array) -> tuple[Pair, Pair]:
-    """Look coefficients up.
+    """Transverse electric and magnetic coefficients (real, imaginary) [...], looked up.
 
-    Args:
-        tables: The tables.
-        cell: Node below, counted over all rows [...].
-        fraction: Distance from that node in units of the interval [...].
-
-    Returns:
-        Transverse electric and magnetic coefficients, (real, imaginary) [...].
+    `cell` is the node below, counted over all rows [...], `fraction` the distance from it in units of the interval
+    [...].
     """
 
     def value(part: int) -> jax.Array:
@@ -238,18 +203,11 @@ def interpolate(tables: CoefficientTables, cell: jax.Array, fraction: jax.Array)
 
 
 def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
-    """Upper bound of the interpolation error of any coefficient.
+    """Upper bound of the interpolation error of any coefficient's real or imaginary part [1].
 
     Every node is compared with the cubic through the nodes one and three steps away, which has twice the step. The
     error of cubics falls with the fourth power of the step, so the tables' error is a sixteenth of the largest gap. The
     bound is twice that.
-
-    Args:
-        tables: The tables.
-        layout: Their layout.
-
-    Returns:
-        Largest absolute error of a coefficient's real or imaginary part [1].
     """
     value = tables.values[:, :4]
 
@@ -262,15 +220,10 @@ def table_error(tables: CoefficientTables, layout: TableLayout) -> jax.Array:
 
 @jax_settings()
 def table_intervals(paths: Paths, tables: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
-    """Number of intervals that each row of the tables needs.
+    """Number of intervals by material and mode [M, 3] for coefficients with an error within `tolerance` [1].
 
-    Args:
-        paths: The path program.
-        tables: Material constants of candidates that represent all others [n, M, 8].
-        tolerance: Largest error of a tabulated coefficient [1].
-
-    Returns:
-        Intervals by material and mode [M, 3], powers of two up to `FINEST`; 0 where there is no such row.
+    They are powers of two up to `FINEST`; 0 where there is no such row. The constants `tables` [n, M, 8] are those of
+    candidates that represent all others.
     """
     material, mode, _ = coefficient_arguments(paths)
     needed = np.zeros((tables.shape[1], len(Mode)), dtype=np.int64)

@@ -41,16 +41,9 @@ class Combining:
         delay: NDArray[np.float64],
         bandwidth: float | None = None,
     ) -> Combining:
-        """Check a way of combining and prepare it for some paths.
+        """Check a way of combining, "power", "coherent" or "band" with a bandwidth [Hz], and prepare it for paths.
 
-        Args:
-            kind: "power", "coherent" or "band".
-            link: Link of every path, non-decreasing [P].
-            delay: Delay of every path [P], [s].
-            bandwidth: Bandwidth [Hz], for "band".
-
-        Returns:
-            The way of combining.
+        Links of the paths [P] do not decrease; delays are [P], [s].
 
         Raises:
             InputError: The kind is unknown, or the bandwidth is missing or not positive.
@@ -86,13 +79,9 @@ def _band_nodes(
 
 
 def path_power(gain: Pair) -> jax.Array:
-    """Power gain of every path, summed over receive ports and averaged over transmit ports.
+    """Power gain of every path [P], summed over receive ports and averaged over transmit ports.
 
-    Args:
-        gain: Path gains, real and imaginary part [R, T, P].
-
-    Returns:
-        Power gains [P].
+    Path gains are [R, T, P], real and imaginary part.
     """
     return squared_magnitude(gain).sum(axis=(0, 1)) / gain[0].shape[1]
 
@@ -105,20 +94,9 @@ def link_power(
     frequency: jax.Array | float,
     combining: Combining = POWER,
 ) -> jax.Array:
-    """Power gain of every link from its path gains.
+    """Power gain of every link [L] from its path gains [R, T, P]; 0 where a link has no path.
 
     With several ports the power is summed over receive ports and averaged over transmit ports.
-
-    Args:
-        gain: Path gains, real and imaginary part [R, T, P].
-        link: Link of every path [P].
-        delay: Delay of every path [P], [s].
-        num_links: Number of links L.
-        frequency: Carrier frequency [Hz].
-        combining: How the paths combine.
-
-    Returns:
-        Power gain [L]; 0 where a link has no path.
     """
     total = partial(jax.ops.segment_sum, segment_ids=link, num_segments=num_links)
     if combining.kind == "power":
@@ -147,18 +125,6 @@ def path_loss_of_gains(
     frequency: float,
     combining: Combining = POWER,
 ) -> NDArray[np.float64]:
-    """Path loss of every link from complex path gains.
-
-    Args:
-        gain: Path gains [P, R, T].
-        link: Link of every path [P].
-        delay: Delay of every path [P], [s].
-        num_links: Number of links L.
-        frequency: Carrier frequency [Hz].
-        combining: How the paths combine.
-
-    Returns:
-        Path loss [L], [dB]; +inf where a link has no path.
-    """
+    """Path loss of every link [L], [dB], from complex path gains [P, R, T]; +inf where a link has no path."""
     real, imaginary = (jnp.asarray(np.moveaxis(part, 0, -1)) for part in (gain.real, gain.imag))
     return np.asarray(decibel(link_power((real, imaginary), link, delay, num_links, frequency, combining)))

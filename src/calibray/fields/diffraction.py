@@ -16,16 +16,7 @@ from calibray.paths import Diffraction
 
 
 def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) -> NDArray[np.complex128]:
-    """The matrices C_0 .. C_4 of diffractions, in the edge-fixed frames.
-
-    Args:
-        table: Geometry of the diffractions.
-        row: Rows of the table to evaluate [n].
-        frequency: Carrier frequency [Hz].
-
-    Returns:
-        Complex matrices [5, 2, 2, n].
-    """
+    """The matrices C_0 .. C_4 of diffractions in the edge-fixed frames [5, 2, 2, n], for rows [n] of a table."""
     exterior, phi_in, phi_out = table.exterior_angle[row], table.azimuth_in[row], table.azimuth_out[row]
     wavenumber = 2 * np.pi * frequency / speed_of_light
     n = exterior / np.pi
@@ -57,11 +48,7 @@ def affine_form(table: Diffraction, row: NDArray[np.int64], frequency: float) ->
 def transition(x: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Transition function F(x) = 2 j sqrt(x) e^{jx} int_{sqrt x}^inf e^{-j u^2} du (Kouyoumjian and Pathak, eq. 27).
 
-    Args:
-        x: Argument, at least 0 [...].
-
-    Returns:
-        Complex values [...].
+    Its argument is at least 0 [...].
     """
     root = np.sqrt(x)
     return 2j * root * np.exp(1j * x) * modfresnelm(root)[0]

@@ -97,17 +97,9 @@ def path_loss(
 
 @jax_settings()
 def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Combining = POWER) -> jax.Array:
-    """Path loss of every link of a program, as one pure function.
+    """Path loss of every link [L], [dB], for material constants [M, 8], as one pure function.
 
-    To differentiate or compile it, do so within `calibray.fields.jax_settings`.
-
-    Args:
-        program: The program.
-        table: Material constants [M, 8].
-        combining: How the paths combine.
-
-    Returns:
-        Path loss [L], [dB]; +inf where a link has no path.
+    It is +inf where a link has no path. To differentiate or compile it, do so within `calibray.fields.jax_settings`.
     """
     response = materialize(material_response(program, table), program.wavelength)
     return decibel(_power(program, split_by_step(program, response), combining))
@@ -115,14 +107,9 @@ def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Comb
 
 @jax_settings()
 def path_powers(program: GroupedProgram, table: ArrayLike) -> jax.Array:
-    """Power gain of every path, summed over receive ports and averaged over transmit ports, as one pure function.
+    """Power gain of every path [P], in the order of the program, for material constants [M, 8].
 
-    Args:
-        program: The program.
-        table: Material constants [M, 8].
-
-    Returns:
-        Power gains in the order of the program [P].
+    It is summed over receive ports and averaged over transmit ports, as one pure function.
     """
     return _path_powers(program, _split_by_step(program, _material_response(program, jnp.asarray(table))))
 
@@ -134,17 +121,11 @@ def path_losses(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], float]:
-    """Path loss of every link for a batch of candidates.
+    """Path loss [count, L], [dB], of a batch of candidates with material constants [n, M, 8].
 
-    Args:
-        program: The program.
-        tables: Material constants [n, M, 8].
-        combining: How the paths combine.
-        count: Number of candidates to evaluate, from the first on; all by default. A function is compiled for the
-            number of tables, so that a partly filled batch saves a compilation.
-
-    Returns:
-        Path loss [count, L], [dB], +inf where a link has no path; and the largest error of a tabulated coefficient.
+    It is +inf where a link has no path. Returned too is the largest error of a tabulated coefficient. The first `count`
+    candidates are evaluated. A function is compiled for the number of tables, so that a partly filled batch saves a
+    compilation.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):
@@ -172,18 +153,10 @@ def path_losses_and_slopes(
     combining: Combining = POWER,
     count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
-    """Path loss of every link for a batch of candidates, and its derivatives by the materials' constants.
+    """Path loss as by `path_losses`, and its derivatives [count, L, M, columns], [dB] per unit.
 
-    Args:
-        program: The program.
-        tables: Material constants [n, M, 8].
-        columns: Columns of the tables to differentiate by.
-        combining: How the paths combine.
-        count: Number of candidates to evaluate, as for `path_losses`.
-
-    Returns:
-        Path loss [count, L], [dB], its derivatives [count, L, M, columns], [dB] per unit, 0 where a link has no path;
-        and the largest error of a tabulated coefficient.
+    The derivatives, by the materials' constants in `columns` of the tables, are 0 where a link has no path. Returned
+    third is the largest error of a tabulated coefficient.
     """
     count = len(tables) if count is None else count
     if isinstance(program.coefficients, FormulaArguments):

@@ -49,14 +49,7 @@ class PathGroup:
 
 
 def exact_groups(paths: Paths) -> list[PathGroup]:
-    """Group paths with the same sequence of interactions.
-
-    Args:
-        paths: The path program.
-
-    Returns:
-        The groups; none has a run.
-    """
+    """Group paths with the same sequence of interactions; no group has a run."""
     number = _numbers(paths)
     groups = []
     for members in _equal(_sequence_codes(paths, number)):
@@ -70,12 +63,8 @@ def exact_groups(paths: Paths) -> list[PathGroup]:
 def padded_groups(paths: Paths) -> list[PathGroup]:
     """Group paths that agree once each run of reflections and transmissions is counted as one interaction.
 
-    Args:
-        paths: The path program.
-
-    Returns:
-        The groups. Within a group, the path with the most reflections and transmissions comes first; a run is as long
-        as the longest one of its paths.
+    Within a group, the path with the most reflections and transmissions comes first; a run is as long as the longest
+    one of its paths.
     """
     number, interaction = _numbers(paths), np.arange(paths.num_interactions)
     path = np.repeat(np.arange(paths.num_paths), np.diff(paths.first))

@@ -49,15 +49,7 @@ class MaterialResponse:
 
 
 def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResponse:
-    """Response of the materials.
-
-    Args:
-        program: The program.
-        table: Material constants [M, 8].
-
-    Returns:
-        The response.
-    """
+    """Response of the materials with the constants `table` [M, 8]."""
     source = program.coefficients
     if isinstance(source, FormulaArguments):
         coefficients = coefficients_of_materials(
@@ -98,16 +90,7 @@ def material_response(program: GroupedProgram, table: jax.Array) -> MaterialResp
 def response_and_derivatives(
     program: GroupedProgram, table: jax.Array, columns: tuple[int, ...]
 ) -> tuple[MaterialResponse, tuple[MaterialResponse, ...]]:
-    """Response of the materials, and its derivatives by a constant of each interaction's own material.
-
-    Args:
-        program: The program.
-        table: Material constants [M, 8].
-        columns: Columns of the table to differentiate by.
-
-    Returns:
-        The response, and its derivatives by each column.
-    """
+    """Response of the materials, and its derivatives by the `columns` of each interaction's own material."""
     response, push = jax.linearize(partial(material_response, program), table)
     permittivity, conductivity = FIELD_COLUMN["relative_permittivity"], FIELD_COLUMN["conductivity"]
     derivatives = {
@@ -144,17 +127,10 @@ def _by_conductivity(program: GroupedProgram, by_permittivity: MaterialResponse)
 def split_by_step(
     program: GroupedProgram, response: MaterialResponse, blank: float = 1.0
 ) -> tuple[GroupResponse, ...]:
-    """The response cut into what each step of each group takes.
+    """The response, or its derivatives, cut into what each step of each group takes, group by group.
 
     Reverse passes differentiate by these parts. By the flat arrays, every part would cost a pass over all of them.
-
-    Args:
-        program: The program.
-        response: The response, or its derivatives.
-        blank: Value of a coefficient at empty positions: 1, or 0 for derivatives.
-
-    Returns:
-        The parts, group by group.
+    `blank` is the value of a coefficient at empty positions: 1, or 0 for derivatives.
     """
     groups, row = [], 0
     step_coefficients = _coefficients_by_step(program, response, blank)

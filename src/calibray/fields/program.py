@@ -216,17 +216,11 @@ def layout(
     intervals: Intervals | None = None,
     phases: bool = True,
 ) -> Layout:
-    """Lay a path program out for evaluation.
+    """Lay a path program out for evaluation, in a precision, on JAX's default device.
 
-    Args:
-        paths: The path program.
-        dtype: Precision of the constants, `numpy.float64` or `numpy.float32`.
-        intervals: Tabulate the coefficients over the angle of incidence with this number of intervals, one for all or
-            by material and mode [M, 3]; None evaluates the slab formula at every interaction.
-        phases: Keep links and delays of the paths. Only sums of powers can be computed without.
-
-    Returns:
-        The grouped program, on JAX's default device.
+    With `intervals`, one for all or by material and mode [M, 3], the coefficients are tabulated over the angle of
+    incidence; None evaluates the slab formula at every interaction. With `phases`, links and delays of the paths are
+    kept. Only sums of powers can be computed without.
     """
     padded = intervals is None or paths.num_interactions <= PADDED
     path_groups = padded_groups(paths) if padded else exact_groups(paths)

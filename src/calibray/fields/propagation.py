@@ -29,15 +29,9 @@ def path_fields(
     responses: tuple[GroupResponse, ...],
     keep: Keep = lambda values: values,
 ) -> Pair:
-    """Gains of all paths.
+    """Gains of all paths in the order of the groups, real and imaginary part [R, T, P].
 
-    Args:
-        program: The program.
-        responses: Response of the materials at every step of every group.
-        keep: Applied to the field after every interaction.
-
-    Returns:
-        Gains in the order of the groups, real and imaginary part [R, T, P].
+    `keep` is applied to the field after every interaction.
     """
     gains = [
         _group_gains(group, response, keep) for group, response in zip(program.groups, responses, strict=True)

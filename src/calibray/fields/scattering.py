@@ -22,19 +22,10 @@ def pattern_value(
     cos_backward: jax.Array,
     patterns: tuple[str, ...],
 ) -> jax.Array:
-    """Density f_s of the diffusely reflected power over directions.
+    """Density f_s [n], [1/sr], of the diffusely reflected power over directions.
 
-    Args:
-        table: Material constants [M, 8].
-        material: Material of every interaction [n].
-        cosine: Cosine of the angle of incidence [n].
-        cos_scattered: Cosine between scattered direction and normal [n].
-        cos_specular: Cosine between scattered and specular direction [n].
-        cos_backward: Cosine between scattered direction and the direction back to the source [n].
-        patterns: Pattern of every material, by name.
-
-    Returns:
-        f_s [n], [1/sr].
+    The cosines [n] are those of the angle of incidence, and between the scattered direction and the normal, the
+    specular direction and the direction back to the source.
     """
     lambertian = cos_scattered / jnp.pi
     if all(pattern == "lambertian" for pattern in patterns):

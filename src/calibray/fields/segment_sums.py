@@ -38,15 +38,7 @@ class Segments:
 
 
 def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
-    """Order numbers for summation.
-
-    Args:
-        segment: Segment of every number [n].
-        count: Number of segments.
-
-    Returns:
-        The segments; the order depends on `segment` only.
-    """
+    """Order numbers for summation by their segments [n]; the order depends on `segment` only."""
     size = np.bincount(segment, minlength=count)
     if not (size >= BLOCK).any():
         return Segments(None, jnp.asarray(segment.astype(np.int32)), 0, count)
@@ -60,15 +52,7 @@ def make_segments(segment: NDArray[np.integer], count: int) -> Segments:
 
 
 def segment_sums(segments: Segments, values: jax.Array) -> jax.Array:
-    """Sum of the numbers of every segment.
-
-    Args:
-        segments: The segments.
-        values: The numbers [n].
-
-    Returns:
-        The sums [count]; 0 for a segment without numbers.
-    """
+    """Sum of the numbers [n] of every segment [count]; 0 for a segment without numbers."""
     if segments.order is not None:
         end = segments.blocks * BLOCK
         blocks = values.at[segments.order[:end]].get(mode="promise_in_bounds").reshape(-1, BLOCK).sum(axis=1)

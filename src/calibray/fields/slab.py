@@ -31,15 +31,7 @@ class Mode(IntEnum):
 
 
 def loss_term(conductivity: jax.Array, wavelength: jax.Array) -> jax.Array:
-    """Negative imaginary part of the complex relative permittivity.
-
-    Args:
-        conductivity: [S/m].
-        wavelength: [m].
-
-    Returns:
-        The term [1].
-    """
+    """Negative imaginary part of the complex relative permittivity [1], of a conductivity [S/m]."""
     # ITU-R P.2040-3 eq. 9: eta'' = sigma / (2 pi f eps_0), f = c / lambda.
     return conductivity * wavelength / (2 * jnp.pi * speed_of_light * epsilon_0)
 
@@ -52,19 +44,11 @@ def coefficients(
     wavelength: jax.Array,
     transmitted: jax.Array | bool,
 ) -> tuple[Pair, Pair]:
-    """Transverse electric and magnetic coefficient of reflection or transmission.
+    """Transverse electric and magnetic coefficient of reflection, or of transmission where `transmitted` [...].
 
-    Args:
-        cosine: Cosine of the angle of incidence [...].
-        permittivity: Relative permittivity eps_r [...].
-        loss: `loss_term` [...].
-        thickness: Thickness d [...], [m].
-        wavelength: [m].
-        transmitted: True for the transmission coefficient, False for the reflection coefficient [...].
-
-    Returns:
-        The two coefficients, each as (real, imaginary) [...], in the precision of the cosine. They are computed in
-        double precision: the fourth power of a metal's permittivity exceeds the range of single precision.
+    The permittivity is relative, `loss` is `loss_term`, the thickness in [m]. Each coefficient is (real, imaginary)
+    [...], in the precision of the cosine. They are computed in double precision: the fourth power of a metal's
+    permittivity exceeds the range of single precision.
     """
     precision = cosine.dtype
     cosine, permittivity, loss, thickness, wavelength = (
@@ -102,18 +86,9 @@ def coefficients_of_materials(
     transmitted: jax.Array | bool,
     unreduced: jax.Array,
 ) -> tuple[Pair, Pair]:
-    """Coefficients from a table of materials; reflection is reduced by the energy that is scattered.
+    """Coefficients [...] from constants of materials [M, 8]; reflection is reduced by the energy that is scattered.
 
-    Args:
-        cosine: Cosine of the angle of incidence [...].
-        table: Material constants [M, 8].
-        material: Material of each coefficient [...].
-        wavelength: [m].
-        transmitted: True for the transmission coefficient [...].
-        unreduced: True where the coefficient is not reduced [...].
-
-    Returns:
-        Transverse electric and magnetic coefficients, (real, imaginary) [...].
+    It is not reduced where `unreduced` [...].
     """
     column = {name: table[:, index] for name, index in FIELD_COLUMN.items()}
     te, tm = coefficients(

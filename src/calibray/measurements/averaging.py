@@ -29,21 +29,13 @@ _AREA: Final = "calibray area"
 
 
 def average_samples(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
-    """Average the samples of one area, transmitter and group.
+    """Average the samples of one area, transmitter and group; the table itself without averaging.
 
     A sample below the noise floor has a power between zero and the floor, and counts as half of the floor. Averages
-    that this leaves uncertain by more than `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor
-    alone would be the strong ones.
-
-    Args:
-        table: The samples; a value at the noise floor means at or below it.
-        steps: The steps; `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used here.
-        columns: The columns of the positions [m] and of the values [dB] or [dBm].
-
-    Returns:
-        For each average the row of its first sample, with the mean receiver position, the mean value, and the columns
-        `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count` (number of samples). The
-        table itself without averaging.
+    that this leaves uncertain by more than `MAX_UNCERTAINTY_DB` are left out, because the samples above the floor alone
+    would be the strong ones. Of the steps, `averaging`, `keep`, `transmitter` and `noise_floor_dbm` are used. Returns
+    for each average the row of its first sample, with the mean receiver position, the mean value, and the columns
+    `std_db` (standard deviation of the samples [dB], NaN for one sample) and `count`.
 
     Raises:
         InputError: A column is missing or not numeric, a time cannot be read, or no average remains.

@@ -11,13 +11,7 @@ from calibray.measurements.source_table import Coordinates, SourceTable
 def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
     """Leave out or move receivers that stand inside buildings, seen from above.
 
-    Args:
-        table: The rows.
-        steps: The steps; `inside` and `outside` are used here.
-        rx: Columns of receiver positions [m].
-
-    Returns:
-        The rows that remain, with positions outside; the table itself without these steps.
+    Of the steps, `inside` and `outside` are used; the table itself is returned without them.
 
     Raises:
         InputError: No row remains.

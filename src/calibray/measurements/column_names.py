@@ -86,12 +86,6 @@ class ValueColumn:
 def words(name: object) -> frozenset[str]:
     """Words of a column's name, in lower case; a word in camel case counts as a whole and in parts.
 
-    Args:
-        name: The name.
-
-    Returns:
-        Its words.
-
     Example:
         >>> sorted(words("Rx_X [m]"))
         ['m', 'rx', 'x']
@@ -107,13 +101,6 @@ def words(name: object) -> frozenset[str]:
 
 def matches(name: object, *rows: str) -> bool:
     """Whether a word of a column's name is a spelling in one of some rows of `PATTERNS`.
-
-    Args:
-        name: The name.
-        rows: The rows.
-
-    Returns:
-        Whether one matches.
 
     Example:
         >>> matches("RSRP [dBm]", "received power"), matches("RSRP [dBm]", "x", "y")
@@ -134,13 +121,7 @@ def numeric_columns(frame: pd.DataFrame) -> list[str]:
 def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) -> PositionColumns | None:
     """Find the columns of one end's position; metres are preferred to degrees.
 
-    Args:
-        frame: The table.
-        end: The end.
-        unnamed: Whether columns that name neither end may be this end's.
-
-    Returns:
-        The columns, or None.
+    With `unnamed`, columns that name neither end may be this end's.
 
     Example:
         >>> find_position(pd.DataFrame({"time": [0], "lat": [50.0], "lon": [10.0]}), "rx", unnamed=True)
@@ -168,16 +149,10 @@ def find_transmitter_height(frame: pd.DataFrame) -> str | None:
 
 
 def find_value(table: SourceTable) -> ValueColumn:
-    """Find the column of measured values.
+    """Find the column of measured values, and its quantity.
 
     Names with a decibel unit come first, then path losses before path gains before received powers. The sign of the
     values decides between loss and gain.
-
-    Args:
-        table: The links.
-
-    Returns:
-        The column and its quantity.
 
     Raises:
         InputError: No column looks like one.
@@ -221,15 +196,10 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
 
 
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
-    """Find the columns of a wide table, one per transmitter.
+    """Find the columns of a wide table, and the transmitter of each.
 
-    Args:
-        frame: The table.
-        transmitters: Names of the transmitters.
-
-    Returns:
-        Transmitter by column: columns whose names differ only in the name of the transmitter, between separators. Of
-        several quantities, received power or path loss is chosen. Empty if there are fewer than two.
+    Their names differ only in the name of the transmitter, between separators. Of several quantities, received power or
+    path loss is chosen. Nothing is found if there are fewer than two.
 
     Example:
         >>> find_wide_columns(pd.DataFrame({"x": [1.0], "rss_a": [-50.0], "rss_b": [-60.0]}), ["a", "b"])
@@ -259,13 +229,6 @@ def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[
 def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -> list[str]:
     """Find columns of a wide table that are named like those of transmitters, but of none in the table of them.
 
-    Args:
-        frame: The table.
-        columns: Transmitter by column, from `find_wide_columns`.
-
-    Returns:
-        The columns.
-
     Example:
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
         >>> find_unknown_wide_columns(table, {"rss_a": "a", "rss_b": "b"})
@@ -280,13 +243,7 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
 
 
 def name_melted_values(columns: Iterable[str]) -> str:
-    """Name the column of values that the columns of a wide table become, after a word that all of them share.
-
-    Args:
-        columns: The columns, at least one.
-
-    Returns:
-        The name.
+    """Name the column of values that at least one column of a wide table becomes, after a word they share.
 
     Example:
         >>> name_melted_values(["RSS AP1", "RSS AP2"])
@@ -298,15 +255,10 @@ def name_melted_values(columns: Iterable[str]) -> str:
 
 
 def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | None:
-    """Find the column by which two tables name the transmitter.
+    """Find the column by which two tables name the transmitter, if any.
 
-    Args:
-        links: The links.
-        transmitters: One row per transmitter.
-
-    Returns:
-        The first column of both tables in which every value of the links appears once among the transmitters; else
-        the first that is named like transmitters in which some values appear, or None.
+    It is the first column of both tables in which every value of the links appears once among the transmitters; else
+    the first that is named like transmitters in which some values appear.
     """
     partial = None
     for name in transmitters:
@@ -322,13 +274,7 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 
 
 def find_transmitter_names(transmitters: pd.DataFrame) -> str:
-    """Find the column of names of a table of transmitters.
-
-    Args:
-        transmitters: One row per transmitter.
-
-    Returns:
-        The column.
+    """Find the column of names of a table of transmitters, one per row.
 
     Raises:
         InputError: No column with such a name distinguishes the transmitters.
@@ -355,14 +301,9 @@ def find_devices(frame: pd.DataFrame) -> list[str]:
 
 
 def find_frequency(frame: pd.DataFrame) -> tuple[str, np.ndarray] | None:
-    """Find the column of carriers.
+    """Find the column of carriers, and the carrier of every row [Hz], if there is one.
 
-    Args:
-        frame: The links.
-
-    Returns:
-        The column and the carrier of every row [Hz], with the unit from the column's name or else from the size of
-        its values; None if there is none.
+    The unit is that of the column's name, or else follows from the size of its values.
     """
     for name in numeric_columns(frame):
         if not matches(name, "frequency"):

@@ -33,17 +33,11 @@ _ROW: Final = re.compile(rb"""<(?:\w+:)?row\s(?:[^>]*?\s)?r=["']([^"']*)["']""")
 
 
 def sheet_text(path: Path) -> tuple[list[int], str]:
-    """Read the first sheet of a workbook as CSV.
+    """Read the first sheet of a workbook as CSV, and the sheet's number of each of its rows that is not blank.
 
-    A formula counts as its last computed value. A formula without one stays text, which no column of numbers
-    accepts. Of merged cells, the first holds the value and the others are empty.
-
-    Args:
-        path: The .xlsx file.
-
-    Returns:
-        The sheet's number of every row that is not blank, the header's first, and these rows as CSV. The columns are
-        those of the header.
+    A formula counts as its last computed value. A formula without one stays text, which no column of numbers accepts.
+    Of merged cells, the first holds the value and the others are empty. The columns are those of the header, whose row
+    comes first.
 
     Raises:
         InputError: The file is not a workbook, has no sheet of cells, is too large, or has a value in a column

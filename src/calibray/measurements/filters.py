@@ -41,14 +41,7 @@ _Item = TypeVar("_Item")
 
 
 def evaluate(expression: str, frame: pd.DataFrame) -> NDArray[np.bool_]:
-    """Evaluate a row filter.
-
-    Args:
-        expression: The filter.
-        frame: The table.
-
-    Returns:
-        Mask [rows] of the rows that pass. A row with a missing value in a comparison does not pass.
+    """Mask [rows] of the rows that pass a filter; a missing value in a comparison does not pass.
 
     Raises:
         InputError: The filter is malformed or too large, names an unknown column or something that is not allowed,

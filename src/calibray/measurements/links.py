@@ -189,13 +189,7 @@ class Measurements:
         return self.table.where(expression)
 
     def held_out(self, holdout: str) -> NDArray[np.bool_]:
-        """The mask [links] of the links that a filter holds out.
-
-        Args:
-            holdout: Filter over the source table's columns.
-
-        Returns:
-            The mask [links], true for at least one link and false for at least one.
+        """The mask [links] of the links that a filter holds out, true and false for at least one link each.
 
         Raises:
             InputError: The filter is not valid, or one of the parts would be empty.

@@ -25,16 +25,10 @@ LARGEST_LEVEL: Final = 190.0
 
 
 def find_codes(values: ArrayLike) -> tuple[float, ...]:
-    """Find the numbers that stand for a missing value.
+    """Find the numbers that stand for a missing value among values [n], [dB] or [dBm]; ascending.
 
-    A number counts as a code if it is in `CODES`, is far from all other values, and has the other sign or an
-    impossible magnitude: 100 is a code among powers, and a value among path losses.
-
-    Args:
-        values: Measured values [n], [dB] or [dBm]; NaN where missing.
-
-    Returns:
-        The codes, ascending.
+    A number counts as a code if it is in `CODES`, is far from all other values, and has the other sign or an impossible
+    magnitude: 100 is a code among powers, and a value among path losses.
 
     Example:
         >>> find_codes([-70.0, 100.0, -200.0]), find_codes([70.0, 100.0, 130.0])
@@ -66,13 +60,8 @@ def mask_codes(
 ) -> tuple[SourceTable, NDArray[np.bool_]]:
     """Set the codes in columns of measured values to missing, and note their number.
 
-    Args:
-        table: The rows.
-        columns: The columns, of one quantity; codes are judged over all of them.
-        stated: Further codes, whatever the other values are.
-
-    Returns:
-        The rows, and a mask [rows] of those in which a column had a code.
+    Codes are judged over all columns, which hold one quantity; those stated are codes whatever the other values are.
+    Returns the rows, and a mask [rows] of those in which a column had a code.
 
     Raises:
         InputError: There is no such column.

@@ -21,18 +21,10 @@ RX_COLUMNS: Final = ("rx_x", "rx_y", "rx_z")
 def place_rows(
     table: SourceTable, steps: Preparation, tx: Coordinates, rx: Coordinates
 ) -> tuple[SourceTable, Coordinates, Coordinates]:
-    """Write the positions of both ends as columns in metres.
+    """Write the positions of both ends as the columns `TX_COLUMNS` and `RX_COLUMNS` in metres.
 
-    Args:
-        table: The rows.
-        steps: The steps; `frame`, `unit_m` and `ground` are used here.
-        tx: Transmitter position: x, y, z (numbers [m], columns in `steps.unit_m`), or with a frame longitude,
-            latitude [deg] and height [m].
-        rx: Receiver position, likewise.
-
-    Returns:
-        The rows with the columns `TX_COLUMNS` and `RX_COLUMNS`, and these names; the arguments unchanged if the only
-        step is a filter.
+    A position is x, y, z (numbers [m], columns in `steps.unit_m`), or with a frame longitude, latitude [deg] and height
+    [m]. Returns the rows and the names of the columns; the arguments unchanged if the only step is a filter.
 
     Raises:
         InputError: A column is missing or not numeric, or a position is not on the globe.

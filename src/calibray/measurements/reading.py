@@ -68,15 +68,7 @@ def read_measurements(
 def measured_links(
     table: SourceTable, columns: LinkColumns, steps: Preparation | None = None
 ) -> Measurements:
-    """Turn the rows of a table into measured links.
-
-    Args:
-        table: The rows.
-        columns: The columns that describe the links.
-        steps: The steps before rows are links; none if None.
-
-    Returns:
-        The links; `prepared` counts what was left out, averaged, merged or moved.
+    """Turn the rows of a table into measured links; `prepared` counts what was left out, averaged or changed.
 
     Raises:
         InputError: A column is missing or malformed, a value is missing or implausible, a transmitter is unknown, or
@@ -120,18 +112,10 @@ def links_from_table(
     tx: Coordinates = TX_COLUMNS,
     rx: Coordinates = RX_COLUMNS,
 ) -> Measurements:
-    """Links without measured values from the rows of a file.
+    """Links without measured values, path losses NaN, from the rows of a file.
 
-    Args:
-        table: The rows.
-        group: Column of group labels, or several whose labels are joined.
-        frequency: Column of carrier frequencies [Hz]; if the table lacks it, all links have the study's carrier.
-        steps: How positions are found; none of its steps may leave out rows.
-        tx: Transmitter position, as in `LinkColumns`.
-        rx: Receiver position, likewise.
-
-    Returns:
-        The links, with path losses NaN.
+    Labels of several columns in `group` are joined. If the table lacks the column `frequency` [Hz], all links have the
+    study's carrier. No step may leave out rows.
 
     Raises:
         InputError: There are no rows, a column is missing or malformed, or a position is not finite.

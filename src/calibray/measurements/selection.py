@@ -24,17 +24,10 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     """Select the rows that become links.
 
     The steps run in the order of the code, so that a filter sees the columns of the track but not those of the
-    transmitters.
-
-    Args:
-        table: The rows of the file.
-        steps: The steps; `wide`, `track`, `where`, `missing`, `transmitters`, `noise_floor_dbm` and `censored` are
-            used here.
-        value: Column of the measured values; with `wide`, the name of the new column of values.
-
-    Returns:
-        The rows that remain, without numbers that mean a missing value (`missing_codes`). Values at or below the
-        noise floor, and missing ones, are set to the floor.
+    transmitters. Used here are `wide`, `track`, `where`, `missing`, `transmitters`, `noise_floor_dbm` and `censored`.
+    `value` is the column of the measured values; with `wide`, the name of the new one. The rows that remain have no
+    numbers that mean a missing value (`missing_codes`). Values at or below the noise floor, and missing ones, are set
+    to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -79,17 +72,10 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
 def melt(
     table: SourceTable, columns: Mapping[str, str], value: str, transmitter: str, *, keep_empty: bool = False
 ) -> SourceTable:
-    """One row per link, from a table with one column per transmitter.
+    """One row per link, those of one row together, from a table with one column per transmitter.
 
-    Args:
-        table: The table.
-        columns: Transmitter by column.
-        value: Name of the new column of values.
-        transmitter: Name of the new column of transmitters.
-        keep_empty: Whether cells without a value become links, without a value, as for prediction.
-
-    Returns:
-        The links, those of one row together.
+    `value` and `transmitter` name the new columns. With `keep_empty`, cells without a value become links, as for
+    prediction.
 
     Raises:
         InputError: A column is missing, not numeric or named like a new one, or no cell has a value.

@@ -57,14 +57,7 @@ class SourceTable:
         return replace(self, frame=self.frame.loc[mask].reset_index(drop=True), row=self.row[mask])
 
     def keep(self, mask: NDArray[np.bool_], reason: str) -> SourceTable:
-        """The rows where a mask [rows] is true; the number of other rows is noted.
-
-        Args:
-            mask: The rows to keep.
-            reason: Entry of `changes` for the rows that are left out.
-
-        Returns:
-            The rows that remain.
+        """The rows where a mask [rows] is true; the number of others is noted in `changes` under the reason.
 
         Raises:
             InputError: No row remains.
@@ -75,13 +68,7 @@ class SourceTable:
         return (self.note(reason, lost) if lost else self).select(mask)
 
     def where(self, expression: str) -> NDArray[np.bool_]:
-        """Evaluate a row filter.
-
-        Args:
-            expression: A filter over the columns (see `filters`), for instance ``"gpsmode == 4 and rx_x_m < -55"``.
-
-        Returns:
-            Mask [rows] of the rows that pass. A row with a missing value in a comparison does not pass.
+        """Mask [rows] of the rows that pass a filter (see `filters`); a missing value in a comparison does not pass.
 
         Raises:
             InputError: The expression is malformed, names an unknown column, or gives no truth value per row.
@@ -104,14 +91,7 @@ class SourceTable:
         return self.frame[name]
 
     def numbers(self, source: str | float, gaps: bool = False) -> NDArray[np.float64]:
-        """One column as finite numbers, or one number for all rows.
-
-        Args:
-            source: Name of the column, or the number.
-            gaps: Whether values may be missing; these are NaN.
-
-        Returns:
-            Values [rows].
+        """One column as finite numbers [rows], or one number for all rows; with `gaps`, missing values are NaN.
 
         Raises:
             InputError: There is no such column, or a value is missing, infinite or not a number.
@@ -145,13 +125,7 @@ class SourceTable:
         return numbers
 
     def labels(self, names: str | Sequence[str]) -> NDArray[np.str_]:
-        """One column as labels, or the labels of several columns joined by a space.
-
-        Args:
-            names: The column or columns.
-
-        Returns:
-            Labels [rows].
+        """One column as labels [rows], or the labels of several columns joined by a space.
 
         Raises:
             InputError: There is no such column, or a label is missing.
@@ -171,14 +145,7 @@ class SourceTable:
         return column.astype(str).to_numpy(dtype=np.str_)
 
     def positions(self, end: str, coordinates: Coordinates) -> NDArray[np.float64]:
-        """Positions in the scene's frame from three numbers or columns.
-
-        Args:
-            end: "tx" or "rx", for messages.
-            coordinates: x, y and z [m].
-
-        Returns:
-            Positions [rows, 3], [m].
+        """Positions [rows, 3], [m], in the scene's frame from three numbers or columns; `end` is "tx" or "rx".
 
         Raises:
             InputError: There are not three coordinates, or a column is missing, not numeric or named like degrees.

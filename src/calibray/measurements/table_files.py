@@ -30,13 +30,7 @@ LARGEST_ROW_GROUP: Final = 2**30
 
 
 def read_table(path: str | Path) -> SourceTable:
-    """Read a CSV, Parquet or Excel file.
-
-    Args:
-        path: A .csv (UTF-8, commas), .parquet or .xlsx file. Of a workbook the first sheet is read.
-
-    Returns:
-        Its rows without blank lines.
+    """Read a .csv (UTF-8, commas), .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
 
     Raises:
         InputError: The file does not exist, has another ending, is empty or malformed, or the library that reads it
@@ -80,13 +74,7 @@ class PiecedTable:
 
     @classmethod
     def open(cls, path: str | Path) -> PiecedTable:
-        """Open a CSV, Parquet or Excel file.
-
-        Args:
-            path: The file. CSV and Excel files are read immediately.
-
-        Returns:
-            The table.
+        """Open a CSV, Parquet or Excel file; CSV and Excel files are read immediately.
 
         Raises:
             InputError: As `read_table`.
@@ -105,13 +93,7 @@ class PiecedTable:
         return cls(str(path), rows, None)
 
     def pieces(self, size: int) -> Iterator[SourceTable]:
-        """Iterate over the rows in pieces.
-
-        Args:
-            size: Largest number of rows of a piece.
-
-        Yields:
-            The pieces in the order of the file. A column has the same type in every piece.
+        """The rows in the order of the file, in pieces of at most `size`; a column has the same type in all.
 
         Raises:
             InputError: The file is damaged.
@@ -211,12 +193,6 @@ def _read_parquet(path: Path) -> SourceTable:
 
 def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> None:
     """Refuse row groups whose declared size is too large: some kilobytes may decompress to many gigabytes.
-
-    Args:
-        path: The file.
-        groups: Metadata of the row groups that are read together.
-        limit: Largest size [bytes].
-        what: What is read together, for the message.
 
     Raises:
         InputError: The size exceeds the limit or the memory.

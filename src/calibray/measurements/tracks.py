@@ -22,16 +22,10 @@ MAX_FILE_SIZE: Final = 200_000_000
 
 
 def join_track(table: SourceTable, track: Track) -> SourceTable:
-    """Give rows the positions of a track, linear in time between its points.
+    """Give rows the positions of a track, linear in time between its points; rows outside its times are left out.
 
-    Altitudes are not used: those of satellite receivers have errors of metres.
-
-    Args:
-        table: The rows. Times are texts in ISO 8601 (UTC unless they name a time zone), or seconds since 1970.
-        track: The track.
-
-    Returns:
-        The rows within the track's times, with the columns `TRACK_COLUMNS`.
+    Times are texts in ISO 8601 (UTC unless they name a time zone), or seconds since 1970. Altitudes are not used: those
+    of satellite receivers have errors of metres. The new columns are `TRACK_COLUMNS`.
 
     Raises:
         InputError: The track or a time cannot be read, or no row lies within the track's times.

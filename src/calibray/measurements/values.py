@@ -20,15 +20,7 @@ PLAUSIBLE_POWER_DBM: Final = (-200.0, 30.0)
 
 
 def make_links(table: SourceTable, columns: LinkColumns, steps: Preparation) -> Measurements:
-    """Make links of rows, one each.
-
-    Args:
-        table: The rows.
-        columns: Their columns; positions in metres.
-        steps: The steps that the rows went through; `noise_floor_dbm` and `censored` are used here.
-
-    Returns:
-        The links.
+    """Make one link of each row; positions are in metres. Used here are `noise_floor_dbm` and `censored`.
 
     Raises:
         InputError: A column is missing, or a value is missing, not a number or implausible.

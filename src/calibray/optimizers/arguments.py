@@ -10,16 +10,7 @@ from calibray.errors import InputError
 
 
 def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
-    """Check a whole number.
-
-    Args:
-        name: The argument's name, for the message.
-        value: Its value.
-        at_least: Smallest allowed value.
-        at_most: Largest allowed value.
-
-    Returns:
-        The value as an int.
+    """The whole number `value` of the argument `name`, if it lies within its bounds.
 
     Raises:
         InputError: It is no whole number, or outside its range.
@@ -35,16 +26,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
 
 
 def real(name: str, value: float, at_least: float, at_most: float = inf) -> float:
-    """Check a real number.
-
-    Args:
-        name: The argument's name, for the message.
-        value: Its value.
-        at_least: Smallest allowed value.
-        at_most: Largest allowed value.
-
-    Returns:
-        The value as a float.
+    """The finite number `value` of the argument `name`, if it lies within its bounds.
 
     Raises:
         InputError: It is no finite number, or outside its range.
@@ -57,15 +39,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
 
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> str:
-    """Check a name.
-
-    Args:
-        name: The argument's name, for the message.
-        value: Its value.
-        allowed: The allowed values.
-
-    Returns:
-        The value.
+    """The string `value` of the argument `name`, if it is one of those allowed.
 
     Raises:
         InputError: The value is not allowed.

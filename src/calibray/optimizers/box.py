@@ -24,14 +24,7 @@ class Box:
 
     @staticmethod
     def between(lower: ArrayLike, upper: ArrayLike) -> Box:
-        """Build a box from its bounds, which are copied.
-
-        Args:
-            lower: Lower bounds [d].
-            upper: Upper bounds [d].
-
-        Returns:
-            The box.
+        """Build a box from lower and upper bounds [d], which are copied.
 
         Raises:
             InputError: The bounds are not two finite vectors of one length >= 1 with lower below upper.

@@ -128,13 +128,8 @@ def advance(starts: Starts, trial: Starts, predicted: NDArray[np.float64]) -> St
 def merge(starts: Starts, settled: Starts) -> tuple[Starts, Starts, NDArray[np.bool_]]:
     """Find searches that come close to a better one and would only reach the same minimum.
 
-    Args:
-        starts: The searches that move.
-        settled: Those that have ended.
-
-    Returns:
-        Both, with the merged searches counted in `searches` of the better ones; and True for each moving search that
-        can be dropped [s].
+    Returns the moving searches and the settled ones, with the merged ones counted in `searches` of the better ones, and
+    True for each moving search that can be dropped [s].
     """
     number, cost = len(settled.cost), np.concatenate([settled.cost, starts.cost])
     rank = np.lexsort((np.arange(len(cost)), cost)).argsort()
@@ -156,24 +151,13 @@ def descend(
     earlier: Starts | None = None,
     followed: int | None = None,
 ) -> Generator[NDArray[np.float64], Residuals, Starts]:
-    """Advance all starts until each has converged, merged with a better one, or been given up.
+    """Advance all starts [s, d] until each has converged, merged with a better one, or been given up.
 
-    Args:
-        unit: Starting points in the unit cube [s, d].
-        iterations: Largest number of steps.
-        tolerance: A search has converged when its model predicts less than this relative decrease of the
-            cost, or a step shorter than this.
-        catch_up: A search is given up when it lies more than this many of its predicted decreases behind
-            the best one.
-        earlier: Ends of earlier searches; new ones that come close to them are merged.
-        followed: Number of starts that are followed, those of the lowest cost; all if None.
-
-    Yields:
-        Points to evaluate [s, d].
-
-    Returns:
-        The earlier searches, those that converged or were still moving at the end, then those that were given up. The
-        latter are so near another minimum that they could not catch up.
+    A search has converged when its model predicts less than `tolerance` as relative decrease of the cost, or a shorter
+    step. It is given up when it lies more than `catch_up` of its predicted decreases behind the best one. New searches
+    that come close to `earlier` ends are merged with them. Of the starts, the `followed` ones of the lowest cost are
+    followed, or all. Yields points to evaluate [s, d]. Returns the earlier searches, those that converged or were still
+    moving at the end, then those that were given up, which are so near another minimum that they could not catch up.
     """
     starts = begin(unit, (yield unit))
     starts = starts.rows(np.isfinite(starts.cost))
@@ -205,17 +189,7 @@ def descend_all(
     iterations: int,
     tolerance: float,
 ) -> Starts:
-    """Descend on a model.
-
-    Args:
-        unit: Starting points in the unit cube [s, d].
-        evaluate: Points [s, d] to residuals and their Jacobian.
-        iterations: Largest number of steps.
-        tolerance: As in `descend`.
-
-    Returns:
-        The ends of the searches.
-    """
+    """Descend from `unit` [s, d] on a model, which gives residuals and their Jacobian; returns the ends."""
     descent = descend(unit, iterations, tolerance)
     points = next(descent)
     while True:
@@ -226,15 +200,7 @@ def descend_all(
 
 
 def distinct(starts: Starts, separation: float) -> Starts:
-    """Keep the best one of searches that ended near one another.
-
-    Args:
-        starts: The searches.
-        separation: Distance in the unit cube below which two ends are the same minimum.
-
-    Returns:
-        The distinct ones, the lowest cost first.
-    """
+    """Keep the best of searches that ended closer than `separation` in the unit cube, the lowest cost first."""
     order = np.argsort(starts.cost, kind="stable")
     near = cdist(starts.unit[order], starts.unit[order]) < separation
     kept = np.zeros(len(order), dtype=bool)

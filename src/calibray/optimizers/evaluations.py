@@ -141,14 +141,9 @@ class Archive:
         return self._parts[0]
 
     def leaders(self, count: int) -> NDArray[np.float64]:
-        """The best distinct points over the whole run.
+        """The best distinct points over the whole run [count, d], best first, ties in the order told.
 
-        Args:
-            count: How many.
-
-        Returns:
-            Points [count, d], best first, ties in the order told; the last one is repeated if there are
-            fewer.
+        The last one is repeated if there are fewer.
         """
         evaluations = self.all()
         chosen: list[NDArray[np.float64]] = []
@@ -162,11 +157,7 @@ class Archive:
     def imputed(self, evaluations: Evaluations) -> Evaluations:
         """Give failed evaluations the values of the worst successful one, so that models steer away from them.
 
-        Args:
-            evaluations: Evaluations of this run, some of them failed.
-
-        Returns:
-            The same with finite values; zero while every evaluation of the run has failed.
+        The value is zero while every evaluation of the run has failed.
         """
         run = self.all()
         failed, good = ~np.isfinite(evaluations.y), np.flatnonzero(np.isfinite(run.y))
@@ -188,19 +179,10 @@ def checked_evaluations(
     uses: frozenset[str],
     objective: Objective | None = None,
 ) -> Evaluations:
-    """Validate and copy evaluations.
+    """Validate and copy evaluations: points x [n, d], values y [n], residuals [n, m], derivatives [n, m, d].
 
-    Args:
-        box: The box searched.
-        x: Points [n, d].
-        y: Value [n]; +inf is a failed evaluation, whose residuals and derivatives are ignored.
-        residuals: Residuals [n, m], or None.
-        jacobian: Derivatives of the residuals [n, m, d], or None.
-        uses: Parts that the optimizer uses; the others are checked and left out.
-        objective: Residuals to the value; not checked if None.
-
-    Returns:
-        The evaluations with exactly the parts used.
+    A value of +inf is a failed evaluation, whose residuals and derivatives are ignored. Parts that the optimizer does
+    not use are checked and left out. Values are compared with the `objective` of the residuals unless it is None.
 
     Raises:
         InputError: A shape is wrong, a number is not finite, a point lies outside the box, a part that the
@@ -244,10 +226,6 @@ def checked_evaluations(
 def check_order(evaluations: Evaluations, archive: Archive) -> None:
     """Check that a lower value comes with a lower mean square, among evaluations and against the best before.
 
-    Args:
-        evaluations: Checked evaluations with residuals.
-        archive: Those before.
-
     Raises:
         InputError: An evaluation has a lower value than another and yet a higher mean square.
     """
@@ -277,15 +255,7 @@ def root_mean_square(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
 def merge_repeated(
     unit: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Merge points that were evaluated more than once.
-
-    Args:
-        unit: Points in the unit cube [n, d].
-        values: Values there [n, ...].
-
-    Returns:
-        The distinct points [k, d] and the means of their values [k, ...].
-    """
+    """Merge repeated points [n, d] of the unit cube: distinct points [k, d], means of their values [k, ...]."""
     points, group = np.unique(np.round(unit, DECIMALS), axis=0, return_inverse=True)
     share = (np.arange(len(points))[:, None] == group) / np.bincount(group)[:, None]
     return points, share @ values

@@ -119,16 +119,7 @@ class GaussianProcess(Optimizer):
 
 
 def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDArray[np.float64]:
-    """The logarithm of the expected decrease of a modelled value below the best one.
-
-    Args:
-        model: A model of one value.
-        x: Points of the unit cube [k, d].
-        best: The lowest value so far.
-
-    Returns:
-        Logarithm of the expected improvement [k].
-    """
+    """Logarithm of the expected decrease of a modelled value below the best one, at points x [k, d]: [k]."""
     mean, share = model.predict(x)
     spread = np.sqrt(np.maximum(share * model.variance[0], 1e-300))
     z = (best - mean[:, 0]) / spread
@@ -136,13 +127,7 @@ def log_improvement(model: Kriging, x: NDArray[np.float64], best: float) -> NDAr
 
 
 def log_shape(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The logarithm of phi(z) + z Phi(z), accurate where that is tiny.
-
-    Args:
-        z: Predicted improvement in standard deviations [k].
-
-    Returns:
-        The logarithm [k].
+    """The logarithm of phi(z) + z Phi(z), accurate where that is tiny; z in standard deviations [k].
 
     Example:
         >>> import numpy as np

@@ -40,15 +40,7 @@ LEAST_BUDGET = 24
 
 
 def linear_decay(iteration: int, iterations: int) -> float:
-    """The standard convergence factor.
-
-    Args:
-        iteration: t, from 1.
-        iterations: T.
-
-    Returns:
-        a(t) = 2 (1 - t / T).
-    """
+    """The standard convergence factor a(t) = 2 (1 - t / T) of iteration t, from 1, of T."""
     return 2.0 * (1.0 - iteration / iterations)
 
 
@@ -62,16 +54,9 @@ def encircle(
 ) -> NDArray[np.float64]:
     """Move a pack by the guidance of its leaders (Mirjalili et al. 2014, eqs. 3.1 to 3.7).
 
-    Args:
-        positions: X [n, d].
-        leaders: Positions of alpha, beta and delta [3, d].
-        a: Convergence factor.
-        r1: Uniform random numbers in [0, 1) per wolf, leader and dimension [n, 3, d].
-        r2: The same, independent of r1 [n, 3, d].
-        origin: The point that positions are measured from [d].
-
-    Returns:
-        X_GWO, the mean of the three guided positions [n, d], not yet clipped.
+    `r1` and `r2` [n, 3, d] are independent uniform random numbers, `leaders` are alpha, beta and delta [3, d], and
+    positions [n, d] are measured from `origin` [d]. Returns X_GWO, the mean of the three guided positions [n, d], not
+    yet clipped.
     """
     guide = leaders - origin
     a_coefficient = 2.0 * a * r1 - a  # A, eq. 3.3
@@ -83,11 +68,7 @@ def encircle(
 def whole_iterations(budget: int) -> dict[str, int]:
     """The settings of GWO that keep to a budget: 30 wolves, and as many whole iterations as fit.
 
-    Args:
-        budget: Number of evaluations.
-
-    Returns:
-        Population and iterations; fewer wolves if two iterations of 30 do not fit.
+    There are fewer wolves if two iterations of 30 do not fit.
 
     Example:
         >>> whole_iterations(600), whole_iterations(45)

@@ -62,14 +62,7 @@ class Kriging:
         return np.sum(self.root**2, axis=0)
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict residuals.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Mean [k, m], and the variance as a share of the prior's, the same for every residual [k].
-        """
+        """Predicted mean [k, m], and variance as a share of the prior's, alike for all residuals [k]."""
         return self.process.predict(Inputs.plain(unit))
 
     def mean_and_slope(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -95,16 +88,10 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Kriging:
-    """Fit a model, its input scales included.
+    """Fit a model and its input scales to residuals [n, m] at distinct points of the unit cube [n, d].
 
-    Args:
-        unit: Evaluated points in the unit cube [n, d], at least d + 2 distinct ones that span it.
-        residuals: Residuals there [n, m].
-        noisy: Learn the nugget too, for an engine whose answers scatter; else the model interpolates.
-        guess: A kernel to start from as well as the prior's, such as that of an earlier fit.
-
-    Returns:
-        The model.
+    There must be at least d + 2 points that span the cube. `noisy` learns the nugget too, for an engine whose answers
+    scatter; else the model interpolates. `guess` is a kernel to start from as well as the prior's.
     """
     spread = residuals.std(axis=0)
     varying = residuals[:, spread > CONSTANT * max(spread.max(), 1e-300)]

@@ -178,34 +178,21 @@ class LeastSquares(Optimizer):
 
 
 def returns(ended: Starts) -> int:
-    """Number of searches that ended in the best minimum, or in one that fits as well.
-
-    Args:
-        ended: The searches.
-
-    Returns:
-        Their number, merged searches included.
-    """
+    """Number of searches that ended in the best minimum, or in one that fits as well, merged ones included."""
     if not len(ended.cost):
         return 0
     return int(ended.searches[ended.cost <= ended.cost.min() + _slack(ended)].sum())
 
 
 def recombine(minima: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """Combine minima into points from which other minima may be reached.
+    """Combine minima [k, d], the best first, into `number` points from which other minima may be reached.
 
     The best minimum is shifted by the difference of two others, or takes one coordinate of another. Shifts help because
     one cause, such as a resonating slab, repeats minima at equal distances wherever the other parameters are. They are
     the mutation of differential evolution (Storn and Price, Journal of Global Optimization 11, 1997). Exchanges help
-    where parameters act nearly independently, such as materials that few paths meet both of. They are its crossover.
-
-    Args:
-        minima: Minima in the unit cube, none within `SPACE` of another, the best first [k, d].
-        number: Number of points wanted.
-
-    Returns:
-        Points inside the unit cube, those of the lowest minima first, shifted and exchanged ones in turn; fewer than
-        wanted if the minima give no more.
+    where parameters act nearly independently, such as materials that few paths meet both of. They are its crossover. No
+    minimum is within `SPACE` of another. Points of the lowest minima come first, shifted and exchanged ones in turn;
+    there are fewer than wanted if the minima give no more.
     """
     best, low, dimension = minima[0], minima[:PARENTS], minima.shape[1]
     target, source = np.nonzero(~np.eye(len(low), dtype=bool))

@@ -30,13 +30,7 @@ class _AbandonedError(BaseException):
 
 
 def inverted(minimise: Callable[[Evaluate], None]) -> Search:
-    """Run a minimiser in a thread and yield the candidates that it wants evaluated.
-
-    Args:
-        minimise: Calls its argument any number of times, then returns.
-
-    Yields:
-        Candidates [n, d].
+    """Run a minimiser in a thread and yield the candidates [n, d] that it wants evaluated.
 
     Raises:
         Exception: Whatever `minimise` raises.
@@ -74,15 +68,7 @@ def inverted(minimise: Callable[[Evaluate], None]) -> Search:
 
 
 def limited(search: Search, budget: int) -> Search:
-    """End a search when it has used its budget, and shorten the last batch.
-
-    Args:
-        search: The search; it must not end before.
-        budget: Number of evaluations.
-
-    Yields:
-        The search's candidates.
-    """
+    """End a search when it has used its budget, and shorten the last batch; it must not end before."""
     with closing(search):
         x = next(search)
         while True:
@@ -94,15 +80,7 @@ def limited(search: Search, budget: int) -> Search:
 
 
 def library(name: str, package: str, extra: str = "optimizers") -> ModuleType:
-    """Import an optional library.
-
-    Args:
-        name: Name of its module.
-        package: Name of its package.
-        extra: The extra of Calibray that installs it.
-
-    Returns:
-        The module.
+    """Import the module `name` of an optional package, which an extra of Calibray installs.
 
     Raises:
         InputError: It is not installed; the message names the command.

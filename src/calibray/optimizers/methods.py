@@ -52,13 +52,7 @@ _NO_OPTIONS: Final = {"lower", "upper", "seed", "objective", "cheap_model"}
 
 
 def method(name: str) -> type[Optimizer]:
-    """Look up a method.
-
-    Args:
-        name: Its name.
-
-    Returns:
-        Its class, which states what it uses, its schedule, and whether it takes starting points.
+    """The class of a method, which states what it uses, its schedule, and whether it takes starting points.
 
     Raises:
         InputError: There is no such method.
@@ -73,13 +67,7 @@ def method(name: str) -> type[Optimizer]:
 
 
 def label(name: str) -> str:
-    """A method's name in tables and figures.
-
-    Args:
-        name: A method, or `METHOD@CALLS` with its budget.
-
-    Returns:
-        The name.
+    """The name in tables and figures of a method, or of `METHOD@CALLS` with its budget.
 
     Example:
         >>> label("gwo@600")

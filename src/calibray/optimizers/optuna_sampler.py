@@ -83,15 +83,7 @@ class SGWOIMSampler(BaseSampler):
         SGWOIM([0.0] * max(len(self._space), 1), [1.0] * max(len(self._space), 1), **self._settings)
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """The parameters that the pack moves in.
-
-        Args:
-            study: The study.
-            trial: The trial to sample for.
-
-        Returns:
-            Their distributions by name.
-        """
+        """The distributions, by name, of the parameters that the pack moves in."""
         if self._space:
             return self._space
         inferred = self._inferred.calculate(study)
@@ -101,15 +93,7 @@ class SGWOIMSampler(BaseSampler):
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Hand out a candidate of the pack that no other trial works on.
-
-        Args:
-            study: The study.
-            trial: The trial to sample for.
-            search_space: The parameters that the pack moves in.
-
-        Returns:
-            Values by name; empty if Optuna should draw them at random.
+        """Hand out a candidate of the pack that no other trial works on; empty if Optuna should draw at random.
 
         Raises:
             InputError: The study has several objectives.
@@ -139,30 +123,13 @@ class SGWOIMSampler(BaseSampler):
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Draw a parameter at random that the pack does not move in.
-
-        Args:
-            study: The study.
-            trial: The trial to sample for.
-            param_name: The parameter.
-            param_distribution: Its distribution.
-
-        Returns:
-            Its value.
-        """
+        """Draw a parameter at random that the pack does not move in."""
         return self._random.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """Take a trial's answer, and stop the study after the last iteration.
-
-        Args:
-            study: The study.
-            trial: The trial, not stored as finished yet.
-            state: How it ended.
-            values: Its objective.
-        """
+        """Take a trial's answer, and stop the study after the last iteration."""
         with self._lock:
             if self._optimizer is None:
                 return

@@ -62,22 +62,12 @@ class Optimizer(ABC):
 
     @classmethod
     def needs_derivatives(cls) -> bool:
-        """Whether every evaluation must come with derivatives.
-
-        Returns:
-            True if so.
-        """
+        """Whether every evaluation must come with derivatives."""
         return "jacobian" in cls.uses
 
     @classmethod
     def within(cls, budget: int) -> dict[str, int]:
-        """Work out the settings that keep to a budget.
-
-        Args:
-            budget: Number of evaluations.
-
-        Returns:
-            Constructor arguments; none if the method stops by itself.
+        """The constructor arguments that keep to a budget; none if the method stops by itself.
 
         Raises:
             InputError: The budget is too small for the method.
@@ -124,10 +114,7 @@ class Optimizer(ABC):
         return len(self._session.archive)
 
     def ask(self) -> NDArray[np.float64]:
-        """The candidates to evaluate next.
-
-        Returns:
-            Points [n, d] inside the bounds that still wait for an evaluation; the same again until told.
+        """The candidates [n, d] to evaluate next, inside the bounds; the same again until told.
 
         Raises:
             InputError: The optimizer is done.

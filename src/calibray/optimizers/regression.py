@@ -63,14 +63,9 @@ class Kernel:
 
     @staticmethod
     def of(hyper: NDArray[np.float64], scale: float = 1.0) -> Kernel:
-        """Make a kernel of logarithms.
+        """Make a kernel of the logarithms of v_0, v_1, v_2, the rates [d] and the nugget [3 + d + 1].
 
-        Args:
-            hyper: Logarithms of v_0, v_1 and v_2, of the rates [d], and of the nugget [3 + d + 1].
-            scale: Factor whose square multiplies variances and nugget.
-
-        Returns:
-            The kernel.
+        `scale` squared multiplies variances and nugget.
         """
         return Kernel(scale**2 * np.exp(hyper[:3]), np.exp(hyper[3:-1]), float(scale**2 * np.exp(hyper[-1])))
 
@@ -167,14 +162,7 @@ class Process:
         return np.sum(self._whiten(np.eye(len(self.values))) ** 2, axis=0)
 
     def predict(self, at: Inputs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict the residuals.
-
-        Args:
-            at: Points [k].
-
-        Returns:
-            Mean [k, m], and the variance relative to that of each residual [k].
-        """
+        """Predicted mean [k, m], and variance relative to that of each residual [k]."""
         cross, prior = self.kernel.covariance(at, self.inputs), self.kernel.variance(at)
         mean, unexplained = cross @ self.weights, cross
         if self.linear:
@@ -194,16 +182,7 @@ class Process:
         return mean + trend_basis(at.unit) @ self.coefficients if self.linear else mean
 
     def slope(self, at: Inputs, response_slope: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives of the predicted mean.
-
-        Args:
-            at: Points [k].
-            response_slope: Derivatives of the responses by the coordinates of the unit cube [k, r, d]; None without a
-                cheap model.
-
-        Returns:
-            Derivatives by these coordinates [k, m, d].
-        """
+        """Derivatives of the mean by the unit cube's coordinates [k, m, d], given those of the responses [k, r, d]."""
         rates, variances = self.kernel.rates, self.kernel.variances
         toward = (at.unit[:, :, None] - self.inputs.unit.T) * rates[:, None] ** 2
         by_coordinate = variances[2] * matern_slope(self.kernel.distance(at, self.inputs))[:, None] * toward
@@ -252,14 +231,9 @@ class Likelihood:
         self.contrasts = Trend.of(unit, linear).contrasts
 
     def __call__(self, kernel: Kernel) -> tuple[float, NDArray[np.float64]]:
-        """Evaluate it.
+        """The value, and its gradient by the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1].
 
-        Args:
-            kernel: The kernel.
-
-        Returns:
-            The value, and its gradient by the logarithms of v_0, v_1, v_2, rates and nugget [3 + d + 1]; `SINGULAR` and
-            zeros where the kernel matrix cannot be factored.
+        They are `SINGULAR` and zeros where the kernel matrix cannot be factored.
         """
         count, residuals = self.values.shape
         rates_squared = kernel.rates**2
@@ -315,16 +289,8 @@ def most_probable(
 ) -> Kernel:
     """The kernel of the largest posterior density.
 
-    Args:
-        likelihood: Likelihood of kernels.
-        prior: Prior of their hyperparameters.
-        scale: Factor whose square multiplies variances and nugget.
-        divisor: What the loss is divided by, which sets the size of the first step.
-        guess: A kernel to start from as well as the prior's mean, such as that of an earlier fit.
-        steps: Largest number of steps from each start.
-
-    Returns:
-        The kernel.
+    `scale` squared multiplies variances and nugget. The loss is divided by `divisor`, which sets the size of the first
+    step. The search takes at most `steps` from the prior's mean and from `guess`, such as the kernel of an earlier fit.
     """
     held, learned = prior.mean[: prior.fixed], slice(prior.fixed, None)
 

@@ -21,17 +21,10 @@ from calibray.support.interruption import defer_interruption
 
 
 def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw points of the unit cube.
+    """Draw points of the unit cube [count, dimension].
 
-    Args:
-        kind: "random" (independent and uniform), "latin-hypercube" (one point in each of n slices of every
-            dimension) or "sobol" (scrambled; the first n of the next power of two).
-        count: Number of points n.
-        dimension: Number of dimensions d.
-        rng: Random generator.
-
-    Returns:
-        Points [n, d].
+    Kinds are "random" (independent and uniform), "latin-hypercube" (one point in each of n slices of every dimension)
+    and "sobol" (scrambled; the first n of the next power of two).
     """
     if kind == "random":
         return rng.random((count, dimension))
@@ -47,17 +40,7 @@ def design(kind: str, count: int, dimension: int, rng: np.random.Generator) -> N
 def maximin_design(
     count: int, dimension: int, rng: np.random.Generator, tries: int = 50
 ) -> NDArray[np.float64]:
-    """Draw a Latin hypercube whose closest points are far apart.
-
-    Args:
-        count: Number of points n.
-        dimension: Number of dimensions d.
-        rng: Random generator.
-        tries: Latin hypercubes to choose from.
-
-    Returns:
-        The one with the largest smallest distance [n, d].
-    """
+    """The Latin hypercube [count, dimension], of as many as `tries`, whose closest points are the farthest apart."""
     drawn = [design("latin-hypercube", count, dimension, rng) for _ in range(tries)]
     spacing = [pdist(points).min(initial=np.inf) for points in drawn]
     return drawn[int(np.argmax(spacing))]
@@ -66,16 +49,9 @@ def maximin_design(
 def draw_around(
     points: NDArray[np.float64], count: int, log_reach: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw points near given ones, at distances over several orders of magnitude.
+    """Draw points [count, d] near given ones of the unit cube [n, d], over several orders of magnitude.
 
-    Args:
-        points: Points of the unit cube [n, d].
-        count: Number of points to draw.
-        log_reach: Decimal logarithm of the smallest standard deviation; the largest is 10^-0.5.
-        rng: Random generator.
-
-    Returns:
-        Points of the unit cube [count, d].
+    The standard deviation is log-uniform from 10^`log_reach` to 10^-0.5.
     """
     near = points[rng.integers(0, len(points), count)]
     reach = 10.0 ** rng.uniform(log_reach, -0.5, (count, 1))

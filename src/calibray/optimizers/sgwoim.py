@@ -54,30 +54,12 @@ SMOOTHING = 1e-6
 
 
 def cosine_decay(iteration: int, iterations: int) -> float:
-    """The paper's convergence factor (eq. 2).
-
-    Args:
-        iteration: t, from 1.
-        iterations: T.
-
-    Returns:
-        a(t) = 2 cos(pi t / (2 T)).
-    """
+    """The paper's convergence factor a(t) = 2 cos(pi t / (2 T)) of iteration t, from 1, of T (eq. 2)."""
     return 2.0 * cos(0.5 * pi * iteration / iterations)
 
 
 def memory_weight(iteration: int, iterations: int, w_min: float, w_max: float) -> float:
-    """The weight of a wolf's memory (paper eq. 4).
-
-    Args:
-        iteration: t, from 1.
-        iterations: T.
-        w_min: Weight at the start.
-        w_max: Weight at the end.
-
-    Returns:
-        w(t) = w_min + (w_max - w_min) (t / T)^2.
-    """
+    """The weight of a wolf's memory, w(t) = w_min + (w_max - w_min) (t / T)^2 (paper eq. 4)."""
     return w_min + (w_max - w_min) * (iteration / iterations) ** 2
 
 
@@ -228,15 +210,9 @@ def remember(memory: Evaluations, wolves: NDArray[np.intp], answers: Evaluations
 
 
 def predict(archive: Archive, candidates: NDArray[np.float64], kernel: str = "cubic") -> NDArray[np.float64]:
-    """Predict the objective of candidates from all real evaluations.
+    """Predict the objective of candidates [n, d] from all real evaluations; zero while all have failed.
 
-    Args:
-        archive: The evaluations, with more than d distinct points that span the box.
-        candidates: Points [n, d].
-        kernel: "cubic" or "gaussian".
-
-    Returns:
-        Predicted objective [n]; all zero while every evaluation has failed.
+    The archive must hold more than d distinct points that span the box.
     """
     if not np.isfinite(archive.best.y):
         return np.zeros(len(candidates))

@@ -244,18 +244,11 @@ class VectorSurrogate(Optimizer):
 
 
 def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The distribution of the mean square Q of the residuals, as the model predicts it.
+    """Expectation and standard deviation [k] of the mean square Q of the residuals at points [k, d].
 
     With prediction r, prior covariance V of the residuals and share s^2 of it, which grows with the distance from
     evaluated points, Q has mean (r^T r + s^2 tr V) / m and variance (4 s^2 r^T V r + 2 s^4 tr V^2) / m^2. Errors of
     different links are correlated: treating them as independent would stop exploration too soon.
-
-    Args:
-        model: The model of the residuals.
-        x: Points of the unit cube [k, d].
-
-    Returns:
-        Expectation and standard deviation [k].
     """
     mean, share = model.predict(x)
     root, links = model.root, model.root.shape[1]
@@ -267,16 +260,10 @@ def mean_square(model: Kriging, x: NDArray[np.float64]) -> tuple[NDArray[np.floa
 def improvement(
     mean: NDArray[np.float64], share: NDArray[np.float64], draws: NDArray[np.float64], best: float
 ) -> NDArray[np.float64]:
-    """Expected decrease of the mean square of the residuals below the best one, by Monte Carlo.
+    """Expected decrease [k] of the mean square of the residuals below the best one, by Monte Carlo.
 
-    Args:
-        mean: Predicted residuals [k, m].
-        share: Their variance relative to the prior's [k].
-        draws: Draws of residuals with the prior covariance [draws, m].
-        best: The root mean square of the best residuals so far.
-
-    Returns:
-        Expected improvement [k]; 0 where no draw improves.
+    From predictions [k, m], their variance relative to the prior's [k], and draws with the prior covariance [draws, m];
+    0 where no draw improves. `best` is the root mean square of the best residuals so far.
     """
     along, across = 2.0 * np.sqrt(share)[:, None] * (mean @ draws.T), np.sum(draws**2, axis=1)
     square = np.sum(mean**2, axis=1)[:, None] + along + share[:, None] * across

@@ -13,17 +13,9 @@ from calibray.scenes.triangles import LEVEL, Triangles
 def footprints(
     triangles: Triangles, west: float, south: float, east: float, north: float
 ) -> list[NDArray[np.float64]]:
-    """Outlines of all that lies, whole or in part, within an area, the ground apart.
+    """Outlines of all that lies, whole or in part, within an area given by its bounds [m], the ground apart.
 
-    Args:
-        triangles: The scene.
-        west: Least x of the area [m].
-        south: Least y [m].
-        east: Largest x [m].
-        north: Largest y [m].
-
-    Returns:
-        Closed lines, the first corner not repeated, each [n, 2], [m].
+    They are closed lines, the first corner not repeated, each [n, 2], [m].
     """
     normal = triangles.normal
     area = np.linalg.norm(normal, axis=1)

@@ -25,14 +25,9 @@ MAX_POINTS: Final = 2_000_000
 
 
 def building_numbers(triangles: Triangles, position: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Find the building that each position lies on, or else the nearest building in plan.
+    """Number of the building [n], from 0, that each position [n, 3], [m], lies on or is nearest to in plan.
 
-    Args:
-        triangles: The scene.
-        position: The positions [n, 3], [m].
-
-    Returns:
-        Number of the building, from 0 [n]; -1 everywhere if the scene is ground alone.
+    It is -1 everywhere if the scene is ground alone.
     """
     # SciPy's spatial modules are slow to import, and few callers of this package need them.
     from scipy import ndimage

@@ -71,16 +71,10 @@ def export_scene(
 
 
 def exported_names(names: Iterable[str]) -> dict[str, str]:
-    """The names of materials in an exported scene.
+    """The names of materials in an exported scene: letters, digits, `_` and `-`, no two alike.
 
-    Sionna RT refuses a plain `radio-material` with an ITU name, and Mitsuba misreads names with dots, quotes or line
-    breaks.
-
-    Args:
-        names: The materials' names.
-
-    Returns:
-        For each name one of letters, digits, `_` and `-`, no two alike; ITU names become `calibrated-NAME`.
+    Sionna RT refuses a plain `radio-material` with an ITU name, so such a name becomes `calibrated-NAME`. Mitsuba
+    misreads names with dots, quotes or line breaks.
 
     Example:
         >>> exported_names(["stone", "concrete", "brick.old", "brick old"])

@@ -70,14 +70,7 @@ class MeshObject:
 
 
 def join_meshes(meshes: Iterable[Mesh]) -> Mesh:
-    """Join meshes into one; vertices of different meshes stay separate.
-
-    Args:
-        meshes: At least one mesh.
-
-    Returns:
-        All faces in the given order. Vertices that no face uses are dropped.
-    """
+    """Join at least one mesh into one; vertices of different meshes stay separate, unused ones are dropped."""
     parts = list(meshes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
@@ -91,15 +84,10 @@ def weld(
     scale: float,
     position: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None,
 ) -> Mesh:
-    """Make a mesh of triangles with integer corners: equal corners become one vertex.
+    """Make a mesh of triangles with integer corners [F, 3, 3]: equal corners become one vertex.
 
-    Args:
-        triangles: Corners of each triangle, counter-clockwise seen from outside [F, 3, 3], in units of `scale`.
-        scale: Unit of the corners [m].
-        position: Gives the position [n, 3], [m] of corners [n, 3], if it is not the corner times `scale`.
-
-    Returns:
-        The mesh, without the triangles that have two equal corners.
+    Triangles are counter-clockwise seen from outside; those with two equal corners are dropped. `scale` is the unit of
+    the corners [m]; `position` gives the position [n, 3], [m], of corners [n, 3] if it is not the corner times `scale`.
 
     Example:
         >>> weld(np.array([[[0, 0, 0], [5, 0, 0], [0, 5, 0]], [[5, 0, 0], [5, 5, 0], [0, 5, 0]]]), 0.001).faces
@@ -114,14 +102,9 @@ def weld(
 
 
 def read_mesh(file: Path, kind: str) -> Mesh:
-    """Read a mesh file and refuse what Mitsuba would trace wrongly or crash on.
+    """Read a mesh file, "ply" or "obj", and refuse what Mitsuba would trace wrongly or crash on.
 
-    Args:
-        file: The file.
-        kind: Its format, "ply" or "obj".
-
-    Returns:
-        The mesh. Polygons of an OBJ file are split into triangles.
+    Polygons of an OBJ file are split into triangles.
 
     Raises:
         InputError: The file cannot be read, is damaged or has no face; a vertex is not finite; a face has a corner that
@@ -258,12 +241,8 @@ def _number(word: str) -> float:
 def ply_bytes(mesh: Mesh) -> bytes:
     """Encode a mesh as a binary little-endian PLY file; equal meshes give equal bytes.
 
-    Args:
-        mesh: The mesh; its vertices are rounded to 32-bit floats, or stored as 64-bit ones where that would lose more
-            than a tenth of a millimetre.
-
-    Returns:
-        The content of the file.
+    Vertices are rounded to 32-bit floats, or stored as 64-bit ones where that would lose more than a tenth of a
+    millimetre.
     """
     is_coarse = np.spacing(np.float32(np.abs(mesh.vertices).max(initial=0.0))) > 3e-4
     name, stored = ("double", "<f8") if is_coarse else ("float", "<f4")

@@ -167,13 +167,6 @@ def has_copied_meshes(scene: Scene) -> bool:
 def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
     """Make the XML that the tracer loads instead of `Scene.xml`, with copies of the meshes in the local frame.
 
-    Args:
-        scene: The scene.
-        folder: Folder for the copies.
-
-    Returns:
-        The scene in its local frame.
-
     Raises:
         InputError: A mesh cannot be copied.
     """
@@ -186,12 +179,7 @@ def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
 
 
 def check_material_name(name: str, materials: Mapping[str, object], location: str) -> None:
-    """Refuse a material that a scene does not have.
-
-    Args:
-        name: The material's name.
-        materials: The scene's materials by name.
-        location: Where the user wrote the name, for the message.
+    """Refuse a material that a scene does not have; `location` is where the user wrote its name.
 
     Raises:
         InputError: The scene has no such material; the message suggests the nearest name.
@@ -201,14 +189,7 @@ def check_material_name(name: str, materials: Mapping[str, object], location: st
 
 
 def is_itu_name(name: str) -> bool:
-    """Whether Sionna RT reserves the name of a material for ITU-R P.2040.
-
-    Args:
-        name: The material's name.
-
-    Returns:
-        True for an ITU name, with or without the prefix `itu_`.
-    """
+    """Whether Sionna RT reserves a material's name, with or without `itu_`, for ITU-R P.2040."""
     return name in ITU_NAMES or name.startswith(("itu_", "itu-"))
 
 
@@ -368,15 +349,7 @@ def _refer(shape: ElementTree.Element, identifier: str) -> None:
 
 
 def material_element(identifier: str, material: Material) -> ElementTree.Element:
-    """Make the BSDF of a material, with the constants that Sionna's scene files can hold.
-
-    Args:
-        identifier: Its id.
-        material: The constants.
-
-    Returns:
-        The XML element.
-    """
+    """Make the BSDF of a material, with the constants that Sionna's scene files can hold."""
     bsdf = ElementTree.Element("bsdf", {"type": "radio-material", "id": identifier})
     for name in (
         "relative_permittivity",

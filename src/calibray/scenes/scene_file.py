@@ -66,13 +66,7 @@ _FRAME_COMMENT: Final = "calibray frame "
 
 
 def scene_path(source: str) -> Path:
-    """Find the file of a scene.
-
-    Args:
-        source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
-
-    Returns:
-        The XML file.
+    """Find the XML file of a scene, its path or `sionna:NAME` for one bundled with Sionna RT.
 
     Raises:
         InputError: There is no such file or bundled scene, or Sionna RT is not installed.
@@ -104,12 +98,6 @@ def scene_path(source: str) -> Path:
 def read_content(path: Path) -> bytes:
     """Read the bytes of a scene file; an unchanged file is read once.
 
-    Args:
-        path: The file.
-
-    Returns:
-        Its bytes.
-
     Raises:
         OSError: The file cannot be read.
     """
@@ -123,14 +111,7 @@ def _content(path: Path, *_: int) -> bytes:
 
 
 def parse(path: Path, source: str) -> ElementTree.Element:
-    """Parse the XML of a scene.
-
-    Args:
-        path: The file.
-        source: The user's name for the scene, for messages.
-
-    Returns:
-        The root element.
+    """Parse the XML of a scene; `source` is the user's name for it.
 
     Raises:
         InputError: The file cannot be read, is not well-formed, is nested too deeply, or is not a Mitsuba scene.
@@ -153,13 +134,7 @@ def parse(path: Path, source: str) -> ElementTree.Element:
 
 
 def find_scene(source: str | Path) -> tuple[Path, ElementTree.Element]:
-    """Find the file of a scene and parse its XML.
-
-    Args:
-        source: Path of the XML file, or `sionna:NAME` for a scene bundled with Sionna RT.
-
-    Returns:
-        The file, and its root element.
+    """Find the file of a scene and parse its XML; returns the file and the root element.
 
     Raises:
         InputError: The file does not exist or is not a Mitsuba scene.
@@ -189,12 +164,7 @@ class _ShallowTree(ElementTree.TreeBuilder):
 def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     """Read the mesh of a shape, and refuse a shape that cannot be traced. Its transform is not applied.
 
-    Args:
-        shape: The element.
-        path: The scene's file.
-
-    Returns:
-        The mesh; None for a rectangle or cube, and for Mitsuba's own `serialized` format.
+    It is None for a rectangle or cube, and for Mitsuba's own `serialized` format.
 
     Raises:
         InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
@@ -221,14 +191,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
 
 
 def mesh_filename(shape: ElementTree.Element) -> str | None:
-    """The file that a shape names.
-
-    Args:
-        shape: The element; a texture or an emitter serves as well.
-
-    Returns:
-        The name, relative to the scene's folder; None if the element names no file.
-    """
+    """The file that a shape, texture or emitter names, relative to the scene's folder, if any."""
     filename = shape.find("string[@name='filename']")
     return None if filename is None else filename.get("value", "")
 
@@ -257,10 +220,6 @@ def keep_traced_elements(root: ElementTree.Element, path: Path) -> None:
 
     Mitsuba would load textures, emitters and sensors, and end the process on some that are malformed. They have no
     effect on radio waves and are dropped.
-
-    Args:
-        root: The scene; changed.
-        path: The scene's file.
 
     Raises:
         InputError: The scene includes another file, or has an element, a property or a parameter that Calibray does not
@@ -311,18 +270,10 @@ def write_scene(
     frame: Frame | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object.
+    """Write a new scene: `scene.xml`, and `meshes/NAME.ply` for each object; returns the XML file.
 
-    Args:
-        folder: Where to write; made if it does not exist.
-        objects: The objects of the scene.
-        materials: Constants by material name. A `type` names a material of ITU-R P.2040, which then gives
-            permittivity and conductivity.
-        frame: Where the scene lies on the globe; kept in a comment, from which `read_frame` reads it.
-        overwrite: Replace files that Calibray did not write.
-
-    Returns:
-        Path of the XML file.
+    A material whose `type` names one of ITU-R P.2040 takes permittivity and conductivity from there. The frame is kept
+    in a comment, from which `read_frame` reads it. With `overwrite`, files are replaced that Calibray did not write.
 
     Raises:
         InputError: The folder cannot be written, or a file there must not be replaced; nothing is written then.
@@ -369,13 +320,7 @@ def _scene_xml(
 
 
 def read_frame(source: str | Path) -> Frame | None:
-    """Read where a scene lies on the globe.
-
-    Args:
-        source: Path of the XML file, as `write_scene` writes it, or `sionna:NAME`.
-
-    Returns:
-        The frame; None if the file does not state it.
+    """Read where a scene lies on the globe; None if its file does not state it.
 
     Raises:
         InputError: The scene does not exist, or its file states an invalid frame.

@@ -80,14 +80,7 @@ class SurfaceSize:
 
 
 def read_surface(shape: ElementTree.Element, path: Path) -> Mesh | None:
-    """Read the surface of a shape in the scene frame.
-
-    Args:
-        shape: The element.
-        path: The scene's file.
-
-    Returns:
-        The mesh, with the shape's transform applied; None for Mitsuba's own `serialized` format.
+    """Read the mesh of a shape in the scene frame; None for Mitsuba's own `serialized` format.
 
     Raises:
         InputError: As for `shape_mesh`, the transform has an element that Calibray does not know, or the
@@ -122,14 +115,7 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh | None:
 
 
 def transform_matrix(shape: ElementTree.Element, path: Path) -> NDArray[np.float64]:
-    """Compute the transform of a shape in double precision.
-
-    Args:
-        shape: The element; its transforms hold finite numbers.
-        path: The scene's file, for messages.
-
-    Returns:
-        The matrix that takes homogeneous coordinates of the shape to those of the scene [4, 4].
+    """Compute the transform of a shape in double precision, a matrix for homogeneous coordinates [4, 4].
 
     Raises:
         InputError: An element is not a translate, scale, rotate or matrix, or has another number of values than it
@@ -196,14 +182,10 @@ def _cube() -> Mesh:
 
 
 def local_origin(sizes: tuple[SurfaceSize | None, ...]) -> NDArray[np.float64]:
-    """Choose the origin of the frame that a scene is traced in.
+    """Choose the origin [3], [m], of the frame that a scene is traced in.
 
-    Args:
-        sizes: Size of every object; None where it is not known.
-
-    Returns:
-        The centre of the scene, rounded to metres, if the scene lies far from the origin of its coordinates: beyond
-        `FAR`, and further than it is wide, so that the local frame gains at least one bit. Otherwise zero [3], [m].
+    It is the centre of the scene, rounded to metres, if the scene lies far from the origin of its coordinates: beyond
+    `FAR`, and further than it is wide, so that the local frame gains at least one bit. Otherwise it is zero.
     """
     known = [size for size in sizes if size is not None]
     if not known:
@@ -219,13 +201,7 @@ def local_origin(sizes: tuple[SurfaceSize | None, ...]) -> NDArray[np.float64]:
 def write_local_shape(
     shape: ElementTree.Element, path: Path, origin: NDArray[np.float64], target: Path
 ) -> None:
-    """Replace a shape by a single-precision mesh in a local frame.
-
-    Args:
-        shape: The element; changed.
-        path: The scene's file.
-        origin: Origin of the local frame [3], [m].
-        target: Mesh file to write.
+    """Replace a shape by a single-precision mesh in a local frame with its origin at `origin` [3], [m].
 
     Raises:
         InputError: The mesh cannot be read, or is `serialized`, which only Mitsuba reads.

@@ -26,12 +26,8 @@ _EDGE: Final = 1e-9
 def read_meshes(source: str | Path) -> Iterator[MeshObject]:
     """Read the PLY and OBJ meshes of a scene, one after the other.
 
-    Args:
-        source: Path of a Mitsuba XML file, or `sionna:NAME`.
-
-    Yields:
-        Each object with its mesh, faces reversed where the file flips normals. Transforms of shapes are not applied,
-        and shapes without a file (rectangles, cubes) are skipped.
+    Faces are reversed where the file flips normals. Transforms of shapes are not applied, and shapes without a file
+    (rectangles, cubes) are skipped.
 
     Raises:
         InputError: The scene or a mesh cannot be read, or the scene has no mesh.
@@ -91,12 +87,7 @@ class Triangles:
 def read_triangles(scene: Scene) -> Triangles:
     """Read the triangles of a scene.
 
-    Args:
-        scene: The scene.
-
-    Returns:
-        The triangles. Objects without a mesh file, with a transform, or whose file became unreadable are left out and
-        named.
+    Objects without a mesh file, with a transform, or whose file became unreadable are left out and named.
     """
     materials = list(scene.materials)
     meshes: list[Mesh] = []
@@ -148,16 +139,10 @@ def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]
 
 
 def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
-    """Whether a mesh is a sheet under the whole scene.
+    """Whether a mesh is a sheet under the whole scene, of an extent east and north [2], [m].
 
-    This is stricter than `Triangles.ground`, which also takes a ceiling for ground: here a ceiling covers the rooms.
-
-    Args:
-        mesh: The mesh.
-        extent: Extent of the scene to the east and to the north [2], [m].
-
-    Returns:
-        True if no face is steep and the mesh covers most of the scene.
+    This is stricter than `Triangles.ground`, which also takes a ceiling for ground: here a ceiling covers the rooms. No
+    face may be steep, and the mesh must cover most of the scene.
     """
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])
@@ -170,15 +155,9 @@ def is_ground(mesh: Mesh, extent: NDArray[np.float64]) -> bool:
 def ground_heights(
     triangles: Triangles, x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Heights of the ground over a grid, whatever stands on it.
+    """Heights of the lowest ground [ny, nx], [m], over a grid of ascending, equally spaced x [nx] and y [ny].
 
-    Args:
-        triangles: The scene.
-        x: Eastings of the grid, ascending and equally spaced [nx], [m].
-        y: Northings, likewise [ny], [m].
-
-    Returns:
-        Heights of the lowest ground [ny, nx], [m]; where there is none, the height of the scene's lowest point.
+    Where there is none, it is the height of the scene's lowest point.
     """
     heights = np.full((len(y), len(x)), np.inf)
     corners = triangles.corners[triangles.ground]

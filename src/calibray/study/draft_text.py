@@ -17,14 +17,7 @@ SCHEMA_FILE: Final = "study.schema.json"
 
 
 def toml(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
-    """Write a study.
-
-    Args:
-        content: Sections by name.
-        reasons: Reasons of assumptions by the dotted name of the section or key.
-
-    Returns:
-        The file's text.
+    """Write the sections of a study, with reasons of assumptions by the dotted name of the section or key.
 
     Raises:
         InputError: A name holds characters that TOML has not.

@@ -20,13 +20,6 @@ def split_engine_keys(content: Any, source: str) -> tuple[Any, dict[str, Any]]:
 
     A study may state how its program is called and yet use replay; `calibray run --engine command` then calls it.
 
-    Args:
-        content: The table as the file gives it.
-        source: Name of the file, for messages.
-
-    Returns:
-        The keys of the named engine, with its name, and the keys of others.
-
     Raises:
         InputError: Another engine cannot use the value of its key.
     """

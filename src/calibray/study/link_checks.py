@@ -50,14 +50,7 @@ _TURNS: Final[dict[str, _Turn]] = {
 
 
 def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """Check links for common mistakes.
-
-    Args:
-        study: The study.
-        links: Its links.
-
-    Returns:
-        The suspicions and their remedies.
+    """Check links for common mistakes; returns the suspicions and their remedies.
 
     Raises:
         InputError: All links are far from the scene, the scene cannot be read, or shapely or trimesh is not installed.
@@ -73,15 +66,7 @@ def examine(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
 
 
 def count_unknowns(study: StudyModel, links: Measurements) -> tuple[Finding, ...]:
-    """Check that the links are many enough for the unknowns of a study.
-
-    Args:
-        study: The study.
-        links: Its links.
-
-    Returns:
-        The suspicion and its remedy, if there are fewer than `LINKS_PER_UNKNOWN` links per unknown.
-    """
+    """The suspicion and its remedy if there are fewer than `LINKS_PER_UNKNOWN` links per unknown."""
     offsets = len(links.group_names) if links.group is not None else 1
     unknowns = len(study.parameters) + offsets
     if len(links) >= LINKS_PER_UNKNOWN * unknowns:

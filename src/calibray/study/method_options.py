@@ -28,9 +28,7 @@ _TYPES: Final[Mapping[str, tuple[tuple[type, ...], str]]] = {
 def check_options(name: str, options: Mapping[str, Any]) -> None:
     """Refuse settings that a method does not have; the method itself checks whether their values suit it.
 
-    Args:
-        name: The method. If it is unknown or chosen later, only the size of values is checked.
-        options: The settings.
+    If the method is unknown or chosen later, only the size of values is checked.
 
     Raises:
         InputError: A setting is unknown, of another type, not finite or too large; the message begins with its key.

@@ -197,14 +197,9 @@ class StudyModel(Section, ABC):
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None
     ) -> Parameters:
-        """The free parameters of a scene, with their start values.
+        """The free parameters of a scene with materials `base`, with their start values, in the order of the file.
 
-        Args:
-            base: The scene's materials by name, after ``[materials]``.
-            laws: How materials depend on frequency; the others are constant.
-
-        Returns:
-            The parameters, in the order of the file.
+        Materials without a law over frequency in `laws` are constant.
 
         Raises:
             InputError: The scene lacks a parameter's material, or a start value is outside its bounds.

@@ -19,13 +19,7 @@ _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_pow
 
 
 def link_columns(study: StudyModel) -> LinkColumns:
-    """The columns of a study's table of links.
-
-    Args:
-        study: The study.
-
-    Returns:
-        The columns, with the groups of the offset.
+    """The columns of a study's table of links, with the groups of the offset.
 
     Raises:
         InputError: Keys of ``[links]`` contradict each other.
@@ -35,13 +29,7 @@ def link_columns(study: StudyModel) -> LinkColumns:
 
 
 def row_steps(study: StudyModel) -> Preparation:
-    """The steps that a study states.
-
-    Args:
-        study: The study.
-
-    Returns:
-        The steps.
+    """The steps from rows to links that a study states.
 
     Raises:
         InputError: The scene's place on the globe is unknown, or the scene cannot be read.
@@ -71,12 +59,6 @@ def row_track(study: StudyModel) -> Track | None:
 
 def position_steps(study: StudyModel) -> Preparation:
     """The steps that position a row's antennas; they leave no row out.
-
-    Args:
-        study: The study.
-
-    Returns:
-        The steps.
 
     Raises:
         InputError: As for `row_steps`.
@@ -109,12 +91,6 @@ def _move_outside(study: StudyModel) -> MoveOutside:
 def scene_frame(study: StudyModel) -> Frame:
     """The place of a study's scene on the globe, stated by the study or else by the scene file.
 
-    Args:
-        study: The study.
-
-    Returns:
-        The frame.
-
     Raises:
         InputError: Neither states it, or the projection is unknown.
     """
@@ -128,13 +104,7 @@ def scene_frame(study: StudyModel) -> Frame:
 
 
 def known_frame(study: StudyModel) -> Frame | None:
-    """The place of a study's scene on the globe, if it is known.
-
-    Args:
-        study: The study.
-
-    Returns:
-        The frame; None if neither the study nor the scene file states it.
+    """The place of a study's scene on the globe; None if neither the study nor the scene file states it.
 
     Raises:
         InputError: The projection is unknown.

@@ -14,11 +14,7 @@ def schema_text() -> str:
 
 
 def schema() -> dict[str, Any]:
-    """The schema.
-
-    Returns:
-        JSON Schema, draft 2020-12; the first line of each docstring describes a table.
-    """
+    """JSON Schema, draft 2020-12; the first line of each docstring describes a table."""
     content = Study.model_json_schema()
     _shorten(content)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Calibray study"} | {

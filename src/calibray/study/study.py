@@ -97,14 +97,9 @@ class Study(StudyModel):
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], path: str | Path = "study.toml") -> Study:
-        """A study from the content of a study file; it is not checked that its files exist.
+        """A study from sections as TOML gives them; it is not checked that its files exist.
 
-        Args:
-            content: Sections by name, as TOML gives them.
-            path: The study file; other files are relative to its folder. It need not exist.
-
-        Returns:
-            The study.
+        Other files are relative to the folder of `path`, which need not exist.
 
         Raises:
             InputError: A key is unknown or a value impossible; one line for each error.
@@ -137,10 +132,7 @@ class Study(StudyModel):
         return display.html(*summary(self))
 
     def measurements(self) -> Measurements:
-        """Read the links, with the groups of the offset.
-
-        Returns:
-            All links of the study, held-out links included.
+        """All links of the study, held-out ones included, with the groups of the offset.
 
         Raises:
             InputError: The table cannot be used (see `read_measurements`), or the scene's place on the globe is
@@ -201,14 +193,6 @@ class Study(StudyModel):
 
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Study:
         """The study with another method, seed or engine; a method's options are dropped with it.
-
-        Args:
-            method: Name of the method, or None to keep it.
-            seed: Seed, or None to keep it.
-            engine: Name of the engine, or None to keep it.
-
-        Returns:
-            The changed study.
 
         Raises:
             InputError: A value is impossible.
@@ -282,28 +266,13 @@ class Setup:
     def replace(self, method: str | None = None, seed: int | None = None, engine: str | None = None) -> Setup:
         """The same with another method, seed or engine; no file is read again (see `Study.replace`).
 
-        Args:
-            method: Name of the method, or None to keep it.
-            seed: Seed, or None to keep it.
-            engine: Name of the engine, or None to keep it.
-
-        Returns:
-            The changed setup.
-
         Raises:
             InputError: A value is impossible.
         """
         return self._with_tracer(replace(self, study=self.study.replace(method, seed, engine)))
 
     def at(self, links: Measurements) -> Setup:
-        """The same with other links, none of them held out; no file is read again.
-
-        Args:
-            links: The links.
-
-        Returns:
-            The changed setup.
-        """
+        """The same with other links, none of them held out; no file is read again."""
         return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
 
     @property
@@ -380,14 +349,7 @@ class Setup:
         return digests
 
     def tracer_at(self, frequency: float) -> Tracer:
-        """The ray tracer with the scene at another carrier.
-
-        Args:
-            frequency: The carrier [Hz].
-
-        Returns:
-            A new tracer.
-        """
+        """A new ray tracer with the scene at another carrier [Hz]."""
         return self._open_tracer(self._scene_at(frequency), frequency)
 
     def trace(

@@ -15,11 +15,7 @@ def _held_out(section: HoldoutSection) -> str:
 
 
 def summary(study: StudyModel) -> tuple[Table, Table]:
-    """The sections of a study and its parameters, as two tables.
-
-    Args:
-        study: The study.
-    """
+    """The sections of a study and its parameters, as two tables."""
     rows = [
         ("scene", study.scene.file),
         ("frequency", hertz(study.scene.frequency)),

@@ -15,13 +15,7 @@ from calibray.support.output_files import exists
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """Read a study file.
-
-    Args:
-        path: The TOML file.
-
-    Returns:
-        Sections by name.
+    """Read the sections of a study file.
 
     Raises:
         InputError: The file does not exist, cannot be read, or is not TOML.
@@ -51,13 +45,6 @@ def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:
 
 def expand(text: str, environment: Mapping[str, str]) -> str:
     """Replace environment variables: ``${NAME}``, or ``${NAME:-default}`` if one may be unset or empty.
-
-    Args:
-        text: The text.
-        environment: The variables.
-
-    Returns:
-        The text with every variable replaced.
 
     Raises:
         InputError: A variable without default is not set, or a ``${`` is malformed.

@@ -49,15 +49,8 @@ def explain(
 ) -> InputError:
     """One message for all errors, a line each: file, dotted key, value, bound.
 
-    Args:
-        error: Pydantic's errors.
-        model: The model of the content; its keys are suggested for misspelled ones.
-        content: The content.
-        source: Name of the file, for the message.
-        tagged: Tables of which there are several kinds, distinguished by their `name`.
-
-    Returns:
-        The error to raise.
+    Keys of the model are suggested for misspelled ones. `tagged` are tables of which there are several kinds,
+    distinguished by their `name`.
     """
     lines: dict[str, str] = {}
     for fault in error.errors():

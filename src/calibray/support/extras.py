@@ -12,14 +12,7 @@ from calibray.support.messages import first_line
 
 
 def library(name: str, extra: str) -> ModuleType:
-    """Import an optional library.
-
-    Args:
-        name: The module.
-        extra: Calibray's extra that installs it.
-
-    Returns:
-        The module.
+    """Import an optional module, which an extra of Calibray installs.
 
     Raises:
         InputError: It is not installed, or cannot be loaded.

@@ -63,30 +63,13 @@ _SETTINGS: Final[dict[Any, Any]] = {
 
 @contextmanager
 def styled(text_as: str = "path") -> Iterator[None]:
-    """The style, for as long as the context is open.
-
-    Args:
-        text_as: In SVG, letters as outlines ("path") or as text in the reader's font ("none").
-
-    Yields:
-        Nothing.
-    """
+    """The style, while the context is open; letters of SVG are outlines ("path") or in the reader's font ("none")."""
     with rc_context({**_SETTINGS, "svg.fonttype": text_as}):
         yield
 
 
 def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tuple[Figure, Axes]:
-    """An empty figure of one panel in the style of all.
-
-    Args:
-        x: What the horizontal axis shows, with its unit.
-        y: What the vertical axis shows, with its unit.
-        width: Width [in].
-        height: Height [in].
-
-    Returns:
-        The figure and its axes.
-    """
+    """An empty figure of one panel in the style of all; the labels state units, width and height are in inches."""
     with styled():
         figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
         axes = figure.add_subplot()
@@ -95,27 +78,14 @@ def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tup
 
 
 def residual_figure(x: str) -> tuple[Figure, Axes]:
-    """An empty figure for what is left of links' path loss, with a line where nothing is left.
-
-    Args:
-        x: What the horizontal axis shows, with its unit.
-
-    Returns:
-        The figure and its axes.
-    """
+    """An empty figure for what is left of links' path loss, with a line where nothing is left."""
     figure, axes = plain_figure(x, "Calibrated - measured [dB]")
     axes.axhline(0, color=INK, lw=0.8)
     return figure, axes
 
 
 def dress(axes: Axes, x: str, y: str) -> None:
-    """Label axes, and take away what says nothing.
-
-    Args:
-        axes: The axes.
-        x: What the horizontal axis shows, with its unit.
-        y: What the vertical axis shows, with its unit.
-    """
+    """Label axes, and take away what says nothing."""
     axes.set(xlabel=x, ylabel=y)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color=LINE)
@@ -123,12 +93,7 @@ def dress(axes: Axes, x: str, y: str) -> None:
 
 
 def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic, its numbers written out: powers would be formulas, which texts here are not.
-
-    Args:
-        axes: The axes, with what they show.
-        direction: Which of them.
-    """
+    """Make an axis logarithmic, its numbers written out: powers would be formulas, which texts here are not."""
     axes.set(**{f"{direction}scale": "log"})
     axis = axes.xaxis if direction == "x" else axes.yaxis
     low, high = sorted(axis.get_view_interval())
@@ -139,15 +104,7 @@ def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure.
-
-    Args:
-        figure: The figure.
-        path: File to write, as PNG or, if its name ends so, as SVG.
-
-    Returns:
-        The file.
-    """
+    """Write a figure as PNG or, if the file's name ends so, as SVG; returns the file."""
     with styled(), replacing(path) as partial:
         if path.suffix == ".svg":
             FigureCanvasSVG(figure).print_svg(partial, metadata={"Date": None})
@@ -159,12 +116,7 @@ def write(figure: Figure, path: Path) -> Path:
 def inline(figure: Figure, name: str) -> str:
     """A figure as an SVG element that takes its ink and its font from the page around it.
 
-    Args:
-        figure: The figure.
-        name: What its ids begin with.
-
-    Returns:
-        The element, which refers to nothing outside it.
+    Its ids begin with `name`, and it refers to nothing outside it.
     """
     written = StringIO()
     figure.patch.set_visible(False)

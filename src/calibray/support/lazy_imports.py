@@ -11,14 +11,9 @@ from typing import Any
 def lazy_attributes(
     package: str, homes: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Make the `__getattr__` and `__dir__` of a package (PEP 562).
+    """Make `__getattr__` and `__dir__` of a package (PEP 562), given the module that defines each name.
 
-    Args:
-        package: The package's name.
-        homes: The module that defines each name; for a submodule, its own name in full.
-
-    Returns:
-        The two functions.
+    For a submodule that is its own name in full.
     """
 
     def find(name: str) -> Any:

@@ -16,14 +16,7 @@ MAX_COMPARED: Final = 2_000
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The remedy for an unknown name, as a phrase to end a message with.
-
-    Args:
-        name: The name as given.
-        known: The valid names.
-
-    Returns:
-        ``did you mean 'x'?`` if a valid name is close, else the names, at most the first twenty.
+    """The remedy for an unknown name, to end a message with: a close valid name, else the first twenty.
 
     Example:
         >>> did_you_mean("concret", ["brick", "concrete"])
@@ -57,12 +50,7 @@ def shortened(text: str, longest: int = MAX_LENGTH) -> str:
 def printable(text: str, keep: str = "") -> str:
     r"""Escape the characters of a text that a terminal or an editor would interpret: names come from files.
 
-    Args:
-        text: The text.
-        keep: Characters that stay, for instance line breaks.
-
-    Returns:
-        The text with control, formatting and line-breaking characters as escape sequences of Python.
+    Characters in `keep`, for instance line breaks, stay; the others become escape sequences of Python.
 
     Example:
         >>> printable("RSS\x1b[2J\n[engine]")

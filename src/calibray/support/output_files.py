@@ -55,13 +55,7 @@ def exists(file: str | Path) -> bool:
 
 
 def check_folder(folder: str | Path) -> Path:
-    """Refuse a folder that no file can be written into.
-
-    Args:
-        folder: The folder, which need not exist.
-
-    Returns:
-        Its path.
+    """Refuse a folder that no file can be written into; it need not exist.
 
     Raises:
         InputError: The folder, or the one that it would be created in, is a file or cannot be written.
@@ -80,14 +74,8 @@ def check_outputs(
 ) -> Path:
     """Refuse a folder that files cannot be written into, or with files that must not be replaced.
 
-    Args:
-        folder: The folder, which need not exist.
-        names: The files that will be written there.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace files that Calibray did not write.
-
-    Returns:
-        The folder's path.
+    `inputs` are files that the work reads, which are never replaced. With `overwrite`, files are replaced that Calibray
+    did not write.
 
     Raises:
         InputError: As for `check_folder` and `check_replaceable`; or `.calibray` in the folder is not Calibray's.
@@ -100,15 +88,7 @@ def check_outputs(
 
 
 def check_file(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> Path:
-    """Refuse a file that cannot be written.
-
-    Args:
-        file: The file, which need not exist; its folder must.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace a file that Calibray did not write.
-
-    Returns:
-        Its path.
+    """Refuse a file that cannot be written; it need not exist, but its folder must. Else as `check_outputs`.
 
     Raises:
         InputError: It is a folder, its folder does not exist or cannot be written, or as for `check_outputs`.
@@ -142,11 +122,6 @@ def check_table(file: str | Path, inputs: Iterable[Path] = (), overwrite: bool =
 def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool = False) -> None:
     """Refuse to replace a file that must be kept; a file that does not exist may be written.
 
-    Args:
-        file: The output.
-        inputs: Files that the work reads; none of them is ever replaced.
-        overwrite: Replace a file that Calibray did not write.
-
     Raises:
         InputError: It is an input, a link, a device or a folder; or a file that Calibray did not write, or that was
             changed since, unless `overwrite`.
@@ -170,9 +145,6 @@ def check_replaceable(file: Path, inputs: Iterable[Path] = (), overwrite: bool =
 
 def check_unchanged(file: Path) -> None:
     """Refuse a file that Calibray signed and that was changed since; an unsigned file may have any content.
-
-    Args:
-        file: The file, which can be read.
 
     Raises:
         InputError: The file changed since it was written.
@@ -230,14 +202,7 @@ def _check_signature_file(folder: Path) -> None:
 
 
 def _open_signatures(folder: Path, flags: int) -> BinaryIO:
-    """Open the signature file of a folder.
-
-    Args:
-        folder: The folder.
-        flags: Flags of `os.open`.
-
-    Returns:
-        The open file.
+    """Open the signature file of a folder, with flags of `os.open`.
 
     Raises:
         InputError: It is a link, a folder or a device; another user owns it; it is too large; or another program wrote
@@ -297,12 +262,8 @@ def file_digest(file: Path) -> str:
 def replacing(path: Path, signed: bool = True) -> Iterator[Path]:
     """Write a file under a temporary name; it is signed and moved into place once it is complete.
 
-    Args:
-        path: The file.
-        signed: Whether to sign it in `.calibray`; files with a seal of their own need no signature.
-
-    Yields:
-        The temporary file in the same folder, which exists and is empty; removed if writing fails.
+    Files with a seal of their own need not be signed. Yields the temporary file in the same folder, which exists and is
+    empty; it is removed if writing fails.
 
     Raises:
         InputError: The file is a link, a device or a folder, `.calibray` is not Calibray's, or somebody exchanged the
@@ -388,16 +349,7 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
 
 
 def csv_text(table: pd.DataFrame, float_format: str | None = None, header: bool = True) -> str:
-    """A table as CSV without its index; texts that a spreadsheet would compute are marked by an apostrophe.
-
-    Args:
-        table: The table.
-        float_format: Format of the numbers, for instance "%.9g"; all digits if None.
-        header: Whether the first line names the columns.
-
-    Returns:
-        The lines, each with a line feed at its end.
-    """
+    """A table as CSV without its index; texts that a spreadsheet would compute are marked by an apostrophe."""
     names = [formula_free(name) for name in table.columns]
     safe, returns = table.set_axis(names, axis=1), any("\r" in str(name) for name in names)
     for number, kind in enumerate(table.dtypes):  # by position, since names may repeat
@@ -440,11 +392,7 @@ def without_formula_mark(cell: str) -> str:
 def growing_table(path: str | Path) -> Iterator[Callable[[pd.DataFrame], None]]:
     """Write a CSV or Parquet file in parts and move it into place once it is complete.
 
-    Args:
-        path: The file; its ending decides the format.
-
-    Yields:
-        A function that appends rows without their index; all calls must give the columns and types of the first one.
+    Yields a function that appends rows without their index; all calls must give the columns and types of the first one.
 
     Raises:
         InputError: As for `check_table`, or Parquet without pyarrow, or a column changes its type.

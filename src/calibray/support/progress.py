@@ -22,15 +22,7 @@ def with_stage(progress: Progress | None, stage: str) -> Progress | None:
 
 
 def with_total(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Report the progress of one of several parts as that of the whole work.
-
-    Args:
-        progress: Receives the reports; None for nobody.
-        before: Amount done before this part.
-        total: Amount of the whole work.
-
-    Returns:
-        The callback of the part.
+    """Report the progress of one of several parts, after the amount `before`, as that of the whole work.
 
     Example:
         >>> progress = with_total(lambda *parts: print(*parts), 100, 250)

@@ -55,14 +55,9 @@ class AntennaPattern:
         )
 
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
-        """Evaluate the Jones vectors of the antenna in the basis (theta, phi) of the wave.
+        """Jones vectors [P, ports, 2] in the wave's basis (theta, phi), for directions seen from the antenna [P, 3].
 
-        Args:
-            direction: Directions seen from the antenna; unit vectors [P, 3].
-            arriving: Whether the waves arrive from there; False if they depart.
-
-        Returns:
-            The vectors by port [P, ports, 2].
+        The waves arrive from there, or depart.
         """
         to_world = rotation_matrix(self.antenna.orientation)
         local = direction @ to_world
@@ -109,11 +104,7 @@ _AMPLITUDES: Final[dict[str, Amplitude]] = {
 
 
 def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Rotation [3, 3] from an antenna's frame into the scene frame (3GPP TR 38.901, eq. 7.1-4).
-
-    Args:
-        orientation: Rotation about z, y and x [rad].
-    """
+    """Rotation [3, 3] from an antenna's frame into the scene frame (3GPP TR 38.901, eq. 7.1-4)."""
     (cos_z, cos_y, cos_x), (sin_z, sin_y, sin_x) = np.cos(orientation), np.sin(orientation)
     about_z = np.array([[cos_z, -sin_z, 0], [sin_z, cos_z, 0], [0, 0, 1]])
     about_y = np.array([[cos_y, 0, sin_y], [0, 1, 0], [-sin_y, 0, cos_y]])
@@ -122,15 +113,7 @@ def rotation_matrix(orientation: tuple[float, float, float]) -> NDArray[np.float
 
 
 def rotate_jones(field: NDArray, rotation: NDArray[np.float64]) -> NDArray:
-    """Express Jones vectors in a rotated frame.
-
-    Args:
-        field: The vectors [P, ports, 2].
-        rotation: (cos, sin) of the angle from the old frame to the new one [P, 2].
-
-    Returns:
-        The vectors [P, ports, 2].
-    """
+    """Express Jones vectors [P, ports, 2] in a frame rotated by the angles with (cos, sin) `rotation` [P, 2]."""
     cos, sin = rotation[:, None, 0], rotation[:, None, 1]
     return np.stack(
         [cos * field[..., 0] + sin * field[..., 1], cos * field[..., 1] - sin * field[..., 0]], axis=-1

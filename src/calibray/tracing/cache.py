@@ -43,19 +43,9 @@ def trace_digest(
     tx: NDArray[np.float64],
     rx: NDArray[np.float64],
 ) -> str:
-    """Fingerprint of everything that a trace depends on.
+    """Fingerprint (SHA-256, in hexadecimal) of everything that a trace depends on.
 
-    Args:
-        versions: The tracer's programs and their versions.
-        scene: The scene; its materials count, because they decide how rays continue.
-        frequency: Carrier frequency [Hz].
-        settings: The tracer's settings.
-        antennas: Transmit and receive antenna.
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-
-    Returns:
-        SHA-256 in hexadecimal.
+    The scene's materials count, because they decide how rays continue.
     """
     record = {
         "calibray": version("calibray"),

@@ -54,13 +54,9 @@ class Convergence:
         return np.argsort(-np.abs(self.change_db), kind="stable")
 
     def quantile(self, share: float) -> float:
-        """Size of change that a share of the links does not exceed.
+        """Size of change [dB] that a share of the links does not exceed, 0.5 for the median.
 
-        Args:
-            share: The share, from 0 to 1: 0.5 for the median, 1 for the largest change.
-
-        Returns:
-            Absolute change of one of the links [dB]; +inf if too many links have a path in one trace only.
+        It is +inf if too many links have a path in one trace only.
         """
         return float(np.quantile(np.abs(self.change_db), share, method="higher"))
 
@@ -70,16 +66,7 @@ class Convergence:
 
 
 def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> Convergence:
-    """Compare two traces of the same links.
-
-    Args:
-        before: The paths found first.
-        after: The paths found with more rays.
-        samples: Rays per transmitter of the first trace.
-        path_loss: Computes the path loss to compare.
-
-    Returns:
-        The change of every link.
+    """Compare the path loss of two traces of the same links, the first with `samples` rays per transmitter.
 
     Raises:
         InputError: The links differ.
@@ -104,17 +91,7 @@ def compare(before: Paths, after: Paths, samples: int, path_loss: PathLoss) -> C
 def check(
     tracer: Tracer, links: Links, before: Paths, path_loss: PathLoss, progress: Progress | None = None
 ) -> Convergence:
-    """Trace links again with twice the rays and the next seed, and compare.
-
-    Args:
-        tracer: The tracer that traced them.
-        links: The links.
-        before: The paths that it found.
-        path_loss: Computes the path loss to compare.
-        progress: Called with ("tracing", receivers traced, receivers in all).
-
-    Returns:
-        The change of every link.
+    """Trace links again with twice the rays and the next seed, and compare with the paths found before.
 
     Raises:
         InputError: `before` holds other links, or its rays were added in rounds, of which the last is the check.
@@ -131,14 +108,7 @@ def check(
 
 
 def join(parts: Sequence[tuple[NDArray[np.int64], Convergence]]) -> Convergence:
-    """Join the changes of links that were traced in parts.
-
-    Args:
-        parts: At least one record, each with the numbers of its links among all; every link is in one part.
-
-    Returns:
-        One record of all links.
-    """
+    """Join the changes of links that were traced in parts, each with the numbers of its links among all."""
     count = sum(len(links) for links, _ in parts)
     change = np.empty(count)
     before, after = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)

@@ -63,15 +63,7 @@ class GainTable:
         return round(float(weight @ (10 ** (self.gain_dbi / 10)).mean(axis=1)) / 2, 12)
 
     def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate the gain.
-
-        Args:
-            azimuth_deg: Azimuth [...], [deg].
-            elevation_deg: Elevation [...], [deg], from -90 to 90.
-
-        Returns:
-            Gain [...], [dBi].
-        """
+        """Interpolate the gain [...], [dBi], at azimuths and elevations [...], [deg]; elevations from -90 to 90."""
         elevation_step, azimuth_step = self.steps_deg
         rows, columns = self.gain_dbi.shape
         row = (np.asarray(elevation_deg, dtype=float) + 90) / elevation_step
@@ -98,13 +90,9 @@ def is_gain_file(pattern: str) -> bool:
 def read_gain_table(path: str | Path) -> GainTable:
     """Read the gain of an antenna.
 
-    Args:
-        path: CSV file with the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order.
-            Azimuths cover a full turn (-180 to 180 or 0 to 360, with or without the end), elevations -90 to 90, both in
-            equal steps of at most 15 degrees; every pair of them has its row. Principal cuts alone are not enough.
-
-    Returns:
-        The table.
+    The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order. Azimuths
+    cover a full turn (-180 to 180 or 0 to 360, with or without the end), elevations -90 to 90, both in equal steps of
+    at most 15 degrees; every pair of them has its row. Principal cuts alone are not enough.
 
     Raises:
         InputError: The file or a column is missing or malformed, a number is out of range, a direction is missing or

@@ -120,15 +120,7 @@ def version_in_name(path: str) -> tuple[int, ...]:
 
 
 def judge(path: str, reported: tuple[int, ...]) -> Llvm:
-    """Decide whether Dr.Jit can use a library that opens.
-
-    Args:
-        path: Path or name of the library.
-        reported: The version that the library reports through `LLVMGetVersion`; empty if it reports none.
-
-    Returns:
-        The library with its version and, if it is not usable, the reason.
-    """
+    """Decide whether Dr.Jit can use a library that opens and reports a version; empty if it reports none."""
     version = reported or version_in_name(path)
     if not reported and (not version or version[0] >= 16):
         return Llvm(path, (), "it reports no LLVM version, as every libLLVM since 16 does")
@@ -165,13 +157,10 @@ def installed_libraries() -> tuple[Llvm, ...]:
 
 
 def select() -> Llvm:
-    """Set Dr.Jit's libLLVM; to be called before Dr.Jit is imported.
+    """Set Dr.Jit's libLLVM, to be called before Dr.Jit is imported; returns the library in use.
 
     A library named by `DRJIT_LIBLLVM_PATH` is used or refused, never ignored. Without one, the best installed library
     is chosen and `DRJIT_LIBLLVM_PATH` set to it, for this process and its children.
-
-    Returns:
-        The library in use.
 
     Raises:
         InputError: No library is usable, `DRJIT_LIBLLVM_PATH` names one that is missing or unusable, Dr.Jit was
@@ -213,10 +202,7 @@ def mitsuba_variant() -> str:
 
 
 def prepare() -> str:
-    """Make Dr.Jit safe to import: choose the variant and, if it compiles with LLVM, the library.
-
-    Returns:
-        The Mitsuba variant to set before `sionna.rt` is imported.
+    """Make Dr.Jit safe to import: returns the Mitsuba variant to set first, and chooses the LLVM that it needs.
 
     Raises:
         InputError: libatomic is missing, or there is no usable GPU and `select` finds no usable library.

@@ -19,13 +19,7 @@ LEAST_DISTANCE: Final = 1e-3
 
 
 def link_positions(links: Links) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of transmitters and receivers, checked.
-
-    Args:
-        links: The links.
-
-    Returns:
-        Transmitter and receiver of every link [L, 3] each, [m].
+    """Positions of transmitters and receivers [L, 3] each, [m], checked.
 
     Raises:
         InputError: There is no link, a position is not finite or too far away, or the ends of a link coincide.
@@ -65,15 +59,6 @@ class EnclosedAntennas:
 
     @classmethod
     def of(cls, row: NDArray[np.integer], tx: NDArray[np.bool_], rx: NDArray[np.bool_]) -> EnclosedAntennas:
-        """Collect the enclosed antennas.
-
-        Args:
-            row: Row of every link in the source file [L].
-            tx: Whether its transmitter is enclosed [L].
-            rx: Whether its receiver is enclosed [L].
-
-        Returns:
-            The rows concerned.
-        """
+        """Collect the rows of the source file [L] whose transmitter or receiver is enclosed [L]."""
         indoors = bool(np.mean(tx | rx) > 0.5)
         return cls(tuple(row[tx].tolist()), tuple(row[rx].tolist()), indoors)

@@ -73,13 +73,7 @@ class Tracer(Protocol):
         ...
 
     def plan(self, links: Links) -> TracePlan:
-        """Plan the launches of a trace.
-
-        Args:
-            links: The links.
-
-        Returns:
-            The launches, with an estimate of the memory that they take.
+        """Plan the launches of a trace, with an estimate of the memory that they take.
 
         Raises:
             InputError: There is no link, a position is not finite, or the ends of a link coincide.
@@ -146,17 +140,7 @@ class TracerFactory(Protocol):
         rx_antenna: Antenna,
         /,
     ) -> Tracer:
-        """Open a scene.
-
-        Args:
-            scene: The scene, with the materials to trace with.
-            frequency: Carrier frequency [Hz].
-            settings: The tracer's settings.
-            tx_antenna: Transmit antenna.
-            rx_antenna: Receive antenna.
-
-        Returns:
-            The tracer.
+        """Open a scene, with the materials to trace with.
 
         Raises:
             InputError: The tracer cannot load the scene, or does not support a setting or an antenna.
@@ -175,20 +159,10 @@ def compile_paths(
     antennas: tuple[AntennaPattern, AntennaPattern],
     settings: Mapping[str, object] | None = None,
 ) -> Paths:
-    """Compile the paths that a tracer found into a path program.
+    """Compile the paths that a tracer found, in any order, into a path program.
 
-    Args:
-        chains: The paths.
-        link: Link of every path, in any order [P].
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-        frequency: Carrier frequency [Hz].
-        materials: The materials by name, in the order of the material numbers of `chains`.
-        antennas: Transmit and receive antenna.
-        settings: How the paths were found; stored with them.
-
-    Returns:
-        The program, its paths ordered by link, and within a link as given.
+    Materials are in the order of the material numbers of `chains`; `link` [P] is the link of every path; `tx` and `rx`
+    are [L, 3], [m]. The program's paths are ordered by link, and within a link as given.
     """
     geometry = compile_chains(chains)
     departure, arrival = geometry.departure_direction, geometry.arrival_direction

@@ -152,12 +152,6 @@ class Antenna:
 def as_antenna(value: Antenna | Mapping[str, object] | None) -> Antenna:
     """Make an antenna from an antenna, a mapping of its attributes, or None for the default.
 
-    Args:
-        value: The antenna as the user gave it.
-
-    Returns:
-        The antenna.
-
     Raises:
         InputError: A key or value is unknown.
     """

@@ -140,29 +140,14 @@ def starts_at_receivers(tx: NDArray[np.float64], rx: NDArray[np.float64], settin
     A path is the same in both directions and is reversed after it was found. Diffuse reflection is not: the scattered
     direction, and the probability with which the tracer chose it, belong to one direction of travel. Such traces start
     at the transmitters.
-
-    Args:
-        tx: Transmitter of every link [L, 3], [m].
-        rx: Receiver of every link [L, 3], [m].
-        settings: The tracer's settings.
-
-    Returns:
-        True if the receivers send.
     """
     return not settings.diffuse_reflection and len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
 
 
 def plan_trace(source: NDArray[np.float64], settings: TraceSettings, lanes: int, buffer: int) -> TracePlan:
-    """Split a trace into launches.
+    """Split a trace into launches, given the end of every link that sends the rays [L, 3], [m].
 
-    Args:
-        source: The end of every link that sends the rays [L, 3], [m].
-        settings: The tracer's settings.
-        lanes: Rays x interactions x receivers that a launch may have.
-        buffer: Paths that the buffer of a launch holds at first.
-
-    Returns:
-        The launches.
+    A launch may have `lanes` rays x interactions x receivers, and its buffer holds `buffer` paths at first.
     """
     depth = max(settings.max_depth, 1)
     rays, adaptive = settings.rays, settings.adaptive
@@ -191,15 +176,9 @@ def launch_seed(seed: int, number: int) -> int:
 
 
 def lattice_directions(first: int, count: int, samples: int) -> NDArray[np.float64]:
-    """Points of the Fibonacci lattice on the unit square, which Sionna RT maps to the directions of its rays.
+    """Points [2, count] of the Fibonacci lattice of `samples` points, from the number `first` on.
 
-    Args:
-        first: Number of the first point.
-        count: Number of points.
-        samples: Number of points of the whole lattice.
-
-    Returns:
-        The points [2, count].
+    Sionna RT maps the unit square to the directions of its rays.
 
     Example:
         >>> lattice_directions(0, 3, 3)[1].tolist()
@@ -220,21 +199,11 @@ def find_repeats(
     vertex: NDArray[np.float64],
     is_sample: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Find the paths that an earlier one of several launches to the same receivers found already.
+    """Find the paths that an earlier one of several launches to the same receivers found already [P].
 
     A deterministic path is the same whichever ray found it: it meets the same objects in the same points. Paths with a
-    diffuse reflection are random samples, and each counts.
-
-    Args:
-        launch: Number of the launch that found each path, ascending [P].
-        link: Link of each path [P].
-        kind: Kinds of interaction, 0 beyond the last one [P, D].
-        shape: Objects met [P, D].
-        vertex: Interaction points [P, D, 3], [m].
-        is_sample: Whether each path is a random sample [P].
-
-    Returns:
-        True for the paths to leave out [P].
+    diffuse reflection are random samples, and each counts. The numbers of the launches ascend [P]; kinds of interaction
+    are 0 beyond the last one [P, D]; interaction points are [P, D, 3], [m].
     """
     repeats = np.zeros(len(link), dtype=bool)
     rows = np.flatnonzero(~is_sample)

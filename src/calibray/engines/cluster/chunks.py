@@ -87,18 +87,11 @@ def for_each_chunk(
     size: int,
     progress: Progress | None = None,
 ) -> list[tuple[NDArray[np.int64], Answer]]:
-    """Do some work once for every chunk of links.
+    """Do some work, a picklable function of the shared content and a chunk's links, once for every chunk.
 
-    Args:
-        workers: Do the work; a chunk whose worker dies is done again.
-        work: Function of the shared content and a chunk's links; picklable.
-        content: The shared content; whatever the work loads into it stays on the worker.
-        links: The links.
-        size: Largest number of links of a chunk.
-        progress: Called with "tracing", the links done and all links, after every chunk.
-
-    Returns:
-        Indices of every chunk's links, and the answer of the work.
+    Whatever the work loads into `content` stays on the worker; a chunk whose worker dies is done again. `progress` is
+    called with "tracing", the links done and all links, after every chunk. Returns the indices of every chunk's links,
+    and the answer of the work.
 
     Raises:
         EngineError: Workers keep dying, or none is left.
@@ -145,12 +138,7 @@ def stated_chunk_size(study: OpenedStudy) -> int | None:
 def cut(links: Measurements, size: int) -> list[NDArray[np.int64]]:
     """Cut links into chunks of about equal size, each with few positions to launch rays from.
 
-    Args:
-        links: The links.
-        size: Largest number of links of a chunk.
-
-    Returns:
-        Indices of every chunk's links, in ascending order.
+    Returns the indices of every chunk's links, in ascending order.
 
     Example:
         >>> links = Measurements(tx=[[0, 0, 9], [5, 0, 9]] * 2, rx=np.arange(12).reshape(4, 3), path_loss_db=[80] * 4)
@@ -181,14 +169,8 @@ def trace_in_chunks(
 ) -> tuple[Paths, Convergence | None]:
     """Trace a study's links in the same chunks as a calibration, or take them from the cache.
 
-    Args:
-        study: The opened study.
-        workers: Trace the chunks.
-        check: Trace every chunk again with twice the samples, unless samples are added in rounds.
-        progress: Called with "tracing" after every chunk.
-
-    Returns:
-        The path program of all links, and the changes of path loss when traced again, if `check`.
+    With `check`, every chunk is traced again with twice the samples, unless samples are added in rounds. Returns the
+    path program of all links, and the changes of path loss when traced again, if `check`.
 
     Raises:
         InputError: The links cannot be traced.

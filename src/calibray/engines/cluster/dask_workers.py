@@ -206,13 +206,7 @@ class DaskWorkers:
 
 @contextmanager
 def scheduler_client(scheduler: str) -> Iterator[Client]:
-    """Connect to a Dask scheduler.
-
-    Args:
-        scheduler: Its address, for instance "tcp://10.0.0.1:8786".
-
-    Yields:
-        The client, closed at the end.
+    """Connect to a Dask scheduler at an address such as "tcp://10.0.0.1:8786"; the client is closed at the end.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.

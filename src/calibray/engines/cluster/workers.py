@@ -27,14 +27,9 @@ class Workers(Protocol):
         ...
 
     def keep(self, make: Callable[[Any], Any], sources: Sequence[Any]) -> Sized:
-        """Make an object for every chunk and keep it on the chunk's worker until the return value is deleted.
+        """Make an object for every chunk and keep it on the chunk's worker until the returned handle is deleted.
 
-        Args:
-            make: Makes the object from its source; picklable.
-            sources: The source for every chunk.
-
-        Returns:
-            A handle for `ask`, with one entry per chunk.
+        `make` makes the object from its source and is picklable.
         """
         ...
 
@@ -45,16 +40,10 @@ class Workers(Protocol):
         *arguments: Any,
         answered: Answered | None = None,
     ) -> list[Any]:
-        """Call a function on the objects that are kept with every chunk.
+        """Call a picklable function on the objects that are kept with every chunk; the answers by chunk.
 
-        Args:
-            function: The function; picklable.
-            kept: Handles from `keep`; the objects are the function's first arguments.
-            *arguments: Further arguments, the same for all chunks.
-            answered: Called with a chunk's number after its answer.
-
-        Returns:
-            The answers in the order of the chunks.
+        The objects, by their handles from `keep`, are the function's first arguments; the further ones are the same for
+        all chunks. `answered` is called with a chunk's number after its answer.
 
         Raises:
             EngineError: Workers keep dying, or none is left.

@@ -57,12 +57,7 @@ class Request:
     carriers: Mapping[float, Mapping[str, Material]] = field(default_factory=dict)
 
     def write(self, path: Path, file_format: str) -> None:
-        """Write the request.
-
-        Args:
-            path: The file.
-            file_format: "json" or "hdf5".
-        """
+        """Write the request as "json" or "hdf5"."""
         if file_format == "json":
             path.write_text(json.dumps(self._json()) + "\n", encoding="utf-8")
         else:
@@ -125,15 +120,7 @@ def _write_materials(group: h5py.Group, materials: Mapping[str, Material]) -> No
 
 
 def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.float64]:
-    """Read the path loss from a program's response.
-
-    Args:
-        path: The file.
-        file_format: "json" or "hdf5".
-        num_links: Number of links L.
-
-    Returns:
-        Path loss [L], [dB]; +inf where a link has no path.
+    """Read the path loss [L], [dB], from a program's response; +inf where a link has no path.
 
     Raises:
         Unusable: The file is missing or malformed, or does not hold one path loss per link.

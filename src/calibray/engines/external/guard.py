@@ -55,15 +55,7 @@ class Output:
 
 
 def main(timeout: float, words: list[str]) -> dict[str, object]:
-    """Run a program until it ends, exceeds its time limit, or Calibray ends or stops it.
-
-    Args:
-        timeout: The time limit [s].
-        words: The program and its arguments.
-
-    Returns:
-        The report for Calibray.
-    """
+    """Run a program until it ends, exceeds its time limit [s], or Calibray ends or stops it; report how."""
     prctl = _prctl()
     prctl(PR_SET_CHILD_SUBREAPER, 1)
     streams = [os.pipe(), os.pipe()]

@@ -97,12 +97,8 @@ class ExternalProgram:
     def run(self, request: Request, stop: Event | None = None) -> Outcome:
         """Call the program for one candidate, and again after a failure until no attempts are left.
 
-        Args:
-            request: The request.
-            stop: Set from outside to kill the program.
-
-        Returns:
-            The outcome. A failure is returned, not raised, so that it costs one candidate and not the batch.
+        A failure is returned, not raised, so that it costs one candidate and not the batch. `stop` is set from outside
+        to kill the program.
 
         Raises:
             Stopped: `stop` was set before there was an answer.

@@ -103,15 +103,9 @@ def trace_and_replay(
 
 
 def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -> Replay | ReplayCarriers:
-    """The replay of an opened study on stored paths.
+    """The replay of an opened study on stored paths, with one program per carrier.
 
-    Args:
-        study: The opened study.
-        paths: The paths of its links, at the study's carrier.
-        compress_db: Largest error of path loss [dB] if few weighted paths approximate all; all are kept if None.
-
-    Returns:
-        The engine, with one program per carrier if the links have several carriers.
+    `compress_db` is the largest error of path loss [dB] if few weighted paths approximate all.
     """
     from calibray.engines.compression import compress
     from calibray.engines.multi_carrier import CarrierPaths, ReplayCarriers

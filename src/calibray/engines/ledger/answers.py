@@ -56,17 +56,7 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a row of a ledger.
-
-    Args:
-        problem: Fingerprint of the problem.
-        candidate: The candidate, by `key`.
-        columns: Path loss as bytes, seconds, failure and digest.
-        num_links: Number of links L; any if None.
-
-    Returns:
-        The entry, or the damage of the row.
-    """
+    """Read an entry from a row of a ledger: path loss as bytes, seconds, failure and digest; or its damage."""
     blob, seconds, failure, digest = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of another type"

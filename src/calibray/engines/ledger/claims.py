@@ -30,17 +30,7 @@ _observed: dict[tuple[str, bytes, str], tuple[float, float]] = {}
 
 
 def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Sequence[bytes]) -> list[bytes]:
-    """Claim candidates, within a transaction of the caller.
-
-    Args:
-        connection: The ledger.
-        run: The run that claims.
-        problem: Fingerprint of the problem.
-        candidates: The candidates, by `key`.
-
-    Returns:
-        The candidates that no other run has claimed.
-    """
+    """Claim candidates, within a transaction of the caller; those that no other run has claimed."""
     now, owner = time.time(), json.dumps(ProcessOwner.current().record())
     _active_runs.add(run)
     claimed = []
@@ -64,14 +54,8 @@ def claim(connection: sqlite3.Connection, run: str, problem: str, candidates: Se
 def _is_valid(claimed: tuple[str, bytes, str], owner: object, expires: object, now: float) -> bool:
     """Whether a claim of another run still holds.
 
-    Args:
-        claimed: Problem, candidate and run.
-        owner: The process of the run, as JSON.
-        expires: When its run expects the claim to end [s since 1970, by the clock of its machine].
-        now: The time by the clock of this machine [s since 1970].
-
-    Returns:
-        False if the process has ended, or gave no sign of life for `EXPIRY`.
+    It does not if the process has ended, or gave no sign of life for `EXPIRY`. `expires` and `now` are [s since 1970],
+    by the clock of its machine and of this one.
     """
     if not isinstance(expires, float) or not abs(expires - now) <= SKEW + EXPIRY:
         return False

@@ -33,10 +33,6 @@ _COLUMNS: Final = {
 def set_up(connection: sqlite3.Connection, path: Path) -> None:
     """Create the tables of a new ledger, and refuse a file that is not a ledger.
 
-    Args:
-        connection: The file.
-        path: Its path, for messages.
-
     Raises:
         InputError: The file is another database, or a ledger of another version.
         sqlite3.OperationalError: Other programs lock the file for too long, or it cannot be used.

@@ -107,11 +107,6 @@ class Ledger:
     def describe(self, problem: str, engine: str, parameters: Sequence[str]) -> None:
         """Write the names that a problem's candidates are listed with.
 
-        Args:
-            problem: Fingerprint of the problem.
-            engine: Name of the engine.
-            parameters: Names of the parameters.
-
         Raises:
             EngineError: The ledger cannot be written.
         """
@@ -119,15 +114,7 @@ class Ledger:
             insert_problem(self._connection, problem, engine, parameters)
 
     def find(self, problem: str, candidate: bytes, num_links: int) -> LedgerEntry | None:
-        """The entry of a candidate; a damaged entry is deleted with a warning.
-
-        Args:
-            problem: Fingerprint of the problem.
-            candidate: The candidate, by `key`.
-            num_links: Number of links L.
-
-        Returns:
-            The entry, or None if there is none.
+        """The entry of a candidate, or None; a damaged entry is deleted with a warning.
 
         Raises:
             EngineError: The ledger cannot be read.
@@ -148,13 +135,7 @@ class Ledger:
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
         """Claim candidates that this run will pay for; `commit` and the end of `working` end the claims.
 
-        Args:
-            problem: Fingerprint of the problem, described before.
-            candidates: The candidates, by `key`.
-            num_links: Number of links L.
-
-        Returns:
-            The candidates without an answer that no other run has claimed.
+        Returns the candidates without an answer that no other run has claimed.
 
         Raises:
             InputError: The ledger is read-only.
@@ -182,15 +163,7 @@ class Ledger:
             claims.release(self._connection, self._run)
 
     def commit(self, problem: str, candidate: bytes, entry: LedgerEntry) -> LedgerEntry:
-        """Write an entry, unless another run has written one first.
-
-        Args:
-            problem: Fingerprint of the problem, described before.
-            candidate: The candidate, by `key`.
-            entry: The entry.
-
-        Returns:
-            The entry that the ledger holds on disk: this one, or the other run's.
+        """Write an entry, unless another run has written one first; returns the entry that is on disk.
 
         Raises:
             EngineError: The ledger cannot take it; `rescue` keeps it in a file.
@@ -212,17 +185,7 @@ class Ledger:
         parameters: Sequence[str],
         answers: Sequence[tuple[bytes, LedgerEntry]],
     ) -> str:
-        """Keep answers that the ledger could not take in a rescue file.
-
-        Args:
-            problem: Fingerprint of the problem.
-            engine: Name of the engine.
-            parameters: Names of the parameters.
-            answers: Candidates, by `key`, and their entries.
-
-        Returns:
-            A sentence that names the file.
-        """
+        """Keep answers that the ledger could not take in a rescue file; returns a sentence that names it."""
 
         def fill(connection: sqlite3.Connection) -> None:
             set_up(connection, self.path)
@@ -234,13 +197,7 @@ class Ledger:
         return _describe_rescue(write_rescue_file(self.path, fill), len(answers))
 
     def forget_failures(self, problem: str | None = None) -> int:
-        """Delete failed calls, so that they are run again.
-
-        Args:
-            problem: Fingerprint of the problem; all problems if None.
-
-        Returns:
-            Number of calls deleted.
+        """Delete failed calls of a problem, or of all, so that they are run again; their number.
 
         Raises:
             InputError: The ledger is read-only.
@@ -256,12 +213,8 @@ class Ledger:
     def table(self, path_loss: bool = False) -> pd.DataFrame:
         """All RT calls in the order of their commits; damaged calls are left out with a warning.
 
-        Args:
-            path_loss: Add one column per link: `link_1`, `link_2`, ... [dB].
-
-        Returns:
-            Columns `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or "failed"),
-            `message`, and one per parameter.
+        Columns are `problem` (the start of its fingerprint), `engine`, `time`, `seconds`, `status` ("ok" or "failed"),
+        `message`, one per parameter and, with `path_loss`, one per link: `link_1`, `link_2`, ... [dB].
 
         Raises:
             EngineError: The ledger cannot be read.
@@ -311,12 +264,6 @@ class Ledger:
 
 def open_ledger(folder: str | Path) -> Ledger:
     """The ledger of a folder that `calibray run` has written to.
-
-    Args:
-        folder: The folder.
-
-    Returns:
-        Its ledger.
 
     Raises:
         InputError: There is none, or it cannot be read.

@@ -29,15 +29,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 
 def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) -> Path | None:
-    """Write a rescue file in the first folder that can be written.
-
-    Args:
-        ledger: The ledger that its answers belong to.
-        fill: Writes the answers.
-
-    Returns:
-        The file; None if no folder can be written.
-    """
+    """Write a ledger's rescue file in the first folder that can be written; None if there is none."""
     for folder, prefix in _folders(ledger):
         file = folder / f"{prefix}{uuid.uuid4().hex}{SUFFIX}"
         partial = file.with_suffix(".part")
@@ -58,14 +50,7 @@ def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) 
 
 
 def rescue_files(ledger: Path) -> Iterator[Path]:
-    """The rescue files of a ledger; a damaged file is renamed with a warning.
-
-    Args:
-        ledger: The ledger.
-
-    Yields:
-        The files.
-    """
+    """The rescue files of a ledger; a damaged file is renamed with a warning."""
     for folder, prefix in _folders(ledger):
         for file in sorted(folder.glob(f"{prefix}*{SUFFIX}")):
             try:

@@ -93,16 +93,7 @@ class ErrorRecord:
 
 
 def average(corrected: Corrected, starts: NDArray[np.float64], random: np.random.Generator) -> Averaged:
-    """Draw members around a corrected model.
-
-    Args:
-        corrected: The model, with its most likely constants [q].
-        starts: Constants from which members are fitted, one each [s, q].
-        random: Random numbers.
-
-    Returns:
-        The model and those members that explain the answers nearly as well.
-    """
+    """Fit members from constants [s, q] around a model; keep those that explain the answers nearly as well."""
     prior = corrected.model.constants
     size = len(prior.centre)
     if not size:

@@ -52,15 +52,7 @@ class Response:
 
     @staticmethod
     def of(residuals: NDArray[np.float64], known: NDArray[np.bool_]) -> Response:
-        """Measure it.
-
-        Args:
-            residuals: Residuals at points spread over the box [k, m].
-            known: Residuals that the model predicts [m].
-
-        Returns:
-            The response.
-        """
+        """Measure it on residuals at points spread over the box [k, m]; `known` says which the model predicts [m]."""
         centre = residuals.mean(axis=0)
         scale = float(np.sqrt(np.mean((residuals - centre)[:, known] ** 2))) if known.any() else 0.0
         return Response(known, centre, max(scale, 1e-6 * max(float(np.abs(residuals).max()), 1e-6)))
@@ -105,14 +97,7 @@ class Corrected:
         return self.discrepancy.root
 
     def predict(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Predict residuals.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Mean [k, m], and the variance relative to that of each residual [k].
-        """
+        """Predicted mean [k, m] at points [k, d], and variance relative to that of each residual [k]."""
         cheap, inputs = self.base(unit)
         mean, share = self.discrepancy.predict(inputs)
         return cheap + mean, share
@@ -123,28 +108,17 @@ class Corrected:
         return cheap + self.discrepancy.mean(inputs), slope + self.discrepancy.slope(inputs, response_slope)
 
     def base(self, unit: NDArray[np.float64]) -> tuple[NDArray[np.float64], Inputs]:
-        """Residuals of the cheap model with adjusted constants.
-
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Residuals [k, m], and the points as the discrepancy sees them.
-        """
+        """Residuals [k, m] of the cheap model with adjusted constants, and the points as the discrepancy sees them."""
         cheap = cheap_residuals(self.model, self.box, unit, self.constants)
         return cheap, self.response.inputs(unit, cheap)
 
     def base_and_slope(
         self, unit: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Inputs, NDArray[np.float64]]:
-        """Residuals of the cheap model with adjusted constants, and derivatives by the coordinates of the unit cube.
+        """What `base` gives, and both derivatives by the coordinates of the unit cube.
 
-        Args:
-            unit: Points of the unit cube [k, d].
-
-        Returns:
-            Residuals [k, m], their derivatives [k, m, d], the points as the discrepancy sees them, and the derivatives
-            of their responses [k, r, d].
+        Residuals [k, m], their derivatives [k, m, d], the points as the discrepancy sees them, and the derivatives of
+        their responses [k, r, d].
         """
         cheap, slope = cheap_and_slope(self.model, self.box, unit, self.constants)
         return cheap, slope, self.response.inputs(unit, cheap), self.response.scaled(slope)
@@ -175,20 +149,11 @@ def correct(
     noisy: bool = False,
     before: Corrected | None = None,
 ) -> Corrected:
-    """Fit a corrected model to the answers of an engine.
+    """Fit a corrected model to an engine's answers [n, m] at points of the unit cube [n, d].
 
-    Args:
-        model: The cheap model.
-        box: The box searched.
-        unit: The evaluated points, in the unit cube [n, d].
-        residuals: The answers [n, m].
-        cloud: Points spread over the unit cube, at which the cheap model's response is measured [k, d].
-        trials: Constants; the input mapping starts from the likeliest of them and from those before [s, q].
-        noisy: Whether the answers scatter.
-        before: The model of fewer points, to go on from.
-
-    Returns:
-        The model.
+    At the points of `cloud` [k, d] the cheap model's response is measured. The input mapping starts from the likeliest
+    of the `trials` [s, q] and from the constants of `before`, the model of fewer points. `noisy` says whether the
+    answers scatter.
     """
 
     def with_discrepancy(constants: NDArray[np.float64], guess: tuple[Kernel, float] | None) -> Corrected:
@@ -237,14 +202,9 @@ def constants_fit(
 ) -> Callable[[NDArray[np.float64]], Residuals]:
     """The least squares problem of the constants, with the covariance of the discrepancy held.
 
-    Args:
-        corrected: The model whose constants are fitted.
-        centre: Centre of their prior [q]; that of the cheap model if None.
-        noise: Disturbance of the answers, in their standard deviations [n m]; none if None.
-
-    Returns:
-        A function of constants, in the unit cube between their bounds [s, q], that gives rows and their Jacobian; half
-        the sum of squares of the rows is the negative log density.
+    The prior has its centre at `centre` [q], or at that of the cheap model. `noise` disturbs the answers, in their
+    standard deviations [n m]. Returns a function of constants, in the unit cube between their bounds [s, q], that gives
+    rows and their Jacobian; half the sum of squares of the rows is the negative log density.
     """
     model, process, prior = corrected.model, corrected.discrepancy, corrected.model.constants
     points, width = corrected.box.from_unit(corrected.unit), prior.width
@@ -270,17 +230,10 @@ def constants_fit(
 
 
 def misfit(corrected: Corrected, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Negative log density of constants, with the kernel of the discrepancy held.
+    """Negative log density [s] of constants [s, q] up to a constant, with the kernel of the discrepancy held.
 
     The variances of the links are integrated out. So a link that the present constants do not explain counts fully for
     others that may.
-
-    Args:
-        corrected: The model whose constants are judged.
-        constants: Constants [s, q].
-
-    Returns:
-        Their negative log density up to a constant [s].
     """
     model, prior = corrected.model, corrected.model.constants
     points, (count, links) = corrected.box.from_unit(corrected.unit), corrected.residuals.shape

@@ -60,17 +60,10 @@ def fit(
     noisy: bool = False,
     guess: Kernel | None = None,
 ) -> Process:
-    """Fit the process, by the largest posterior density of its hyperparameters.
+    """Fit the process to discrepancies [n, m], by the largest posterior density of its hyperparameters.
 
-    Args:
-        inputs: The evaluated points, at least one.
-        values: Discrepancy there [n, m].
-        scale: Root mean square of the cheap model's response, which the prior is relative to.
-        noisy: Learn the nugget too, for an engine whose answers scatter.
-        guess: A kernel to start from as well as the prior's.
-
-    Returns:
-        The process.
+    The prior is relative to `scale`, the root mean square of the cheap model's response. `noisy` learns the nugget too.
+    `guess` is a kernel to start from as well as the prior's.
     """
     d, low = inputs.unit.shape[1], float(np.log(NUGGET))
     three, rates = np.ones(3), np.ones(d)
@@ -92,13 +85,9 @@ def solve(inputs: Inputs, values: NDArray[np.float64], kernel: Kernel) -> Proces
 
 
 def negative_log_density(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Negative log density of discrepancies, a multivariate t, up to a constant.
+    """Negative log density [...] of discrepancies [..., n, m], a multivariate t, up to a constant.
 
-    Args:
-        whitened: Discrepancies times the inverse of the Cholesky factor of K [..., n, m].
-
-    Returns:
-        Its sum over the residuals [...].
+    They are whitened by the inverse of the Cholesky factor of K.
     """
     count, square = whitened.shape[-2], np.sum(whitened**2, axis=-2)
     return 0.5 * (FREEDOM + count) * np.log1p(square / FREEDOM).sum(axis=-1)

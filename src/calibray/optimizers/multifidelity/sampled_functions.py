@@ -74,29 +74,12 @@ class SampledFunction:
         return self.prior.values(at) + self.rest.mean(at)
 
     def slopes(self, at: Inputs, response_slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Its derivatives.
-
-        Args:
-            at: Points [k].
-            response_slope: Derivatives of their responses by the coordinates of the unit cube [k, r, d].
-
-        Returns:
-            Derivatives by these coordinates [k, m, d].
-        """
+        """Derivatives [k, m, d] by the unit cube's coordinates, given those of the responses [k, r, d]."""
         return self.prior.slopes(at, response_slope) + self.rest.slope(at, response_slope)
 
 
 def sample_function(process: Process, random: np.random.Generator, stretch: float = 1.0) -> SampledFunction:
-    """Draw a function.
-
-    Args:
-        process: The process.
-        random: Random numbers.
-        stretch: Factor of its deviations from the mean; 0 gives the mean.
-
-    Returns:
-        The function.
-    """
+    """Draw a function; `stretch` multiplies its deviations from the mean, and 0 gives the mean."""
     inputs, kernel = process.inputs, process.kernel
     (count, d), residuals = inputs.unit.shape, process.values.shape[1]
     size = stretch * np.sqrt(kernel.variances)
@@ -122,14 +105,6 @@ def sample_function(process: Process, random: np.random.Generator, stretch: floa
 
 
 def standardized_error(process: Process, points: NDArray[np.intp]) -> float:
-    """Errors at points that are left out, relative to what the process expects of them.
-
-    Args:
-        process: The process.
-        points: Indices of the points.
-
-    Returns:
-        Root mean square of the errors over their standard deviations; 1 where the stated uncertainty is right.
-    """
+    """Root mean square, over expected standard deviations, of errors at points left out; 1 if those are right."""
     expected = 1.0 / np.outer(process.inverse_diagonal, process.precision)
     return float(np.sqrt(np.mean((process.left_out_errors() ** 2 / expected)[points])))

@@ -318,11 +318,7 @@ class SpaceMapping(Optimizer):
 def error_ratio(corrected: Corrected) -> float:
     """Squared errors of points predicted from all the others, with the cheap model over without it.
 
-    Args:
-        corrected: The cheap model, corrected by three points or more.
-
-    Returns:
-        The ratio of the median link; the cheap model helps below 1.
+    The ratio of the median link, from three points or more; the cheap model helps below 1.
     """
     residuals = corrected.residuals
     scale = max(float(residuals.std(axis=0).max()), 1e-12)

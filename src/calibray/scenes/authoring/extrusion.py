@@ -58,13 +58,7 @@ class Windows:
             raise InputError(f"module = {self.module!r}: must be a finite number of metres greater than 0")
 
     def divide(self, edge: Edge) -> list[tuple[Point, int]]:
-        """Divide a wall into strips.
-
-        Args:
-            edge: Its two ends [mm].
-
-        Returns:
-            Where the strips begin, from the first end, and the kind of each: `WALL` or `WINDOW`.
+        """Divide a wall, given its two ends [mm], into strips: where each begins and its kind, `WALL` or `WINDOW`.
 
         Example:
             >>> Windows(0.5, module=2.0).divide(((0, 0), (2000, 0)))
@@ -102,16 +96,10 @@ class Shell:
 def extrude(
     cells: Sequence[Cell], windows: Windows | None = None, ground: NDArray[np.float64] | None = None
 ) -> Shell:
-    """Raise buildings on their cells.
+    """Raise buildings on their cells, with heights in the scene's frame.
 
-    Args:
-        cells: The cells, with heights in the scene's frame.
-        windows: How walls are divided; None for walls without windows.
-        ground: Height of the ground under each building [n], [m]. Bodies that stand on it stay open at the bottom. None
-            closes all bodies.
-
-    Returns:
-        The shell, closed except for the open bottoms.
+    Without `windows` walls are whole. `ground` is the height of the ground under each building [n], [m]; bodies that
+    stand on it stay open at the bottom, and the shell is closed but for these. None closes all bodies.
     """
     outlines = [_rings(cell.polygon) for cell in cells]
     standing = [
@@ -144,14 +132,7 @@ def extrude(
 
 
 def to_millimetres(length: float) -> int:
-    """Round a length.
-
-    Args:
-        length: The length [m].
-
-    Returns:
-        The length [mm].
-    """
+    """Round a length [m] to whole millimetres."""
     return round(length / MILLIMETRE)
 
 
@@ -205,16 +186,8 @@ def wall_triangles(
 ) -> Iterator[tuple[Corner, Corner, Corner]]:
     """Divide an upright rectangle into triangles, counter-clockwise seen from the right of the line left to right.
 
-    Args:
-        left: x and y of one side [mm].
-        right: x and y of the other side [mm].
-        left_levels: Heights of the corners on the column over `left`, both ends included [mm], ascending.
-        right_levels: The same over `right`.
-        low: Bottom [mm].
-        high: Top [mm].
-
-    Yields:
-        Three corners of each triangle [mm].
+    All numbers are in mm. `left` and `right` are x and y of the sides; `left_levels` and `right_levels` are the heights
+    of the corners on their columns, both ends included, ascending. Yields three corners of each triangle.
     """
     left_column = [(*left, level) for level in left_levels if low <= level <= high]
     right_column = [(*right, level) for level in right_levels if low <= level <= high]
@@ -266,13 +239,9 @@ def _with_strips(ring: Sequence[Point], strips: Strips) -> list[Point]:
 
 
 def triangulate(polygons: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons without new corners.
+    """Triangulate polygons [n], [mm], holes allowed, without new corners.
 
-    Args:
-        polygons: Polygons, holes allowed [n], [mm].
-
-    Returns:
-        Corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each [F], ascending.
+    Returns the corners of the triangles, counter-clockwise [F, 3, 2], [mm], and the polygon of each [F], ascending.
     """
     shapely = library("shapely", "scenes")
     parts, polygon = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons), return_index=True)

@@ -57,17 +57,11 @@ class HeightRule:
                 )
 
     def heights(self, tags: Mapping[str, str]) -> tuple[float, float, HeightSource]:
-        """Find the bottom and top of a building from OpenStreetMap tags.
+        """Find bottom [m], top [m] and the source of the top of a building from its OpenStreetMap tags.
 
         `height` and `min_height` have priority, then `building:levels` and `building:min_level` times `storey`, then
-        `default`. All heights are above the ground; those above `HIGHEST` are ignored. Roof shapes are ignored: the
-        roof is flat at `height`.
-
-        Args:
-            tags: The building's tags.
-
-        Returns:
-            Bottom [m], top [m], and the source of the top. A stated top that is not above the bottom is ignored.
+        `default`. All heights are above the ground; those above `HIGHEST` are ignored, as is a stated top that is not
+        above the bottom. Roof shapes are ignored: the roof is flat at `height`.
 
         Example:
             >>> HeightRule().heights({"building": "yes", "building:levels": "4"})
@@ -87,13 +81,7 @@ class HeightRule:
 
 
 def parse_length(text: str | None) -> float | None:
-    r"""Parse a length as written on maps.
-
-    Args:
-        text: A number with or without a unit: `12`, `12.5 m`, `40 ft`, `40'6"`.
-
-    Returns:
-        The length [m]; None if there is none or it cannot be read.
+    r"""Parse a length as written on maps, with or without a unit [m]; None if it cannot be read.
 
     Example:
         >>> parse_length("12,5 m"), parse_length("10'6\""), parse_length("tall")
@@ -151,13 +139,8 @@ class Footprints:
 def clean_footprints(raw: Footprints, grid: float = GRID, smallest: float = 1.0) -> Footprints:
     """Repair outlines so that buildings can be raised on them: on a grid, without self-crossings, not too small.
 
-    Args:
-        raw: Footprints as read from a map.
-        grid: Corners are rounded to multiples of this [m].
-        smallest: Outlines of less area are left out [m^2].
-
-    Returns:
-        The footprints, with unique names; repairs are counted.
+    Corners are rounded to multiples of `grid` [m]; outlines of less area than `smallest` [m^2] are left out. Repairs
+    are counted, and names are unique.
 
     Raises:
         InputError: A height is not a number or above `HIGHEST`, or the buildings lie further apart than `WIDEST`.
@@ -218,15 +201,7 @@ def _check_extent(polygons: NDArray[Any], names: Sequence[str]) -> None:
 
 
 def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
-    """Project outlines to the scene's frame.
-
-    Args:
-        polygons: Outlines in a reference system [n]; their heights are ignored.
-        frame: The scene's frame.
-        crs: The reference system.
-
-    Returns:
-        Outlines [n], [m].
+    """Project outlines [n] from a reference system to the scene's frame [m]; their heights are ignored.
 
     Raises:
         InputError: A corner lies outside the area of the frame's projection.
@@ -239,12 +214,6 @@ def project(polygons: NDArray[Any], frame: Frame, crs: str) -> NDArray[Any]:
 
 def make_unique(names: Sequence[str]) -> list[str]:
     """Make names usable for files and objects: letters, digits, `_` and `-` only, and no two alike.
-
-    Args:
-        names: The original names.
-
-    Returns:
-        One name for each, in the same order.
 
     Example:
         >>> make_unique(["Town hall", "Town/hall", '"><x'])

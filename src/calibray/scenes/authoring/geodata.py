@@ -81,14 +81,7 @@ class Features:
 
 
 def read_features(path: Path, layer: str | None) -> Features:
-    """Read a vector file.
-
-    Args:
-        path: The file, in one of `VECTOR_FORMATS`.
-        layer: Layer of the file, if it has several.
-
-    Returns:
-        Its features.
+    """Read the features of a vector file in one of `VECTOR_FORMATS`, or of one of its layers.
 
     Raises:
         InputError: The file does not exist, has another format, is damaged, or does not fit into memory.
@@ -215,14 +208,7 @@ class HeightModel:
     metres: float
 
     def read(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> np.ma.MaskedArray:
-        """Read heights.
-
-        Args:
-            first: First row and column [2].
-            last: Last row and column [2].
-
-        Returns:
-            Heights [rows, columns], [m]; gaps are masked.
+        """Heights [rows, columns], [m], from a first row and column to a last; gaps are masked.
 
         Raises:
             InputError: There are too many, they cannot be read, or one is not a height on land.
@@ -256,13 +242,7 @@ class HeightModel:
 
 @contextmanager
 def open_height_model(path: Path) -> Iterator[HeightModel]:
-    """Open a height model.
-
-    Args:
-        path: A GeoTIFF.
-
-    Yields:
-        The model.
+    """Open a height model, a GeoTIFF.
 
     Raises:
         InputError: The file does not exist, is not a GeoTIFF or cannot be used: it states no reference system or unit

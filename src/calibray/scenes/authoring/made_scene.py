@@ -129,17 +129,9 @@ def write_made_scene(
 ) -> MadeScene:
     """Write a scene and the assumptions made.
 
-    Args:
-        folder: Where to write.
-        objects: Its meshes.
-        materials: Their materials; further ones, and the same one several times, do not matter.
-        frame: Where it lies on the globe, if known.
-        counts: Number of objects used, repaired or left out, by what they are.
-        guessed: The buildings whose height is a guess, by the source of the guess.
-        overwrite: Replace files that Calibray did not write.
-
-    Returns:
-        The scene.
+    Further materials, and the same one several times, do not matter. `counts` is the number of objects used, repaired
+    or left out, by what they are; `guessed` are the buildings whose height is a guess, by the source of the guess. With
+    `overwrite`, files are replaced that Calibray did not write.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be

@@ -46,15 +46,9 @@ class Cell:
 def split_overlaps(
     footprints: Footprints, bottom: NDArray[np.float64], top: NDArray[np.float64]
 ) -> tuple[list[Cell], int]:
-    """Divide buildings into cells.
+    """Divide buildings into cells, given the heights [m] at which each begins and ends in the scene's frame [n].
 
-    Args:
-        footprints: The buildings.
-        bottom: Height at which each begins, in the scene's frame [n], [m].
-        top: Height at which each ends [n], [m].
-
-    Returns:
-        The cells, and the number of footprints that share ground with another one.
+    Returns the cells, and the number of footprints that share ground with another one.
     """
     shapely = library("shapely", "scenes")
     tree = shapely.STRtree(footprints.polygon)
@@ -110,15 +104,7 @@ def _stack(stands: list[Interval]) -> tuple[Interval, ...]:
 def subtract(
     interval: tuple[Length, Length, int], bottom: Length, top: Length
 ) -> list[tuple[Length, Length, int]]:
-    """Subtract a range of heights from an interval.
-
-    Args:
-        interval: The interval, [m] or [mm].
-        bottom: Where the range begins.
-        top: Where it ends.
-
-    Returns:
-        None, one or two intervals of the same owner.
+    """Subtract a range of heights from an interval: none, one or two intervals of the same owner.
 
     Example:
         >>> subtract((0.0, 10.0, 7), 2.0, 4.0)

@@ -37,15 +37,7 @@ class Terrain:
     repairs: dict[str, int] = field(default_factory=dict)
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate heights on the triangles.
-
-        Args:
-            x: Eastings [n], [m].
-            y: Northings [n], [m]; outside the grid the height at its border is taken.
-
-        Returns:
-            Heights [n], [m].
-        """
+        """Interpolate heights [n], [m], on the triangles; outside the grid the height at its border is taken."""
         x = np.clip(np.asarray(x, dtype=float), self.x[0], self.x[-1])
         y = np.clip(np.asarray(y, dtype=float), self.y[0], self.y[-1])
         column = np.clip(np.searchsorted(self.x, x, side="right") - 1, 0, len(self.x) - 2)
@@ -71,29 +63,13 @@ class Terrain:
 
 
 def make_level_ground(bounds: ArrayLike, height: float = 0.0) -> Terrain:
-    """Make a level rectangle.
-
-    Args:
-        bounds: West, south, east and north [4], [m].
-        height: Its height [m].
-
-    Returns:
-        The terrain, of two triangles.
-    """
+    """Make a level rectangle of two triangles within west, south, east and north [4], [m]."""
     west, south, east, north = np.asarray(bounds, dtype=float)
     return Terrain(np.array([west, east]), np.array([south, north]), np.full((2, 2), float(height)))
 
 
 def lower_origin(terrain: Terrain, frame: Frame) -> tuple[Terrain, Frame]:
-    """Move the frame's origin vertically so that the lowest ground is less than a metre above z = 0.
-
-    Args:
-        terrain: The ground.
-        frame: The scene's frame.
-
-    Returns:
-        The same ground in the new frame, and the new frame.
-    """
+    """Move the frame's origin vertically so that the lowest ground is less than a metre above z = 0."""
     lowest = float(np.floor(terrain.z.min()))
     return replace(terrain, z=terrain.z - lowest), replace(frame, height=frame.height + lowest)
 

@@ -44,14 +44,7 @@ class Alignment:
     moved: NDArray[np.float64]
 
     def positions(self, corners: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Find the positions of corners of walls and roofs.
-
-        Args:
-            corners: Corners [n, 3], [mm]; each is one of `points` at some height.
-
-        Returns:
-            Their positions [n, 3], [m].
-        """
+        """Positions [n, 3], [m], of corners [n, 3], [mm], each of which is one of `points` at some height."""
         every = np.concatenate([self.points, corners[:, :2]])
         unique, index = np.unique(every, axis=0, return_inverse=True)
         moved = np.empty((len(unique), 2))
@@ -60,14 +53,10 @@ class Alignment:
 
 
 def align(triangles: NDArray[np.int64], tolerance: float = TOLERANCE) -> Alignment:
-    """Align walls that continue each other.
+    """Align walls that continue each other, of triangles [F, 3, 3], [mm], upright or level.
 
-    Args:
-        triangles: Corners of all triangles, upright or level [F, 3, 3], [mm].
-        tolerance: Distance from a straight line that rounding explains [mm].
-
-    Returns:
-        The new positions. Corners keep their position where moving them would reverse an edge or a level triangle.
+    Corners within `tolerance` [mm] of a straight line are moved onto it, unless that would reverse an edge or a level
+    triangle.
     """
     points, index = np.unique(triangles[..., :2].reshape(-1, 2), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)

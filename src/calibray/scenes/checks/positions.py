@@ -44,13 +44,7 @@ class SceneSurfaces:
 
     @classmethod
     def read(cls, source: str | Path) -> SceneSurfaces:
-        """Read a scene.
-
-        Args:
-            source: Path of a Mitsuba XML file, or `sionna:NAME`.
-
-        Returns:
-            Its faces.
+        """Read the faces of a scene: the path of a Mitsuba XML file, or `sionna:NAME`.
 
         Raises:
             InputError: The scene cannot be read.
@@ -61,13 +55,7 @@ class SceneSurfaces:
         return cls(corners[~wall], corners[wall], bounds)
 
     def under_roof(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Find the points that have a surface above them.
-
-        Args:
-            points: Positions [n, 3], [m].
-
-        Returns:
-            The mask [n].
+        """Mask [n] of the points [n, 3], [m], that have a surface above them.
 
         Raises:
             InputError: shapely is not installed.
@@ -83,13 +71,7 @@ class SceneSurfaces:
         return above > 0
 
     def underground(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Find the points that lie below all surfaces at their position.
-
-        Args:
-            points: Positions [n, 3], [m].
-
-        Returns:
-            The mask [n].
+        """Mask [n] of the points [n, 3], [m], that lie below all surfaces at their position.
 
         Raises:
             InputError: shapely is not installed.
@@ -99,28 +81,13 @@ class SceneSurfaces:
         return (count > 0) & (above == count)
 
     def outside(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Find the points that lie outside the scene's bounds in plan.
-
-        Args:
-            points: Positions [n, 3], [m].
-            margin: Distance from the bounds up to which a point counts as inside [m].
-
-        Returns:
-            The mask [n].
-        """
+        """Mask [n] of the points [n, 3], [m], that lie outside the scene's bounds in plan by more than a margin [m]."""
         position = np.asarray(points, dtype=float).reshape(-1, 3)[:, :2]
         low, high = self.bounds[:2] - margin, self.bounds[3:5] + margin
         return np.asarray(((position < low) | (position > high)).any(axis=1))
 
     def ground_height(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-        """Find the height of the lowest surface.
-
-        Args:
-            x: Eastings [n], [m].
-            y: Northings [n], [m].
-
-        Returns:
-            Heights [n], [m].
+        """Height of the lowest surface [n], [m], at eastings and northings [n], [m].
 
         Raises:
             InputError: The scene has no surface at a position, or shapely is not installed.
@@ -163,13 +130,7 @@ class SceneSurfaces:
 def count_crossings(corners: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> NDArray[np.int64]:
     """Count the surfaces that straight lines cross (Moeller and Trumbore, J. Graphics Tools 2(1), 1997).
 
-    Args:
-        corners: Corners of the triangles [F, 3, 3], [m].
-        start: One end of each line [n, 3], [m].
-        end: The other end [n, 3], [m].
-
-    Returns:
-        Number of surfaces that each line crosses [n].
+    Triangles are [F, 3, 3], the ends of the lines [n, 3], [m].
 
     Example:
         >>> sheet = np.array([[[1, -9, -9], [1, 9, -9], [1, 0, 9]]], float)

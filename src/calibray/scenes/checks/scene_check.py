@@ -98,14 +98,9 @@ class SceneCheck:
 
 
 def check_scene(source: str | Path, progress: Progress | None = None) -> SceneCheck:
-    """Find the faults of a scene.
+    """Find the size, meshes and faults of a scene, a Mitsuba XML file or `sionna:NAME`.
 
-    Args:
-        source: Path of a Mitsuba XML file, or `sionna:NAME`.
-        progress: Called with ("examining", meshes done, meshes in all).
-
-    Returns:
-        Size, meshes and faults.
+    `progress` is called with ("examining", meshes done, meshes in all).
 
     Raises:
         InputError: The scene does not exist or is not a Mitsuba scene, or a mesh is missing or cannot be read.
@@ -207,14 +202,7 @@ def _scale_findings(low: NDArray[np.float64], high: NDArray[np.float64]) -> Iter
 
 
 def count_faults(item: MeshObject) -> MeshFaults:
-    """Count the faults of a mesh.
-
-    Args:
-        item: The object.
-
-    Returns:
-        The counts.
-    """
+    """Count the faults of a mesh."""
     mesh = item.mesh
     _, position = np.unique(np.rint(mesh.vertices / _SAME).astype(np.int64), axis=0, return_inverse=True)
     by_position = position.reshape(-1)[mesh.faces]

@@ -146,16 +146,10 @@ class AdaptiveSearch:
     def run(
         self, plan: TracePlan, targets: NDArray[np.float64], progress: Progress | None
     ) -> tuple[tuple[TracedBuffer, ...], dict[str, object]]:
-        """Find the paths.
+        """Find the paths from the sources, a launch for each, to the other ends of the links [L, 3], [m].
 
-        Args:
-            plan: A launch for every source.
-            targets: The end of every link that does not send rays [L, 3], [m].
-            progress: Called with ("tracing", receivers traced, receivers in all) before the first source and after
-                each.
-
-        Returns:
-            The paths; the largest number of rays of a source and the largest change of a link in the last round.
+        Returns the paths, the largest number of rays of a source, and the largest change of a link in the last round.
+        `progress` is called before the first source and after each.
 
         Raises:
             EngineError: There are more paths than fit into memory.

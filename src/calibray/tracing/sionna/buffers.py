@@ -39,14 +39,8 @@ class TracedBuffer:
 def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
     """Remove the entries that Sionna RT 2.2 counts but does not fill; refraction produces some.
 
-    An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each
-    into another direct path between these two.
-
-    Args:
-        buffer: Candidate paths; direct paths among them are marked valid.
-
-    Returns:
-        The buffer itself if no entry is empty, else a copy without the empty ones.
+    An empty entry has no interaction and refers to the first source and target. The geometry stage would turn each into
+    another direct path between these two.
     """
     if not buffer.buffer_size:
         return buffer
@@ -58,11 +52,7 @@ def drop_empty_entries(buffer: PathsBuffer) -> PathsBuffer:
 def drop_repeats(traced: list[TracedBuffer]) -> list[TracedBuffer]:
     """Remove paths that several launches to the same receivers found; random samples of diffuse reflection stay.
 
-    Args:
-        traced: The paths of each launch, in order; changed.
-
-    Returns:
-        The same buffers without the paths that an earlier one holds.
+    The buffers of the launches, in order, lose the paths that an earlier one holds.
     """
     if len(traced) == 1:
         return traced
@@ -95,13 +85,6 @@ def reverse(buffer: PathsBuffer, sources: mi.Point3f) -> PathsBuffer:
     makes the paths equal digit by digit whichever end they were found from. Three things depend on the direction: the
     order of the interactions, the two ends, and the faces of an edge, where Sionna calls the one that the source
     illuminates the 0-face.
-
-    Args:
-        buffer: Candidates without diffuse reflection, their geometry not computed yet.
-        sources: Where the reversed candidates start.
-
-    Returns:
-        The candidates in the same order, sources and targets exchanged.
     """
     if not buffer.buffer_size:
         return buffer

@@ -59,15 +59,7 @@ def verify_export(
 ) -> None:
     """Load an exported scene into plain Sionna RT; compare materials, surfaces and the path loss of some links.
 
-    Args:
-        scene: The scene that was exported.
-        materials: The constants that it was exported with, by name.
-        names: The names of the materials in the exported scene.
-        target: The exported file.
-        frequency: Carrier frequency [Hz].
-        settings: The tracer's settings; fewer rays are used.
-        antennas: Transmit and receive antenna.
-        links: The links to compare.
+    Fewer rays are used than the settings say. `names` are those of the materials in the exported scene.
 
     Raises:
         InputError: Sionna RT cannot load the exported scene, or it is another one.

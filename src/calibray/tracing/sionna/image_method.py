@@ -71,10 +71,9 @@ class Surfaces:
         self._tree = KDTree(np.vstack([self._feature, -self._feature])) if len(grid) else None
 
     def bounding_boxes(self, plane: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Boxes around all surfaces in planes [n], or so near to them that the tracer may confuse the two.
+        """Least and largest coordinates [n, 3], [m], of boxes around all surfaces in or very near to planes [n].
 
-        Returns:
-            Least and largest coordinates [n, 3] each, [m].
+        The tracer may confuse surfaces that are so near.
         """
         if self._tree is None:
             return np.zeros((0, 3)), np.zeros((0, 3))
@@ -140,17 +139,9 @@ def unfold(
     surfaces: Surfaces,
     edges: Edges,
 ) -> Unfolded:
-    """Unfold the interaction sequences of a source.
+    """Unfold the interaction sequences of a source at `source` [3], [m].
 
-    Args:
-        source: Position of the source [3], [m].
-        kind: Kinds of interaction, 0 beyond the last one [C, D].
-        triangle: Triangle of each interaction [C, D]; any number where none is met.
-        surfaces: The triangles.
-        edges: The edge of each sequence.
-
-    Returns:
-        The unfolded sequences.
+    Kinds of interaction [C, D] are 0 beyond the last one; `triangle` [C, D] is any number where none is met.
     """
     mirrors = kind == Kind.SPECULAR
     met = np.where(mirrors, triangle, 0)
@@ -276,14 +267,9 @@ def unfold_sequences(sequences: PathsBuffer, source: NDArray[np.float64], meshes
 def possible_pairs(
     unfolded: Unfolded, targets: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Find the sequences that may lead to each receiver.
+    """Find the sequences that may lead to each receiver [R, 3], [m].
 
-    Args:
-        unfolded: Unfolded sequences.
-        targets: The receivers [R, 3], [m].
-
-    Yields:
-        Numbers of sequences and of receivers, pair by pair [n] each; pairs that are left out have no path.
+    Yields numbers of sequences and of receivers, pair by pair [n] each; pairs that are left out have no path.
     """
     count, depth = unfolded.kind.shape
     kinds = mi.UInt(aligned(unfolded.kind.reshape(-1), np.uint32))

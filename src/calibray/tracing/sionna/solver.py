@@ -149,16 +149,9 @@ class Solver:
     def find_candidates(
         self, mitsuba_scene: Any, source: mi.Point3f, targets: mi.Point3f, rays: Rays
     ) -> PathsBuffer:
-        """Send out rays and collect candidate paths.
+        """Send out rays from the sources and collect candidate paths to the targets.
 
-        Args:
-            mitsuba_scene: Mitsuba's scene, or an object with its ray queries.
-            source: Where the rays start.
-            targets: Where paths end.
-            rays: The rays.
-
-        Returns:
-            The candidates.
+        The scene is Mitsuba's, or an object with its ray queries.
 
         Raises:
             EngineError: There are more than fit into memory.

@@ -92,11 +92,7 @@ class Trace:
         return np.concatenate(delays)[self._order()]
 
     def path_gains(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.complex128]:
-        """Compute path gains [P, R, T] with Sionna's field stage, in the order of `paths()`.
-
-        Args:
-            materials: Constants that replace those traced with, by name.
-        """
+        """Path gains [P, R, T] by Sionna's field stage in the order of `paths()`, for other materials by name."""
         self.solver.set_materials({**self.materials, **(materials or {})})
         return np.concatenate([self.solver.compute_fields(part) for part in self.buffers])[self._order()]
 
