@@ -14,6 +14,7 @@ import calibray as cb
 from calibray.calibration.result import Result
 from calibray.cli.app import app
 from calibray.measurements import links_from_frame
+from calibray.prediction.cost import LOG, announce
 from calibray.prediction.fallback import fill_missing
 from calibray.prediction.map_files import figure
 from calibray.result import RemarkKind
@@ -172,6 +173,42 @@ def test_the_command_counts_links_without_a_path(shadowed: Result, tmp_path: Pat
     folder = shadowed.study.path.parent / "out"
     run = CliRunner().invoke(app, ["predict", str(folder), str(tmp_path / "new.csv")])
     assert run.exit_code == 0, run.output
+    assert run.stderr.startswith("Tracing 2 links: ")
     assert "Warning: no path leads to 1 of 2 links, row 3\nThe log-distance model predicts" in run.stderr
     assert run.stdout.splitlines()[0].endswith("path_loss_db,basis")
     assert run.stdout.splitlines()[2].endswith("no path: log-distance")
+
+
+def test_the_rate_of_the_calibration_gives_the_cost(
+    shadowed: Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = replace(shadowed, cost=replace(shadowed.cost, trace_seconds=17.0))
+    said: list[str] = []
+    monkeypatch.setattr(LOG, "info", lambda text, *parts: said.append(text % parts))
+    announce(slow, 1000, "cells")
+    model = replace(shadowed.prediction.model, parameters=None)
+    announce(replace(slow, prediction=replace(slow.prediction, model=model)), 1000)
+    assert said[0].startswith(
+        "Tracing 1,000 cells: up to about 17 minutes at the rate of the 17 calibration links"
+    )
+    assert "without a trace" in said[1]
+
+
+def test_calibrated_links_and_known_candidates_are_not_traced_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CALIBRAY_CACHE", str(tmp_path / "cache"))
+    result = calibrated(tmp_path, behind=0)
+    assert result.uncertainty.draws
+    opened: list[object] = []
+    open_tracer = cb.Setup._open_tracer
+    monkeypatch.setattr(
+        cb.Setup, "_open_tracer", lambda setup, *rest: opened.append(setup) or open_tracer(setup, *rest)
+    )
+    result.predict(result.study.measurements())
+    assert not opened
+    # Candidates are traced by one tracer, and the prediction there takes their trace.
+    result.suggest(places(SEEN, (-40.0, 5.0)), 1)
+    assert len(opened) == 1
+    result.predict(places(SEEN, (-40.0, 5.0)))
+    assert len(opened) == 1

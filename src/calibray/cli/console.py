@@ -30,6 +30,22 @@ def echo(text: str, err: bool = False, nl: bool = True) -> None:
     typer.echo(printable(text, keep="\n\t"), err=err, nl=nl)
 
 
+@cache
+def print_costs() -> None:
+    """Print the costs of predictions to stderr before they start."""
+    import logging
+
+    class Echo(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            echo(record.getMessage(), err=True)
+
+    from calibray.prediction.cost import LOG
+
+    LOG.setLevel(logging.INFO)
+    LOG.addHandler(Echo())
+    LOG.propagate = False
+
+
 StudyFile = Annotated[
     Path, typer.Argument(metavar="STUDY", help="The study file, in TOML.", show_default=False)
 ]

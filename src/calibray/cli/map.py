@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log, print_costs
 from calibray.errors import InputError
 from calibray.support.messages import shortened
 
@@ -83,6 +83,7 @@ def map(
         from calibray.prediction.map_files import FILES
         from calibray.support.output_files import check_outputs
 
+        print_costs()
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         inputs = result.study.files()
         # Checked before the tracing, which takes long.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, Scheduler, Workers, echo, log, print_costs
 from calibray.errors import InputError
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def predict(
         from calibray.prediction.predict import as_links, as_measured
         from calibray.support.output_files import check_table, growing_table
 
+        print_costs()
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study, table = result.study, PiecedTable.open(links_file)
         first = as_links(result, next(table.pieces(1)))

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibray.cli.console import AllowChangedInputs, Overwrite, echo, log
+from calibray.cli.console import AllowChangedInputs, Overwrite, echo, log, print_costs
 
 
 def suggest(
@@ -44,6 +44,7 @@ def suggest(
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
+        print_costs()
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
         study = result.study
         links = as_links(result, read_table(candidates_file))

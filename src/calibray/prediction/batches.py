@@ -12,6 +12,7 @@ import pandas as pd
 from calibray.engines.cluster.chunks import CHUNK_LINKS, for_each_chunk, select_links, stated_chunk_size
 from calibray.engines.cluster.workers import InProcess, Workers
 from calibray.measurements import Measurements, PiecedTable
+from calibray.prediction.cost import announce
 from calibray.prediction.position_checks import remarks
 from calibray.prediction.predict import as_links, check_groups, interval, open_for_links
 from calibray.result.record import Record
@@ -134,6 +135,7 @@ def predict_batches(
             progress("checking", done, table.rows)
     if setup is None:
         return
+    announce(result, table.rows)
     done, size = 0, BATCH if workers is None else batch_size(setup, workers)
     for rows in table.pieces(size):
         setup = setup.at(as_links(result, rows))

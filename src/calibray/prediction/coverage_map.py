@@ -20,6 +20,7 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE
 from calibray.measurements import MIN_DISTANCE
 from calibray.prediction.batches import batch_size, predict_links
+from calibray.prediction.cost import announce
 from calibray.prediction.map_files import CoverageMap
 from calibray.prediction.position_checks import INSIDE, is_indoors, locate
 from calibray.prediction.predict import as_links, open_for_links
@@ -99,6 +100,7 @@ def coverage_map(
     names = ("path_loss_db",) if level is None else ("path_loss_db", "lower_db", "upper_db")
     layers, no_path = np.full((3, len(rx)), np.nan), np.zeros(len(rx), dtype=bool)
     size = batch_size(setup, workers)
+    announce(result, len(cells), "cells")
     for start in range(0, len(cells), size):
         batch = cells[start : start + size]
         links = pd.DataFrame({**_positions(transmitter, rx[batch]), **constants})

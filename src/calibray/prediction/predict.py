@@ -12,6 +12,7 @@ from scipy.special import stdtrit
 
 from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
+from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.prediction.fallback import fill_missing, without_scene
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
@@ -126,9 +127,23 @@ def open_for_links(result: Record, links: Measurements, *, allow_changed_inputs:
         InputError: The scene or the parameters cannot be used, or such a file changed.
     """
     setup = Setup.open(result.study, links=links)
-    if not allow_changed_inputs:
-        _check_unchanged(result, setup)
+    check_inputs(result, setup, allow_changed_inputs)
     return setup
+
+
+def traced_materials(result: Record, materials: dict[str, Material] | None) -> dict[str, Material] | None:
+    """Materials to trace with.
+
+    Args:
+        result: The calibration.
+        materials: Materials that the paths are evaluated with.
+
+    Returns:
+        None if the paths do not depend on the materials, so that one cached trace serves for all of them: the tracer
+        samples only refraction and diffuse reflection by the materials.
+    """
+    trace = result.study.trace
+    return materials if trace.refraction or trace.diffuse_reflection else None
 
 
 def check_groups(result: Record, links: Measurements) -> None:
@@ -280,7 +295,8 @@ def _modelled(
     values = np.array([[prediction.model.parameters[name] for name in names]])
     if draws:
         values = np.vstack([values, np.stack([draws[name] for name in names], axis=1)])
-    path_loss_db = replay(setup, setup.trace(prediction.materials, progress)).path_loss(values)
+    paths = setup.trace(traced_materials(result, prediction.materials), progress)
+    path_loss_db = replay(setup, paths).path_loss(values)
     # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
     ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
     return path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)
@@ -296,9 +312,18 @@ def _residual_field(result: Record, links: Measurements) -> tuple[NDArray[np.flo
     return krige_residuals(field, measured, residuals, np.hstack([links.tx, links.rx]))
 
 
-def _check_unchanged(result: Record, setup: Setup) -> None:
-    """Refuse a scene that differs from the calibrated one."""
-    if not result.provenance.files:
+def check_inputs(result: Record, setup: Setup, allow_changed: bool) -> None:
+    """Refuse a scene or an antenna that differs from the calibrated one.
+
+    Args:
+        result: The calibration.
+        setup: The opened study.
+        allow_changed: Allow changes.
+
+    Raises:
+        InputError: A file changed since the calibration.
+    """
+    if allow_changed or not result.provenance.files:
         return
     # Files are compared by name and content, since the whole folder may have moved.
     calibrated, current = (

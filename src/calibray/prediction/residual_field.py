@@ -25,6 +25,9 @@ MOST_EXACT: Final = 1000
 NEAREST: Final = 50
 """Number of nearest measured links used at each new link."""
 
+TOGETHER: Final = 500
+"""New links whose neighbours are solved for together; each takes some 150 kB."""
+
 
 def krige_residuals(
     field: ResidualField,
@@ -48,9 +51,17 @@ def krige_residuals(
         return _krige(field, measured, residuals, position)
     correction, share = np.zeros(len(position)), np.zeros(len(position))
     neighbours = np.asarray(KDTree(measured).query(position, k=NEAREST)[1])
-    for index, nearest in enumerate(neighbours):
-        link = slice(index, index + 1)
-        correction[link], share[link] = _krige(field, measured[nearest], residuals[nearest], position[link])
+    variance = field.shared_db**2
+    for first in range(0, len(position), TOGETHER):
+        links = slice(first, first + TOGETHER)
+        near = measured[neighbours[links]]
+        between = np.linalg.norm(near[:, :, None] - near[:, None], axis=3)
+        covariance = variance * np.exp(-between / field.range_m) + field.own_db**2 * np.eye(NEAREST)
+        distance = np.linalg.norm(near - position[links, None], axis=2)
+        cross = variance * np.exp(-distance / field.range_m)
+        weights = np.linalg.solve(covariance, cross[..., None])[..., 0]
+        correction[links] = np.einsum("nm,nm->n", weights, residuals[neighbours[links]])
+        share[links] = np.einsum("nm,nm->n", weights, cross) / variance
     return correction, share
 
 

@@ -15,6 +15,7 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
+from calibray.prediction.cost import announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
     Beliefs,
@@ -24,7 +25,7 @@ from calibray.prediction.experiment_design import (
     initial_range_probability,
 )
 from calibray.prediction.position_checks import POSITION_COLUMNS
-from calibray.prediction.predict import as_links, open_for_links
+from calibray.prediction.predict import as_links, check_inputs, traced_materials
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.progress import Progress
@@ -86,8 +87,12 @@ def suggest(
             "links than unknowns"
         )
     links = as_links(result, candidates)
-    setup = open_for_links(result, links, allow_changed_inputs=allow_changed_inputs)
-    model = _ReplayedDraws(result, Setup.open(study), progress)
+    calibrated = Setup.open(study)
+    # Both share one loaded tracer.
+    setup = calibrated.at(links)
+    check_inputs(result, setup, allow_changed_inputs)
+    announce(result, len(links), "candidates")
+    model = _ReplayedDraws(result, calibrated, progress)
     predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):
@@ -202,8 +207,7 @@ class _ReplayedDraws:
     def _engine(self, setup: Setup) -> Differentiable:
         section = setup.study.engine
         compress_db = section.compress_db if isinstance(section, ReplaySection) else None
-        # The same materials as in the calibration's last trace, so that the cache of traces answers.
-        materials = None if self.result.fit.retrace_gap_db is None else self.result.materials
+        materials = traced_materials(self.result, self.result.materials)
         return replay(setup, setup.trace(materials, self.progress), compress_db)
 
     def _replay(self, engine: Differentiable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
