@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import shutil
 import sqlite3
 import threading
@@ -140,6 +141,29 @@ def test_another_database_is_refused_and_left_as_it_is(tmp_path, script, message
     with closing(sqlite3.connect(file)) as database:
         database.execute("PRAGMA journal_mode = DELETE")
     assert len(file.read_bytes()) == len(before)
+
+
+FOREIGN = {
+    "link": lambda file, mine: file.symlink_to(mine),
+    "link to nothing": lambda file, mine: file.symlink_to(mine.with_name("new")),
+    "second name": lambda file, mine: file.hardlink_to(mine),
+    "FIFO": lambda file, _: os.mkfifo(file),
+    "folder": lambda file, _: file.mkdir(),
+}
+
+
+@pytest.mark.parametrize("ending", database.ENDINGS[:2])
+@pytest.mark.parametrize("foreign", FOREIGN)
+def test_a_ledger_that_leads_to_another_file_is_refused(tmp_path, foreign, ending):
+    mine = tmp_path / "mine.sqlite"
+    with closing(Ledger(mine)):
+        pass
+    before = mine.read_bytes()
+    FOREIGN[foreign](tmp_path / f"ledger.sqlite{ending}", mine)
+    with pytest.raises(InputError, match=rf"ledger.sqlite{ending}: must be .* or name another folder"):
+        Ledger(tmp_path / "ledger.sqlite")
+    assert mine.read_bytes() == before
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("seed", range(4))

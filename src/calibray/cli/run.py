@@ -85,16 +85,17 @@ def run(
 
 def _kept_text(out: Path) -> str:
     """What is kept of an interrupted run, and how to continue."""
-    from contextlib import closing
+    from contextlib import closing, suppress
 
     from calibray.engines import open_ledger
     from calibray.engines.ledger.ledger import LEDGER_FILE
+    from calibray.errors import InputError
     from calibray.support.cache_folder import cache_folder
     from calibray.tracing.cache import stored_traces
 
     parts = []
     if (out / LEDGER_FILE).is_file():
-        with closing(open_ledger(out)) as ledger:
+        with suppress(InputError), closing(open_ledger(out)) as ledger:  # it may be another program's
             parts.append(f"{len(ledger.table())} RT calls in {out / LEDGER_FILE}")
     if stored_traces():
         parts.append(f"finished traces in {cache_folder()}")

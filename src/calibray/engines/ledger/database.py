@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import stat
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -16,6 +17,7 @@ from calibray.engines.ledger.answers import LedgerEntry
 from calibray.errors import InputError
 
 VERSION: Final = 2
+ENDINGS: Final = ("", "-wal", "-shm", "-journal")  # names of the files that SQLite writes, after the ledger's
 LOCK_WAIT: Final = 60.0  # longest wait for other writers [s]
 _PROBLEMS: Final = """CREATE TABLE IF NOT EXISTS problems (
     problem TEXT PRIMARY KEY, engine TEXT NOT NULL, parameters TEXT NOT NULL) WITHOUT ROWID"""
@@ -28,6 +30,34 @@ _COLUMNS: Final = {
     "answers": ["id", "problem", "candidate", "path_loss_db", "seconds", "failure", "time", "digest"],
     "claims": ["problem", "candidate", "run", "owner", "expires"],
 }
+
+
+def check_own_file(path: Path) -> None:
+    """Refuse a ledger that is another file under this name: SQLite would follow it, and write there.
+
+    Args:
+        path: The SQLite file, which need not exist.
+
+    Raises:
+        InputError: It, or a file that SQLite keeps next to it, is a link, a folder, a device or a FIFO, or has further
+            names (hard links).
+    """
+    for ending in ENDINGS:
+        file = path.with_name(path.name + ending)
+        try:
+            status = file.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(
+                f"{file}: must be a file of the ledger's own, but is a link, a folder, a device or a FIFO; move it "
+                "away, or name another folder"
+            )
+        if status.st_nlink > 1:
+            raise InputError(
+                f"{file}: must be a file of the ledger's own, but has {status.st_nlink} names (hard links); replace "
+                "it with a copy, or name another folder"
+            )
 
 
 def set_up(connection: sqlite3.Connection, path: Path) -> None:

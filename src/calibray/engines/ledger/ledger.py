@@ -24,7 +24,14 @@ import pandas as pd
 
 from calibray.engines.ledger import claims, database
 from calibray.engines.ledger.answers import LedgerEntry, read_entry
-from calibray.engines.ledger.database import explain, insert_answer, insert_problem, set_up, transaction
+from calibray.engines.ledger.database import (
+    check_own_file,
+    explain,
+    insert_answer,
+    insert_problem,
+    set_up,
+    transaction,
+)
 from calibray.engines.ledger.rescue import rescue_files, write_rescue_file
 from calibray.errors import EngineError, InputError
 
@@ -45,7 +52,8 @@ class Ledger:
         read_only: Whether the file cannot be written.
 
     Raises:
-        InputError: The file cannot be opened, is not a ledger, is damaged, or has another version.
+        InputError: The file cannot be opened, is not a ledger, is a link or has further names, is damaged, or has
+            another version.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -55,8 +63,10 @@ class Ledger:
         )
         self._run, self._copy = uuid.uuid4().hex, None
         try:
+            check_own_file(self.path)
             self._connection = self._connect()
             try:
+                check_own_file(self.path)  # SQLite opens the file by its name: it may have been exchanged
                 set_up(self._connection, self.path)
                 self._file = _identity(self.path)
             except BaseException:
@@ -279,7 +289,7 @@ def open_ledger(folder: str | Path) -> Ledger:
 def _identity(path: Path) -> tuple[int, int] | None:
     """Device and inode of the file at a path."""
     try:
-        status = path.stat()
+        status = path.lstat()
     except OSError:
         return None
     return status.st_dev, status.st_ino

@@ -20,7 +20,7 @@ from typing import Final
 
 from platformdirs import user_state_path
 
-from calibray.engines.ledger.database import set_up
+from calibray.engines.ledger.database import ENDINGS, set_up
 from calibray.errors import InputError
 
 PREFIX: Final = "ledger-rescue-"
@@ -41,7 +41,7 @@ def write_rescue_file(ledger: Path, fill: Callable[[sqlite3.Connection], None]) 
                 connection.execute("PRAGMA journal_mode = DELETE")  # one file, without a write-ahead log
             partial.replace(file)
         except (OSError, sqlite3.Error):
-            for ending in ("", "-wal", "-shm", "-journal"):
+            for ending in ENDINGS:
                 with suppress(OSError):
                     Path(f"{partial}{ending}").unlink(missing_ok=True)
             continue
