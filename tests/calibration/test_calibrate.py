@@ -54,6 +54,17 @@ def test_least_squares_recovers_planted_values(tmp_path, exact, method):
     assert {interval.verdict for interval in result.intervals.values()} == {"identified"}
 
 
+@pytest.mark.parametrize("step", [0.0, 1e-7])
+def test_rows_that_were_logged_twice_change_nothing(tmp_path, step):
+    """Their values and positions differ by what rounding leaves."""
+    noisy = planted.campaign(noise_db=1.0)
+    again = noisy.assign(path_loss_db=noisy.path_loss_db + step, rx_x=noisy.rx_x + step)[::2]
+    once, twice = run(tmp_path, noisy), run(tmp_path, pd.concat([noisy, again]))
+    assert twice.provenance.rows == {"rows that repeat a link, merged": len(again)}
+    losses = [planted.path_loss(result.parameters) for result in (once, twice)]
+    assert losses[1] == pytest.approx(losses[0], abs=0.01)
+
+
 @pytest.mark.parametrize("method", METHOD_NAMES)
 def test_every_method_keeps_the_contract(tmp_path, exact, method):
     calls = planted.engine().calls

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.measurements.preparation import Averaging, LinkColumns, Preparation
+from calibray.measurements.repeats import join_positions
 from calibray.measurements.source_table import SourceTable
 
 MAX_UNCERTAINTY_DB: Final = 1.0
@@ -102,7 +103,7 @@ def _areas(table: SourceTable, averaging: Averaging, rx: Sequence[str]) -> NDArr
     """Number of the place, cell, stretch or window of every row [rows]; `rx` names the columns of x, y and z [m]."""
     if averaging.by == "place":
         positions = np.stack([table.numbers(name) for name in rx], axis=1)
-        return np.unique(positions, axis=0, return_inverse=True)[1].reshape(-1)
+        return join_positions(positions)
     if averaging.size is None or not (np.isfinite(averaging.size) and averaging.size > 0):
         raise InputError(f"average.size = {averaging.size!r}: must be a finite number greater than 0")
     if averaging.by == "time":

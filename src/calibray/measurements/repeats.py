@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from calibray.measurements import column_names
 from calibray.measurements.preparation import LinkColumns, Preparation
 from calibray.measurements.source_table import SourceTable
 
+SAME_POSITION: Final = 1e-4
+"""Distance [m] per axis up to which positions are equal, as in meshes: coordinates are written to a millimetre at best,
+and conversions of coordinates differ by micrometres."""
+
 
 def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) -> SourceTable:
     """Merge the rows of one link.
 
-    Rows are of one link if their positions, transmitter, groups, carrier, transmitted power and times agree. Rows at
-    different times stay separate links. A link below the noise floor is not merged with one above it.
+    Rows are of one link if their positions agree within `SAME_POSITION`, and transmitter, groups, carrier, transmitted
+    power and times are equal. Rows at different times stay separate links. A link below the noise floor is not merged
+    with one above it.
 
     Args:
         table: The rows, before receivers inside buildings are moved: two positions may be moved to one corner.
@@ -41,12 +48,12 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     if steps.averaging is not None:
         return table
     value = table.numbers(columns.value)
-    keys = pd.DataFrame(np.hstack([table.positions("tx", columns.tx), table.positions("rx", columns.rx)]))
-    for name in _separating_columns(table, steps, columns):
-        keys[f"column {name}"] = table.column(name).to_numpy()
-    if steps.noise_floor_dbm is not None:
-        keys["censored"] = value <= steps.noise_floor_dbm
-    link = keys.groupby(list(keys), sort=False, dropna=False).ngroup().to_numpy()
+    positions = np.hstack([table.positions("tx", columns.tx), table.positions("rx", columns.rx)])
+    keys = pd.DataFrame({name: table.column(name) for name in _separating_columns(table, steps, columns)})
+    floor = -np.inf if steps.noise_floor_dbm is None else steps.noise_floor_dbm
+    keys["censored"] = value <= floor
+    group = keys.groupby(list(keys), sort=False, dropna=False).ngroup().to_numpy()
+    link = join_positions(positions, group)
     first = ~pd.Series(link).duplicated().to_numpy()
     if first.all():
         return table
@@ -72,3 +79,33 @@ def _separating_columns(table: SourceTable, steps: Preparation, columns: LinkCol
         names.append(steps.transmitter)
     names += [str(name) for name in table.frame if column_names.matches(str(name), "time")]
     return list(dict.fromkeys(names))
+
+
+def join_positions(
+    positions: NDArray[np.float64], group: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Number the places of positions: those within `SAME_POSITION` of each other, also step by step, are one place.
+
+    Args:
+        positions: The positions [N, axes], [m].
+        group: Positions of different groups are different places [N]; one group if None.
+
+    Returns:
+        Number of each position's place [N], in the order of the first positions.
+
+    Example:
+        >>> join_positions(np.array([[1.0, 2.0], [1.0, 3.0], [1.0 + 1e-7, 2.0]])).tolist()
+        [0, 1, 0]
+    """
+    place = np.zeros(len(positions), dtype=np.int64) if group is None else group
+    count = 0
+    # Splitting along one axis opens gaps along the others.
+    while len(place) and place.max() + 1 != count:
+        count = place.max() + 1
+        for axis in positions.T:
+            order = np.lexsort((axis, place))
+            # A position that is not a number is no repeat; it is refused later.
+            starts = (np.diff(place[order]) > 0) | ~(np.diff(axis[order]) <= SAME_POSITION)
+            place = place.copy()
+            place[order] = np.concatenate([[0], np.cumsum(starts)])
+    return pd.factorize(place)[0]
