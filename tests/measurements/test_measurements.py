@@ -2,6 +2,8 @@ import sys
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -177,6 +179,22 @@ def test_a_row_group_that_decompresses_to_gigabytes_is_refused(tmp_path, monkeyp
         PiecedTable.open(path)
 
 
+@pytest.mark.parametrize("read", [read_table, PiecedTable.open])
+def test_a_parquet_file_whose_rows_share_a_large_text_is_refused(tmp_path, monkeypatch, read):
+    """8 MB in the file as declared, 100 GB in memory; no part of it is decoded in this process."""
+    index = pa.array(np.zeros(12_000, dtype=np.int32))
+    column = pa.DictionaryArray.from_arrays(index, pa.array(["x" * 2**23]))
+    path = tmp_path / "links.parquet"
+    pq.write_table(
+        pa.table({"x": column}), path, store_schema=False, dictionary_pagesize_limit=2**30, compression="zstd"
+    )
+    monkeypatch.setattr("calibray.measurements.table_files.DECODING_MEMORY", 2**30)
+    before = pa.total_allocated_bytes()
+    with pytest.raises(InputError, match=r"links\.parquet: takes more memory than it declares"):
+        read(path)
+    assert pa.total_allocated_bytes() - before < 2**24
+
+
 def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
     path = tmp_path / "links.parquet"
     path.write_bytes(b"")
@@ -290,6 +308,19 @@ def test_rows_that_repeat_a_link_are_merged_in_linear_power(tmp_path):
     # An exact copy changes no value.
     copied = read(tmp_path, TABLE + LATER[1] + "\n")
     assert copied.path_loss_db.tolist() == read(tmp_path, TABLE).path_loss_db.tolist()
+
+
+def test_positions_that_differ_by_rounding_are_equal():
+    """Also at the edges of any grid, in another order of rows, and with another row that is between two."""
+    x = np.array([0.00005, 20.0, 0.00005 - 1e-9, 20.0 - 2e-7, 20.002, np.nan, np.nan])
+    frame = pd.DataFrame({"x": x, "loss": 80.0 + 1e-7 * np.arange(7)})
+    columns = LinkColumns((0, 0, 5), ("x", 0, 1), "loss")
+    for rows in (frame[:5], frame[:5].iloc[[3, 4, 0, 2, 1]]):
+        links = measured_links(SourceTable(rows.reset_index(drop=True)), columns)
+        assert sorted(links.rx[:, 0].round(3)) == [0.0, 20.0, 20.002]
+        assert links.path_loss_db == pytest.approx(80.0, abs=1e-6)
+    with pytest.raises(InputError):  # what is no number is no repeat
+        measured_links(SourceTable(frame), columns)
 
 
 @pytest.mark.parametrize(

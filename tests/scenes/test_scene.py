@@ -148,15 +148,11 @@ def test_a_missing_mesh_is_refused(tmp_path: Path) -> None:
         read_scene(file, 2e9)
 
 
-def test_a_damaged_serialized_mesh_is_refused_by_the_tracer(tmp_path: Path) -> None:
+def test_a_compressed_mesh_is_refused(tmp_path: Path) -> None:
     file = write_scene(tmp_path, FLOOR)
-    (tmp_path / "meshes" / "floor.ply").rename(tmp_path / "meshes" / "floor.serialized")
-    file.write_text(
-        file.read_text().replace("floor.ply", "floor.serialized").replace('"ply"', '"serialized"')
-    )
-    links = SimpleNamespace(tx=np.zeros((1, 3)), rx=np.ones((1, 3)))
-    with pytest.raises(InputError, match=r"scene\.xml: Sionna RT cannot load the scene"):
-        cb.trace(file, links, frequency=2e9, max_depth=0, samples=1)
+    file.write_text(file.read_text().replace('"ply"', '"serialized"'))
+    with pytest.raises(InputError, match=r"scene\.xml: shape 'mesh-floor' is a 'serialized', .* PLY mesh"):
+        read_scene(file, 2e9)
 
 
 @pytest.mark.parametrize(

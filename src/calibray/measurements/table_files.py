@@ -18,6 +18,7 @@ from calibray.errors import InputError
 from calibray.measurements.excel import sheet_text
 from calibray.measurements.source_table import SourceTable
 from calibray.support.extras import library
+from calibray.support.limited_process import run_limited
 from calibray.support.memory import available_memory
 from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists
@@ -27,6 +28,29 @@ LARGEST_TABLE: Final = 2 * 2**30
 
 LARGEST_ROW_GROUP: Final = 2**30
 """Decompressed size of a row group of a Parquet file that is read in pieces [bytes]."""
+
+DECODING_MEMORY: Final = 4 * 2**30
+"""Limit of the address space in which a Parquet file is decoded once [bytes]."""
+
+_DECODE: Final = """
+from pyarrow import parquet
+try:
+    size = 0
+    with parquet.ParquetFile({path!r}, pre_buffer=False) as file:
+        for number in range(file.num_row_groups):
+            size = size if {whole} else 0
+            for batch in file.iter_batches(2**14, [number], use_threads=False):
+                size += batch.nbytes
+                if size > {limit}:
+                    raise MemoryError
+except MemoryError:
+    refuse("takes more memory than it declares; export it again")
+except Exception as error:
+    refuse("not a Parquet file (" + " ".join(str(error).split())[:300] + "); export it again")
+"""
+
+_decoded: Final[set[tuple[str | int, ...]]] = set()
+"""Files that were decoded before, in their present form."""
 
 
 def read_table(path: str | Path) -> SourceTable:
@@ -86,8 +110,9 @@ class PiecedTable:
         library("pyarrow", "parquet")
         with _open_parquet(path) as file:
             rows = file.metadata.num_rows
-            for number in range(file.metadata.num_row_groups):
-                _check_size(path, [file.metadata.row_group(number)], LARGEST_ROW_GROUP, "a row group")
+            groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        size = sum(_check_size(path, [group], LARGEST_ROW_GROUP, "a row group") for group in groups)
+        _decode_elsewhere(path, size, LARGEST_ROW_GROUP, whole=False)
         if not rows:
             raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
         return cls(str(path), rows, None)
@@ -183,7 +208,8 @@ def _read_parquet(path: Path) -> SourceTable:
         raise InputError(f"{path}: Parquet needs pyarrow; install it with: pip install calibray[parquet]")
     with _open_parquet(path) as file:
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        _check_size(path, groups, LARGEST_TABLE, "the table")
+    size = _check_size(path, groups, LARGEST_TABLE, "the table")
+    _decode_elsewhere(path, size, LARGEST_TABLE, whole=True)
     try:
         frame = pd.read_parquet(path, engine="pyarrow")
     except Exception as error:
@@ -191,8 +217,8 @@ def _read_parquet(path: Path) -> SourceTable:
     return SourceTable(frame.reset_index(drop=True), source=str(path))
 
 
-def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> None:
-    """Refuse row groups whose declared size is too large: some kilobytes may decompress to many gigabytes.
+def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> int:
+    """The declared size of row groups [bytes], which is refused if too large: kilobytes may decompress to gigabytes.
 
     Raises:
         InputError: The size exceeds the limit or the memory.
@@ -208,6 +234,30 @@ def _check_size(path: Path, groups: Sequence[Any], limit: int, what: str) -> Non
             f"{path}: {what} takes {size / 2**30:,.1f} GiB decompressed, at most {limit / 2**30:g} GiB and the free "
             "memory are read; keep the columns and rows that you need, or write smaller row groups"
         )
+    return size
+
+
+def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
+    """Decode a Parquet file in a process with limits: pages may be larger than declared, and rows may share one text.
+
+    Its declared size and the limit of its rows in memory are in bytes. The limit is for the whole table or a row group.
+
+    Raises:
+        InputError: The file takes more memory or time, or is damaged.
+    """
+    status = path.stat()
+    key = (str(path.resolve()), status.st_mtime_ns, status.st_size, status.st_ino, limit, whole)
+    if key in _decoded:
+        return
+    try:
+        is_read = run_limited(_DECODE.format(path=key[0], limit=limit, whole=whole), DECODING_MEMORY, size)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except TimeoutError as error:
+        raise InputError(f"{path}: cannot be decompressed {error}; export it again") from None
+    if not is_read:
+        raise InputError(f"{path}: its library fails while it reads it; export it again")
+    _decoded.add(key)
 
 
 def _open_parquet(path: Path) -> Any:

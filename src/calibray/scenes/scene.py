@@ -70,7 +70,7 @@ class Scene:
         objects: The meshes, in the file's order.
         xml: The scene for the tracer; the id of material k of `materials` is `mat-calibray-k`.
         laws: How the constants of each material depend on frequency: ITU-R's law for ITU materials, else constant.
-        sizes: Size of every object; None for a mesh that only Mitsuba reads.
+        sizes: Size of every object.
     """
 
     source: str
@@ -79,7 +79,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
     xml: str
     laws: dict[str, ItuLaw] = field(default_factory=dict)
-    sizes: tuple[SurfaceSize | None, ...] = ()
+    sizes: tuple[SurfaceSize, ...] = ()
 
     @property
     def local_origin(self) -> NDArray[np.float64]:
@@ -122,10 +122,9 @@ def read_scene(
     laws: dict[str, ItuLaw] = {}
     index: dict[str, int] = {}
     originals: dict[str, str] = {}  # material in the file, by the material that the object gets
-    sizes: list[SurfaceSize | None] = []
+    sizes: list[SurfaceSize] = []
     for shape in root.findall("shape"):
-        surface = read_surface(shape, path)
-        sizes.append(None if surface is None else SurfaceSize.of(surface))
+        sizes.append(SurfaceSize.of(read_surface(shape, path)))
         object_name = (shape.get("id") or "").removeprefix("mesh-")
         original = _file_material_name(shape, definitions, path)
         name = _split_name(object_name, split, definitions) or original
@@ -161,7 +160,7 @@ def read_scene(
 
 def has_copied_meshes(scene: Scene) -> bool:
     """Whether the tracer reads copies of meshes: the scene is traced in a local frame, or a shape would be misread."""
-    return bool(scene.local_origin.any()) or any(size is not None and size.misread for size in scene.sizes)
+    return bool(scene.local_origin.any()) or any(size.misread for size in scene.sizes)
 
 
 def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
@@ -173,7 +172,7 @@ def xml_with_copied_meshes(scene: Scene, folder: Path) -> str:
     origin = scene.local_origin
     root = ElementTree.fromstring(scene.xml)
     for number, (shape, size) in enumerate(zip(root.findall("shape"), scene.sizes, strict=True)):
-        if origin.any() or (size is not None and size.misread):
+        if origin.any() or size.misread:
             write_local_shape(shape, scene.path, origin, folder / f"{number}.ply")
     return ElementTree.tostring(root, encoding="unicode")
 

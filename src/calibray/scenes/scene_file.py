@@ -22,8 +22,9 @@ from calibray.support.output_files import check_outputs, exists, write_bytes, wr
 
 BUNDLED_PREFIX: Final = "sionna:"
 
-SHAPES: Final = ("cube", "obj", "ply", "rectangle", "serialized")
-"""Types of shapes that are triangle meshes; Sionna RT takes no others."""
+SHAPES: Final = ("cube", "obj", "ply", "rectangle")
+"""Types of shapes that are triangle meshes. Mitsuba's compressed `serialized` meshes are refused, since their size is
+known only after Mitsuba has decompressed them."""
 
 MESHES: Final = "meshes"
 """Folder for meshes, next to the scene file."""
@@ -164,7 +165,7 @@ class _ShallowTree(ElementTree.TreeBuilder):
 def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     """Read the mesh of a shape, and refuse a shape that cannot be traced. Its transform is not applied.
 
-    It is None for a rectangle or cube, and for Mitsuba's own `serialized` format.
+    It is None for a rectangle or cube, which have no file.
 
     Raises:
         InputError: The shape is not a triangle mesh or has a degenerate transform, or its mesh is missing or malformed.
@@ -173,12 +174,12 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
     if kind not in SHAPES:
         raise InputError(
             f"{path}: shape {name!r} is a {shortened(kind)!r}, must be one of {', '.join(SHAPES)}; "
-            "export it as a triangle mesh"
+            "export it as a PLY mesh of triangles"
         )
     _check_transform(shape, path)
     filename = mesh_filename(shape)
     if filename is None:
-        if kind in ("obj", "ply", "serialized"):
+        if kind in ("obj", "ply"):
             raise InputError(f"{path}: shape {name!r} names no file; give it a filename")
         return None
     mesh = path.parent / filename
@@ -187,7 +188,7 @@ def shape_mesh(shape: ElementTree.Element, path: Path) -> Mesh | None:
             f"{path}: mesh {shortened(filename, 200)!r} of shape {name!r} does not exist in {path.parent}; copy the "
             "meshes folder next to the scene"
         )
-    return read_mesh(mesh, kind) if kind in ("obj", "ply") else None
+    return read_mesh(mesh, kind)
 
 
 def mesh_filename(shape: ElementTree.Element) -> str | None:

@@ -79,8 +79,8 @@ class SurfaceSize:
         )
 
 
-def read_surface(shape: ElementTree.Element, path: Path) -> Mesh | None:
-    """Read the mesh of a shape in the scene frame; None for Mitsuba's own `serialized` format.
+def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
+    """Read the surface of a shape in the scene frame.
 
     Raises:
         InputError: As for `shape_mesh`, the transform has an element that Calibray does not know, or the
@@ -88,10 +88,7 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh | None:
     """
     mesh = shape_mesh(shape, path)
     if mesh is None:
-        kind = shape.get("type")
-        if kind == "serialized":
-            return None
-        mesh = _SQUARE if kind == "rectangle" else _cube()
+        mesh = _SQUARE if shape.get("type") == "rectangle" else _cube()
     if mesh.step > TOO_COARSE:
         raise InputError(
             f"{path}: the mesh of shape {shape.get('id')!r} lies so far from the origin that its file stores "
@@ -181,17 +178,16 @@ def _cube() -> Mesh:
     return Mesh(np.rint(np.concatenate(vertices)), np.concatenate(faces))
 
 
-def local_origin(sizes: tuple[SurfaceSize | None, ...]) -> NDArray[np.float64]:
+def local_origin(sizes: tuple[SurfaceSize, ...]) -> NDArray[np.float64]:
     """Choose the origin [3], [m], of the frame that a scene is traced in.
 
     It is the centre of the scene, rounded to metres, if the scene lies far from the origin of its coordinates: beyond
     `FAR`, and further than it is wide, so that the local frame gains at least one bit. Otherwise it is zero.
     """
-    known = [size for size in sizes if size is not None]
-    if not known:
+    if not sizes:
         return np.zeros(3)
-    low = np.min([size.low for size in known], axis=0)
-    high = np.max([size.high for size in known], axis=0)
+    low = np.min([size.low for size in sizes], axis=0)
+    high = np.max([size.high for size in sizes], axis=0)
     furthest = max(float(np.abs(low).max()), float(np.abs(high).max()))
     if furthest <= max(FAR, float((high - low).max())):
         return np.zeros(3)
@@ -204,14 +200,9 @@ def write_local_shape(
     """Replace a shape by a single-precision mesh in a local frame with its origin at `origin` [3], [m].
 
     Raises:
-        InputError: The mesh cannot be read, or is `serialized`, which only Mitsuba reads.
+        InputError: The mesh cannot be read.
     """
     mesh = read_surface(shape, path)
-    if mesh is None:
-        raise InputError(
-            f"{path}: the mesh of shape {shape.get('id')!r} is serialized, which cannot be moved to the local frame of "
-            "a scene far from its origin; export it as PLY"
-        )
     target.write_bytes(ply_bytes(replace(mesh, vertices=mesh.vertices - origin)))
     for child in shape.findall("transform") + shape.findall("string"):
         shape.remove(child)

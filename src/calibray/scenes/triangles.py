@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.scenes.meshes import Mesh, MeshObject
 from calibray.scenes.scene import Scene
-from calibray.scenes.scene_file import find_scene, mesh_filename, shape_mesh
+from calibray.scenes.scene_file import find_scene, shape_mesh
 
 LEVEL: Final = 0.5
 """A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
@@ -38,10 +38,6 @@ def read_meshes(source: str | Path) -> Iterator[MeshObject]:
         name = (shape.get("id") or "?").removeprefix("mesh-")
         mesh = shape_mesh(shape, path)
         if mesh is None:
-            if mesh_filename(shape) is not None:
-                raise InputError(
-                    f"{path}: the mesh of {name!r} is serialized, which only Mitsuba reads; export it as PLY"
-                )
             continue
         flip = shape.find("boolean[@name='flip_normals']")
         if flip is not None and flip.get("value") == "true":

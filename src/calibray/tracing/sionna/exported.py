@@ -82,11 +82,10 @@ def verify_export(
                 raise InputError(_failed(target, fault))
     by_material = surfaces_by_material(loaded.mi_scene, lambda material: str(material.name))
     for name in scene.materials:
-        sizes = [size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == name]
-        stored = [size for size in sizes if size is not None]
-        if len(stored) == len(sizes) and not surfaces_agree(
-            by_material.get(names[name], []), stored, np.zeros(3)
-        ):
+        stored = [
+            size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == name
+        ]
+        if not surfaces_agree(by_material.get(names[name], []), stored, np.zeros(3)):
             fault = f"Sionna RT holds another surface of material {shortened(repr(names[name]))}"
             raise InputError(_failed(target, fault))
     if scene.local_origin.any():

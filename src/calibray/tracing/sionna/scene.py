@@ -43,7 +43,7 @@ def load_scene(scene: Scene) -> rt.Scene:
     else:
         loaded = _load(scene.xml, scene.path)
     _check_surfaces(loaded.mi_scene, scene)
-    step = max((size.step for size in scene.sizes if size is not None), default=0.0)
+    step = max((size.step for size in scene.sizes), default=0.0)
     if step > COARSE:
         _LOG.warning(
             "%s stores coordinates in steps of %g m, because it is far from the origin: path loss may change by "
@@ -86,12 +86,9 @@ def _check_surfaces(mitsuba_scene: Any, scene: Scene) -> None:
     # The names of Sionna's materials end in the number of the material (`Scene.xml`).
     held = surfaces_by_material(mitsuba_scene, lambda material: int(material.name.split("-")[-1]))
     for number, material in enumerate(scene.materials):
-        of_material = [
+        stored = [
             size for size, item in zip(scene.sizes, scene.objects, strict=True) if item.material == material
         ]
-        stored = [size for size in of_material if size is not None]
-        if len(stored) < len(of_material):
-            continue  # a `serialized` mesh, whose file only Mitsuba reads
         traced = held.get(number, [])
         if not surfaces_agree(traced, stored, scene.local_origin):
             raise InputError(
