@@ -49,7 +49,7 @@ def heard() -> list[list[np.ndarray]]:
     """Amplitudes of the paths from every access point to every spot, in the scene of the plan."""
     places = np.column_stack([spots(), np.full(len(spots()), HEIGHT)])
     with TemporaryDirectory() as folder:
-        sheets, _ = merge_faces(read_plan(FOLDER / "plan.csv", 2.6))
+        sheets = merge_faces(read_plan(FOLDER / "plan.csv", 2.6)).sheets
         scene = make_plan_scene(sheets, folder).path
         return amplitudes(
             scene, list(ACCESS_POINTS.values()), places, FREQUENCY, PLANTED, max_depth=DEPTH, samples=500_000,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from importlib import metadata
 
 import pytest
@@ -11,6 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from calibray import doctor as diagnosis
+from calibray.cli import main
 from calibray.cli.app import Commands, app
 from calibray.errors import EngineError, InputError
 from calibray.tables.text import render
@@ -120,3 +122,14 @@ def test_doctor_prints_its_table_and_fails_if_a_check_failed(monkeypatch, passed
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stderr) == (status, "")
     assert result.stdout == render(found.table()) + "\n"
+
+
+def test_warnings_of_libraries_do_not_reach_the_user(monkeypatch, capsys):
+    monkeypatch.setattr(
+        "calibray.cli.app.app", lambda: warnings.warn("deep inside", UserWarning, stacklevel=1)
+    )
+    monkeypatch.setattr(sys, "warnoptions", [])
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        main()
+    assert capsys.readouterr().err == ""

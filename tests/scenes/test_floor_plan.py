@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +33,9 @@ def mesh(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 def test_the_faces_of_a_house_become_five_sheets():
-    sheets, merged = merge_faces([*OUTER, *ROOMS])
-    assert merged == 12
+    merged = merge_faces([*OUTER, *ROOMS])
+    sheets = merged.sheets
+    assert merged.lines == 12
     ends = [sorted(np.round([sheet.start, sheet.end], 6).tolist()) for sheet in sheets]
     expected = [
         ((0.1, 0.1), (9.9, 0.1)), ((9.9, 0.1), (9.9, 5.9)), ((0.1, 5.9), (9.9, 5.9)), ((0.1, 0.1), (0.1, 5.9)),
@@ -52,7 +55,7 @@ def test_merging_does_not_depend_on_the_orientation_of_the_plan(angle):
         ends = [(cosine * x - sine * y, sine * x + cosine * y) for x, y in (segment.start, segment.end)]
         return Segment(*ends, segment.kind, segment.bottom, segment.top)
 
-    sheets, _ = merge_faces([rotated(segment) for segment in [*OUTER, *ROOMS]])
+    sheets = merge_faces([rotated(segment) for segment in [*OUTER, *ROOMS]]).sheets
     assert sorted(sheet.length for sheet in sheets) == pytest.approx([5.6, 5.8, 5.8, 9.8, 9.8])
 
 
@@ -84,7 +87,87 @@ def test_merging_does_not_depend_on_the_orientation_of_the_plan(angle):
     ],
 )
 def test_lines_are_faces_of_one_wall_only_if_all_conditions_hold(other, merges):
-    assert merge_faces([line(0, 0, 4, 0), other])[1] == (2 if merges else 0)
+    assert merge_faces([line(0, 0, 4, 0), other]).lines == (2 if merges else 0)
+
+
+def area(sheets) -> float:
+    return sum(sheet.length * (sheet.top - sheet.bottom) for sheet in sheets)
+
+
+def test_what_is_left_of_a_longer_face_is_kept():
+    """An outer wall whose inner face is drawn in two of four rooms only; the second wall is staggered."""
+    wall = [line(0, 0, 12, 0), line(0.2, 0.2, 3, 0.2), line(3.1, 0.2, 6, 0.2)]
+    merged = merge_faces(wall)
+    (sheet,) = merged.sheets
+    assert (sheet.start, sheet.end) == (pytest.approx((0.1, 0.1)), pytest.approx((12.0, 0.1)))
+    assert merged.report == [
+        "brick: 2 merged from two faces, 0.20 m apart, 5.8 m long",
+        "brick: 1 kept of a face that is longer than the other, 6.0 m long",
+        "brick: walls without a thickness get 0.2 m",
+    ]
+    (staggered,) = merge_faces([line(0, 0, 10, 0), line(4, 0.2, 14, 0.2)]).sheets
+    assert staggered.length == pytest.approx(14.0)
+
+
+def outlined() -> str:
+    """A flat of 12 m x 8 m as closed outlines of its walls, drawn with errors of millimetres; a door, a window."""
+    boxes = [
+        (0, 0, 12, 0.3), (0, 7.697, 12, 8), (0, 0.3, 0.302, 7.7), (11.703, 0.3, 12, 7.7),
+        (5, 0.3, 5.299, 3), (5, 3.9, 5.301, 7.7), (0.3, 4, 3.2, 4.298), (5.3, 5, 11.7, 5.3),
+    ]  # fmt: skip
+    rows = [f'"POLYGON (({x} {y}, {u} {y}, {u} {v}, {x} {v}, {x} {y}))",brick' for x, y, u, v in boxes]
+    return "\n".join(["wkt,type", *rows, '"LINESTRING (5.15 3, 5.15 3.9)",door', ""])
+
+
+def test_walls_drawn_as_closed_outlines_become_one_sheet_each_of_one_material(tmp_path):
+    (tmp_path / "plan.csv").write_text(outlined())
+    segments = read_plan(tmp_path / "plan.csv", 2.5)
+    assert len(segments) == 8 * 4 + 1
+    made = make_plan_scene(segments, tmp_path / "flat", floor=False, ceiling=False)
+    materials = read_scene(made.path, 5e9).materials
+    assert {name: material.thickness for name, material in materials.items()} == {
+        "brick_wall": pytest.approx(0.3, abs=0.004), "door": 0.04,
+    }  # fmt: skip
+    walls = mesh(tmp_path / "flat", "brick_wall")
+    # Centre lines: outside 2 x 11.7 m and 2 x 7.7 m, inside 2.85 m + 3.95 m, 3.05 m and 6.7 m; a corner counts once.
+    assert walls.area == pytest.approx((2 * 11.7 + 2 * 7.7 + 2.85 + 3.95 + 3.05 + 6.7) * 2.5, rel=0.01)
+    assert any("ends of outlined walls left out" in text for text in made.walls)
+    assert json.loads((tmp_path / "flat" / "scene.json").read_text())["walls"] == list(made.walls)
+
+
+DXF = """0 SECTION 2 ENTITIES
+0 LWPOLYLINE 8 brick 90 4 70 1 10 0 20 0 10 5000 20 0 10 5000 20 4000 10 0 20 4000
+0 POLYLINE 8 glass 66 1 70 0 0 VERTEX 8 glass 10 1000 20 0 0 VERTEX 8 glass 10 2000 20 0 0 SEQEND
+0 LINE 8 door 10 0 20 1000 11 0 21 1750 0 TEXT 8 notes 10 1 20 1 40 1 1 kitchen 0 ENDSEC 0 EOF"""
+JSON = {
+    "type": "FeatureCollection",
+    "features": [
+        {"type": "Feature", "properties": {"type": kind}, "geometry": {"type": shape, "coordinates": points}}
+        for kind, shape, points in [
+            ("brick", "Polygon", [[[0, 0], [5000, 0], [5000, 4000], [0, 4000], [0, 0]]]),
+            ("glass", "LineString", [[1000, 0], [2000, 0]]),
+            ("door", "MultiLineString", [[[0, 1000], [0, 1750]]]),
+            ("notes", "Point", [1, 1]),
+        ]
+    ],
+}
+
+
+@pytest.mark.parametrize("ending", ["dxf", "geojson"])
+def test_polylines_of_vector_files_are_read(tmp_path, ending):
+    path = tmp_path / f"plan.{ending}"
+    path.write_text("\n".join(DXF.split()) + "\n" if ending == "dxf" else json.dumps(JSON))
+    plan = read_plan(path, height=2.5, unit=0.001)
+    corners = [(0, 0), (5, 0), (5, 4), (0, 4), (0, 0)]
+    walls = [line(*a, *b, top=2.5) for a, b in pairwise(corners)]
+    assert plan == [*walls, line(1, 0, 2, 0, "glass", top=2.5), line(0, 1, 0, 1.75, "door", top=2.5)]
+
+
+def test_a_file_that_is_dxf_for_one_driver_and_vrt_for_another_is_refused(tmp_path):
+    path = tmp_path / "plan.dxf"
+    path.write_text("0\nSECTION\n<OGRVRTDataSource><OGRVRTLayer/></OGRVRTDataSource>")
+    with pytest.raises(InputError, match="is none of the formats that are read"):
+        read_plan(path)
 
 
 def test_walls_that_meet_share_their_corners(tmp_path):
@@ -146,6 +229,8 @@ def test_a_plan_is_read_in_its_unit(tmp_path):
         ("x0,y0,x1,y1,type\n", "holds no segment"),
         ("x0,y0,x1,y1,type\n0,0,a,1,brick\n", "row 2: x1 = 'a' is not a number"),
         ("x0,y0,x1,y1,type\n0,0,,1,brick\n", "row 2: lacks its type or a coordinate"),
+        ("wkt,type\nLINE,brick\n", "row 2: wkt = 'LINE' is no geometry"),
+        ("wkt,type\nPOINT (1 1),brick\n", "row 2: lacks its type or a coordinate"),
         ("x0,y0,x1,y1,type\n0,0,1,1,brick\n2,2,2,2,brick\n", "row 3: its length, height"),
         ("x0,y0,x1,y1,type,height\n0,0,1,1,brick,-2\n", "row 2: its length, height"),
     ],

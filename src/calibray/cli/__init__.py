@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import warnings
 from typing import NoReturn
 
 from calibray.support.interruption import INTERRUPTED
@@ -14,6 +15,8 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line of this process and exit."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # warnings of libraries, for programmers; the tests make them errors
     try:
         from calibray.cli.app import app
 

@@ -169,7 +169,8 @@ def plan(
         Path,
         typer.Argument(
             metavar="PLAN",
-            help="CSV with columns x0, y0, x1, y1 and type; optional: thickness, bottom, height.",
+            help="CSV with columns x0, y0, x1, y1 (or wkt) and type; optional: thickness, bottom, height. "
+            "Or DXF, GeoJSON and other vector files.",
         ),
     ],
     out: Out,

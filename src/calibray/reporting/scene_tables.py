@@ -34,6 +34,7 @@ def contents(scene: MadeScene) -> Table:
         ("extent", f"{east - west:.0f} m x {north - south:.0f} m, {bottom:.1f} m to {top:.1f} m high"),
         ("triangles", ", ".join(f"{name} {count}" for name, count in scene.triangles.items())),
         *((name, str(count)) for name, count in scene.counts.items()),
+        *(("walls", text) for text in scene.walls),
         *((_HEIGHT_SOURCES[source], _listed(names)) for source, names in scene.guessed.items()),
     ]
     if scene.frame is not None:

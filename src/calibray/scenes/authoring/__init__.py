@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.building_scene import make_scene as make_scene
     from calibray.scenes.authoring.extrusion import Windows as Windows
     from calibray.scenes.authoring.floor_plan import Segment as Segment
-    from calibray.scenes.authoring.floor_plan import merge_faces as merge_faces
     from calibray.scenes.authoring.floor_plan import read_plan as read_plan
     from calibray.scenes.authoring.floor_plan_scene import WALL_THICKNESS as WALL_THICKNESS
     from calibray.scenes.authoring.floor_plan_scene import make_plan_scene as make_plan_scene
@@ -29,16 +28,18 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.terrain import Terrain as Terrain
     from calibray.scenes.authoring.terrain import lower_origin as lower_origin
     from calibray.scenes.authoring.terrain import read_terrain as read_terrain
+    from calibray.scenes.authoring.wall_faces import merge_faces as merge_faces
 
 _MODULES = {
     "building_scene": ("make_scene",),
     "extrusion": ("Windows",),
-    "floor_plan": ("Segment", "merge_faces", "read_plan"),
+    "floor_plan": ("Segment", "read_plan"),
     "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
     "footprint_files": ("read_footprints", "read_openstreetmap"),
     "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
     "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),
+    "wall_faces": ("merge_faces",),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 

@@ -21,10 +21,11 @@ from calibray.scenes.authoring.extrusion import (
     triangulate,
     wall_triangles,
 )
-from calibray.scenes.authoring.floor_plan import OPENINGS, Segment, merge_faces
+from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, SurfaceMaterial, write_made_scene
 from calibray.scenes.authoring.overlaps import subtract
 from calibray.scenes.authoring.wall_alignment import align
+from calibray.scenes.authoring.wall_faces import MergedPlan, merge_faces
 from calibray.scenes.meshes import MeshObject, weld
 from calibray.scenes.scene import ITU_NAMES
 from calibray.support.extras import library
@@ -72,8 +73,8 @@ def make_plan_scene(
         segments: Lines of the plan.
         folder: Where to write `scene.xml`, `scene.json` and the meshes.
         types: Materials by type, in addition to `TYPES` or replacing them. A type that is a material of ITU-R P.2040,
-            such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type become several
-            materials.
+            such as `brick`, becomes the material `brick_wall`. Several thicknesses of one type that the
+            plan states become several materials.
         floor: Whether to make a floor: a sheet over all that walls enclose, at the lowest bottom.
         ceiling: Whether to make a ceiling, at the highest top.
         merge: Whether two parallel lines are merged into one wall (`merge_faces`).
@@ -91,7 +92,8 @@ def make_plan_scene(
     types = {**TYPES, **(types or {})}
     if not segments:
         raise InputError("the floor plan holds no segment; give at least one wall")
-    sheets, merged = merge_faces(segments) if merge else (list(segments), 0)
+    merged = merge_faces(segments) if merge else MergedPlan(segments)
+    sheets = merged.sheets
     materials = _materials(sheets, types)
     pieces = _pieces(_extend_to_walls(sheets), [material.name for material in materials])
     objects = _wall_objects(pieces)
@@ -113,9 +115,11 @@ def make_plan_scene(
     counts = {
         "lines": len(segments),
         "sheets": len(sheets),
-        **({"lines merged as faces of one wall": merged} if merged else {}),
+        **({"lines merged as faces of one wall": merged.lines} if merged.lines else {}),
     }
-    return write_made_scene(folder, objects, materials, frame, counts, overwrite=overwrite)
+    return write_made_scene(
+        folder, objects, materials, frame, counts, walls=merged.report, overwrite=overwrite
+    )
 
 
 def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:

@@ -8,6 +8,7 @@ recognised by their first bytes, and what they declare is bounded before anythin
 from __future__ import annotations
 
 import json
+import logging
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -41,8 +42,8 @@ LARGEST_BLOCK: Final = 2**28
 FEATURE_BYTES: Final = 500
 """Memory of a feature with its outline and attributes [bytes], at least."""
 
-JSON_GROWTH: Final = 15
-"""Memory of parsed GeoJSON as a multiple of the file's size."""
+TEXT_GROWTH: Final = 15
+"""Memory of parsed GeoJSON or DXF as a multiple of the file's size."""
 
 HEIGHTS: Final = (-1000.0, 10_000.0)
 """Range of heights on land [m]; -32768 and -9999 are gaps that the file does not declare."""
@@ -52,6 +53,10 @@ _MAGIC: Final = (
     (b"\0\0\x27\x0a", "ESRI Shapefile"),
     (b"fgb\x03fgb", "FlatGeobuf"),
 )
+
+_LOG: Final = logging.getLogger(__name__)
+_DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
+"""Start of a DXF file; without these characters, it is no file of another driver too."""
 
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
@@ -88,7 +93,7 @@ def read_features(path: Path, layer: str | None) -> Features:
     """
     # A geodatabase is a folder.
     if not (path.is_dir() or exists(path)):
-        raise InputError(f"footprints {path}: does not exist; check the path")
+        raise InputError(f"{path}: does not exist; check the path")
     try:
         head = b"" if path.is_dir() else _head(path)
         if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"{":
@@ -98,47 +103,60 @@ def read_features(path: Path, layer: str | None) -> Features:
             driver = "OpenFileGDB"
         if driver == "GPKG" and head[68:70] != b"GP":
             driver = None
+        if driver is None and not path.is_dir() and _DXF.fullmatch(_head(path, 4096)):
+            _check_text_size(path, "DXF")
+            driver = "DXF"
         if driver is None:
-            raise InputError(
-                f"footprints {path}: is none of the formats that are read; give {VECTOR_FORMATS}"
-            )
+            raise InputError(f"{path}: is none of the formats that are read; give {VECTOR_FORMATS}")
         return _read_with_gdal(path, layer, driver)
     except OSError as error:
-        raise InputError(f"footprints {path}: cannot be read ({error.strerror}); check the file") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
     except MemoryError:
-        raise InputError(
-            f"footprints {path}: does not fit into memory; cut out the area that you need"
-        ) from None
+        raise InputError(f"{path}: does not fit into memory; cut out the area that you need") from None
 
 
-def _head(path: Path) -> bytes:
+def _head(path: Path, size: int = 100) -> bytes:
     with path.open("rb") as file:
-        return file.read(100)
+        return file.read(size)
+
+
+def _check_text_size(path: Path, what: str) -> None:
+    size = path.stat().st_size
+    if size * TEXT_GROWTH > available_memory():
+        raise InputError(
+            f"{path}: {size / 1e6:,.0f} MB of {what} need about {TEXT_GROWTH * size / 1e9:,.1f} GB of memory; convert "
+            "it to a GeoPackage, or cut out the area that you need"
+        )
 
 
 def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
     pyogrio, shapely = library("pyogrio", "scenes"), library("shapely", "scenes")
     # Absolute, so that no part of the name is taken for a prefix of GDAL's, such as /vsicurl or WFS:.
     file = str(path.resolve())
+    # Blocks of a DXF file may contain blocks, so that some kilobytes of it become gigabytes.
+    pyogrio.set_gdal_config_options({"DXF_INLINE_BLOCKS": False})
     try:
+        if layer is None:
+            layers = pyogrio.list_layers(file)[:, 0].tolist()
+            layer = "entities" if driver == "DXF" else layers[0]
+            if len(layers) > 1 and driver != "DXF":
+                _LOG.warning("%s has the layers %s; %r is read", path, shortened(", ".join(layers)), layer)
         info = pyogrio.read_info(file, layer=layer)
         count = int(info["features"])
         if info["driver"] != driver:
-            raise InputError(f"footprints {path}: is damaged; give {VECTOR_FORMATS}")
+            raise InputError(f"{path}: is damaged; give {VECTOR_FORMATS}")
         if count * FEATURE_BYTES > available_memory():
             raise InputError(
-                f"footprints {path}: declares {count:,} features, more than fit into memory; cut out the area that you "
+                f"{path}: declares {count:,} features, more than fit into memory; cut out the area that you "
                 "need"
             )
         meta, _, geometry, fields = pyogrio.raw.read(file, layer=layer)
         outline = shapely.from_wkb(geometry)
     except (
         pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.FeatureError,
-        pyogrio.errors.GeometryError, shapely.GEOSException, ValueError,
+        pyogrio.errors.GeometryError, shapely.GEOSException, ValueError, IndexError,
     ) as error:  # fmt: skip
-        raise InputError(
-            f"footprints {path}: cannot be read ({first_line(error)}); give {VECTOR_FORMATS}"
-        ) from None
+        raise InputError(f"{path}: cannot be read ({first_line(error)}); give {VECTOR_FORMATS}") from None
     crs = None if meta["crs"] is None else str(meta["crs"])
     return Features(outline, dict(zip(map(str, meta["fields"]), fields, strict=True)), crs)
 
@@ -146,12 +164,7 @@ def _read_with_gdal(path: Path, layer: str | None, driver: str) -> Features:
 def _read_geojson(path: Path) -> Features:
     """Read GeoJSON (RFC 7946, and the member `crs` of its predecessor), which GDAL would try with other drivers."""
     shapely = library("shapely", "scenes")
-    size = path.stat().st_size
-    if size * JSON_GROWTH > available_memory():
-        raise InputError(
-            f"footprints {path}: {size / 1e6:,.0f} MB of GeoJSON need about {JSON_GROWTH * size / 1e9:,.1f} GB of "
-            "memory; convert it to a GeoPackage, or cut out the area that you need"
-        )
+    _check_text_size(path, "GeoJSON")
     try:
         content = json.loads(path.read_bytes().decode("utf-8-sig"))
         kind = content["type"]
@@ -174,7 +187,7 @@ def _read_geojson(path: Path) -> Features:
         shapely.GEOSException,
     ) as error:
         raise InputError(
-            f"footprints {path}: cannot be read ({first_line(error)}); give valid GeoJSON of features, as UTF-8"
+            f"{path}: cannot be read ({first_line(error)}); give valid GeoJSON of features, as UTF-8"
         ) from None
     # CRS84 is WGS 84 with longitude first, which is how all coordinates are taken here.
     return Features(outline, columns, WGS84 if crs is not None and crs.endswith("CRS84") else crs)

@@ -98,6 +98,7 @@ class MadeScene:
         triangles: Number of triangles by material.
         counts: Number of objects used, repaired or left out, by what they are.
         guessed: The buildings whose height is a guess, by the source of the guess.
+        walls: What became of the lines of a floor plan.
     """
 
     path: Path
@@ -106,6 +107,7 @@ class MadeScene:
     triangles: Mapping[str, int]
     counts: Mapping[str, int]
     guessed: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    walls: Sequence[str] = ()
 
     def record(self) -> dict[str, object]:
         """The content of `scene.json`."""
@@ -115,6 +117,7 @@ class MadeScene:
             "triangles": dict(self.triangles),
             "counts": dict(self.counts),
             "guessed": {source: list(names) for source, names in self.guessed.items()},
+            **({"walls": list(self.walls)} if self.walls else {}),
         }
 
 
@@ -126,12 +129,14 @@ def write_made_scene(
     counts: Mapping[str, int],
     guessed: Mapping[str, Sequence[str]] | None = None,
     overwrite: bool = False,
+    walls: Sequence[str] = (),
 ) -> MadeScene:
     """Write a scene and the assumptions made.
 
     Further materials, and the same one several times, do not matter. `counts` is the number of objects used, repaired
-    or left out, by what they are; `guessed` are the buildings whose height is a guess, by the source of the guess. With
-    `overwrite`, files are replaced that Calibray did not write.
+    or left out, by what they are; `guessed` are the buildings whose height is a guess, by the source of the guess;
+    `walls` says what became of the lines of a floor plan. With `overwrite`, files are replaced that Calibray did not
+    write.
 
     Raises:
         InputError: Two different materials, or a material and a mesh, have the same name; or a file must not be
@@ -156,6 +161,6 @@ def write_made_scene(
     check_outputs(folder, SCENE_FILES, overwrite=overwrite)
     used_constants = {name: values for name, values in constants.items() if name in used}
     path = write_scene(folder, objects, used_constants, frame, overwrite)
-    scene = MadeScene(path, frame, bounds, triangles, counts, guessed or {})
+    scene = MadeScene(path, frame, bounds, triangles, counts, guessed or {}, walls)
     write_text(folder / "scene.json", json.dumps(scene.record(), indent=2) + "\n")
     return scene

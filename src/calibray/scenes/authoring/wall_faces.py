@@ -1,0 +1,236 @@
+"""Wall faces: plans that draw both faces of a wall contain every wall twice.
+
+Sionna RT models a wall as one sheet whose material has a thickness. `merge_faces` replaces two parallel lines of one
+type, a wall's thickness apart, by one sheet midway between them.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
+from calibray.support.extras import library
+
+THICKEST: Final = 0.6
+"""Largest thickness of a wall whose faces are merged [m]."""
+
+_PARALLEL: Final = np.cos(np.radians(2.0))
+_TOUCHING: Final = 0.02  # distance of ends that meet [m]
+_SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall have in common
+
+
+@dataclass(frozen=True)
+class MergedPlan:
+    """The sheets of a plan, and what became of its lines.
+
+    Attributes:
+        sheets: One for each wall, door and window.
+        lines: Number of lines that were merged as faces.
+        report: What was merged, kept and left out, a sentence each.
+    """
+
+    sheets: Sequence[Segment]
+    lines: int = 0
+    report: Sequence[str] = field(default=())
+
+
+def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> MergedPlan:
+    """Merge the two faces of each wall into one sheet.
+
+    Two lines are faces of one wall if they have the same type, bottom and top, are parallel, lie next to each other at
+    the distance of a wall's thickness over more than that distance, and no line nearer to one of them could be its
+    other face. The distance is at most `thickest`, and within a fifth or 2 cm of the thickness if that is given. Where
+    one long face has several short ones opposite, as between the rooms along a corridor, each pair makes a sheet, and
+    gaps between the sheets up to `thickest` are closed. Ends lie midway between the faces' ends, so that corners meet.
+
+    What is left of a face that is longer than the other one is kept as a sheet in the same plane. The short lines that
+    close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
+    distances of their faces, weighted with their lengths.
+
+    Args:
+        segments: Lines of a plan.
+        thickest: Largest thickness of a wall [m].
+
+    Returns:
+        The sheets, followed by the lines without another face.
+    """
+    pairs = _face_pairs(segments, thickest)
+    paired = {index for pair in pairs for index in pair}
+    merged = [_merge_pair(segments[one], segments[other], thickest) for one, other in pairs]
+    distances = [abs(_offset(segments[one], segments[other])) for one, other in pairs]
+    rest = [sheet for index in sorted(paired) for sheet in _left_over(index, pairs, segments, thickest)]
+    single = [index for index in range(len(segments)) if index not in paired]
+    closing = {index for index in single if _closes_wall(segments[index], pairs, segments, thickest)}
+    thickness = _thicknesses(merged, distances)
+    sheets = [*_close_gaps([*merged, *rest], thickest), *(segments[k] for k in single if k not in closing)]
+    report = [
+        *_described("merged from two faces", merged, distances),
+        *_described("kept of a face that is longer than the other", rest),
+        *_described("ends of outlined walls left out", [segments[index] for index in sorted(closing)]),
+        *(f"{kind}: walls without a thickness get {value:g} m" for kind, value in thickness.items()),
+    ]
+    return MergedPlan(
+        [
+            replace(sheet, thickness=thickness[sheet.kind])
+            if sheet.thickness is None and sheet.kind in thickness
+            else sheet
+            for sheet in sheets
+        ],
+        len(paired),
+        report,
+    )
+
+
+def _face_pairs(segments: Sequence[Segment], thickest: float) -> list[tuple[int, int]]:
+    """Pairs of lines that are the two faces of one wall."""
+    shapely = library("shapely", "scenes")
+    lines = np.array([shapely.LineString([segment.start, segment.end]) for segment in segments], dtype=object)
+    near = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=thickest)
+    distances: dict[tuple[int, int], float] = {}
+    nearest = np.full(len(segments), np.inf)
+    for one, other in near.T.tolist():
+        distance = _face_distance(segments[one], segments[other], thickest) if one > other else None
+        if distance is not None:
+            distances[other, one] = distance
+            nearest[[one, other]] = np.minimum(nearest[[one, other]], distance)
+    # A wall has one other face, but that may be drawn in pieces at nearly the same distance.
+    return [
+        pair for pair, distance in sorted(distances.items()) if (distance <= nearest[list(pair)] + 0.01).all()
+    ]
+
+
+def _face_distance(one: Segment, other: Segment, thickest: float) -> float | None:
+    """Distance of two lines that may be faces of one wall [m]; None if they cannot be."""
+    if (one.kind, one.bottom, one.top) != (other.kind, other.bottom, other.top):
+        return None
+    if abs(one.direction @ other.direction) < _PARALLEL:
+        return None
+    low, high = _span(one, other)
+    distance = abs(_offset(one, other))
+    if not 0.01 < distance <= thickest or high - low < max(0.5 * min(one.length, other.length), distance):
+        return None
+    for stated in (one.thickness, other.thickness):
+        if stated is not None and abs(distance - stated) > max(0.2 * stated, 0.02):
+            return None
+    return distance
+
+
+def _relative(one: Segment, other: Segment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The ends of a segment along and across another one, from that one's start [2], [m]."""
+    direction = one.direction
+    offset = np.array([other.start, other.end]) - np.array(one.start)
+    return offset @ direction, offset @ [-direction[1], direction[0]]
+
+
+def _span(one: Segment, other: Segment) -> tuple[float, float]:
+    """Where a segment has another one opposite, from and to, along it [m]."""
+    low, high = sorted(_relative(one, other)[0].tolist())
+    return max(low, 0.0), min(high, one.length)
+
+
+def _offset(one: Segment, other: Segment) -> float:
+    """Distance of another segment to the left of one [m]."""
+    return float(np.mean(_relative(one, other)[1]))
+
+
+def _part(segment: Segment, start: float, end: float, offset: float) -> Segment:
+    """The part of a segment between two distances from its start [m], moved to its left [m]."""
+    direction = segment.direction
+    base = np.array(segment.start) + np.array([-direction[1], direction[0]]) * offset
+    first, last = ((base + direction * distance).tolist() for distance in (start, end))
+    return replace(segment, start=(first[0], first[1]), end=(last[0], last[1]))
+
+
+def _merge_pair(one: Segment, other: Segment, thickest: float) -> Segment:
+    """The sheet between two faces: over their overlap, its ends midway where both faces end near each other."""
+    low, high = sorted(_relative(one, other)[0].tolist())
+    start = low / 2 if abs(low) <= thickest else max(low, 0.0)
+    end = (high + one.length) / 2 if abs(high - one.length) <= thickest else min(high, one.length)
+    sheet = _part(one, start, end, _offset(one, other) / 2)
+    return replace(sheet, thickness=one.thickness if one.thickness is not None else other.thickness)
+
+
+def _left_over(
+    index: int, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment], thickest: float
+) -> list[Segment]:
+    """The parts of a face without another face, longer than `thickest`, moved into the plane of the nearest sheet."""
+    face = segments[index]
+    opposite = [segments[sum(pair) - index] for pair in pairs if index in pair]
+    spans = sorted((*_span(face, other), _offset(face, other)) for other in opposite)
+    parts, covered, offset = [], 0.0, spans[0][2]
+    for low, high, offset in [*spans, (face.length, face.length, spans[-1][2])]:
+        if low - covered > thickest:
+            parts.append(_part(face, covered, low, offset / 2))
+        covered = max(covered, high)
+    return parts
+
+
+def _closes_wall(
+    segment: Segment, pairs: Sequence[tuple[int, int]], segments: Sequence[Segment], thickest: float
+) -> bool:
+    """Whether a line joins ends of the two faces of a wall."""
+    if segment.length > thickest:
+        return False
+    for one, other in pairs:
+        faces = [np.array([segments[index].start, segments[index].end]) for index in (one, other)]
+        for first, second in (faces, faces[::-1]):
+            gaps = [
+                np.hypot(*(face - end).T).min()
+                for face, end in ((first, segment.start), (second, segment.end))
+            ]
+            if max(gaps) <= _TOUCHING and segment.kind == segments[one].kind:
+                return True
+    return False
+
+
+def _close_gaps(sheets: Sequence[Segment], longest: float) -> list[Segment]:
+    """Join sheets of one wall that only a crossing wall separates."""
+    joined: list[Segment] = []
+    for sheet in sorted(sheets, key=lambda sheet: min(sheet.start, sheet.end)):
+        for index, before in enumerate(joined):
+            if any(getattr(sheet, name) != getattr(before, name) for name in _SAME):
+                continue
+            along, across = _relative(before, sheet)
+            if (
+                np.abs(across).max() < _TOUCHING
+                and along.min() <= before.length + longest
+                and along.max() >= -longest
+            ):
+                reach = min(0.0, float(along.min())), max(before.length, float(along.max()))
+                joined[index] = _part(before, *reach, 0.0)
+                break
+        else:
+            joined.append(sheet)
+    return joined
+
+
+def _thicknesses(sheets: Sequence[Segment], distances: Sequence[float]) -> dict[str, float]:
+    """The thickness of the walls of each type without one [m]: the median distance of their faces, by length."""
+    thickness = {}
+    for kind in sorted({sheet.kind for sheet in sheets if sheet.thickness is None} - OPENINGS):
+        walls = sorted(
+            (distance, sheet.length)
+            for sheet, distance in zip(sheets, distances, strict=True)
+            if sheet.kind == kind and sheet.thickness is None
+        )
+        lengths = np.cumsum([length for _, length in walls])
+        thickness[kind] = round(walls[int(np.searchsorted(lengths, lengths[-1] / 2))][0], 3)
+    return thickness
+
+
+def _described(what: str, sheets: Sequence[Segment], distances: Sequence[float] = ()) -> list[str]:
+    """Number and length of sheets by type and, if given, the distance of their faces to a centimetre."""
+    groups: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for index, sheet in enumerate(sheets):
+        apart = f", {distances[index]:.2f} m apart" if distances else ""
+        groups[sheet.kind, apart].append(sheet.length)
+    return [
+        f"{kind}: {len(lengths)} {what}{apart}, {sum(lengths):.1f} m long"
+        for (kind, apart), lengths in sorted(groups.items())
+    ]
