@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import shown
 from calibray.calibration.result import Result
-from calibray.engines.ledger.answers import LedgerEntry, read_entry
+from calibray.engines.ledger.database import LedgerEntry, read_entry
 from calibray.errors import InputError
 from calibray.measurements import read_measurements, read_table
 from calibray.measurements.filters import evaluate

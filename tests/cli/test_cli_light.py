@@ -13,7 +13,7 @@ import pytest
 import programs
 from calibray.calibration.result import Result
 from calibray.engines import Ledger
-from calibray.engines.ledger.answers import LedgerEntry, key
+from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.tracing.llvm import PATH_VARIABLE
 from commands import write_study
 

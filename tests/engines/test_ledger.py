@@ -20,7 +20,7 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.engines import Answer, Ledger, Recorded, fingerprint
-from calibray.engines.ledger.answers import LedgerEntry, key
+from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Study

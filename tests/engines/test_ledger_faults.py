@@ -22,7 +22,7 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.engines import Answer, Ledger, Recorded
 from calibray.engines.ledger import claims, database
-from calibray.engines.ledger.answers import LedgerEntry, key
+from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.engines.process_owner import ProcessOwner
 from calibray.errors import EngineError, InputError
 from calibray.parameters import Parameter, Parameters

@@ -19,7 +19,7 @@ import calibray as cb
 import synthetic
 from calibray.fields import path_gains, path_loss, slab
 from calibray.fields.diffraction import affine_form, transition
-from calibray.fields.scattering import pattern_value
+from calibray.fields.material_response import pattern_value
 from calibray.materials import FIELDS, Material, complex_relative_permittivity, constants_matrix
 from calibray.paths import Diffraction, Paths
 from calibray.scenes import read_scene

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibray.fields.segment_sums import BLOCK, make_segments, segment_sums
+from calibray.fields.arithmetic import BLOCK, make_segments, segment_sums
 
 SIZES = {
     "no block": [3, 0, BLOCK - 1],

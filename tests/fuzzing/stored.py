@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from calibray.engines.ledger.answers import LedgerEntry
+from calibray.engines.ledger.database import LedgerEntry
 from calibray.fields import path_loss
 from calibray.paths import seal
 from calibray.study import Study

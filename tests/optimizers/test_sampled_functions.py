@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.sampled_functions import sample_function, standardized_error
+from calibray.optimizers.multifidelity.discrepancy import sample_function, standardized_error
 from calibray.optimizers.regression import Inputs, Process
 
 

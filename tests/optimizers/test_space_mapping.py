@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from calibray.optimizers import SpaceMapping, VectorSurrogate
-from calibray.optimizers.box import Box
-from calibray.optimizers.multifidelity.averaging import CAPPED, UNLIKELY, ErrorRecord, average
+from calibray.optimizers.arguments import Box
 from calibray.optimizers.multifidelity.cheap_model import Constants, FunctionModel
-from calibray.optimizers.multifidelity.correction import FOLLOWED, constants_fit, correct, misfit
+from calibray.optimizers.multifidelity.correction import (
+    CAPPED,
+    FOLLOWED,
+    UNLIKELY,
+    ErrorRecord,
+    average,
+    constants_fit,
+    correct,
+    misfit,
+)
 from calibray.optimizers.multifidelity.space_mapping import HELPFUL, error_ratio
 from calibray.optimizers.sampling import design
 
@@ -153,7 +161,9 @@ def test_members_pass_through_the_answers_and_agree_better_with_more_of_them():
 
 def test_members_that_explain_the_answers_badly_are_left_out(monkeypatch):
     corrected, starts = corrected_by(3)
-    monkeypatch.setattr("calibray.optimizers.multifidelity.averaging.STEPS", 0)  # members stay at their start
+    monkeypatch.setattr(
+        "calibray.optimizers.multifidelity.correction.STEPS", 0
+    )  # members stay at their start
     kept = average(corrected, starts, np.random.default_rng(3)).members[1:]
     fit, prior = constants_fit(corrected), corrected.model.constants
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray import engines
-from calibray.engines.problem_fingerprint import fingerprint
+from calibray.engines.make_engine import fingerprint
 from calibray.errors import InputError
 from calibray.fitting.methods import local_searches
 from calibray.fitting.preliminary_fits import estimate_noise

@@ -21,19 +21,18 @@ if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers as Workers
     from calibray.engines.cluster.workers import open_workers as open_workers
     from calibray.engines.compression import compress as compress
-    from calibray.engines.external.command import Command as Command
     from calibray.engines.external.exchange import Request as Request
-    from calibray.engines.ledger.answers import LedgerEntry as LedgerEntry
-    from calibray.engines.ledger.answers import key as key
+    from calibray.engines.external.program import Command as Command
+    from calibray.engines.ledger.database import LedgerEntry as LedgerEntry
+    from calibray.engines.ledger.database import key as key
     from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
     from calibray.engines.ledger.ledger import Ledger as Ledger
     from calibray.engines.ledger.ledger import open_ledger as open_ledger
     from calibray.engines.ledger.recorded import Recorded as Recorded
+    from calibray.engines.make_engine import fingerprint as fingerprint
     from calibray.engines.make_engine import make as make
-    from calibray.engines.multi_carrier import ReplayCarriers as ReplayCarriers
     from calibray.engines.observable import PATH_LOSS as PATH_LOSS
     from calibray.engines.observable import Observable as Observable
-    from calibray.engines.problem_fingerprint import fingerprint as fingerprint
     from calibray.engines.protocol import Answer as Answer
     from calibray.engines.protocol import Answering as Answering
     from calibray.engines.protocol import Chunked as Chunked
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from calibray.engines.protocol import Engine as Engine
     from calibray.engines.protocol import check_candidates as check_candidates
     from calibray.engines.replay import Replay as Replay
+    from calibray.engines.replay import ReplayCarriers as ReplayCarriers
     from calibray.engines.retrace import Retrace as Retrace
     from calibray.engines.section import OpenedStudy as OpenedStudy
     from calibray.engines.section import RadioSettings as RadioSettings
@@ -50,27 +50,27 @@ _HOMES = {
     "Answering": "calibray.engines.protocol",
     "Chunked": "calibray.engines.protocol",
     "ChunkedReplay": "calibray.engines.cluster.chunked_replay",
-    "Command": "calibray.engines.external.command",
+    "Command": "calibray.engines.external.program",
     "Differentiable": "calibray.engines.protocol",
     "Engine": "calibray.engines.protocol",
     "InProcess": "calibray.engines.cluster.workers",
     "LEDGER_FILE": "calibray.engines.ledger.ledger",
     "Ledger": "calibray.engines.ledger.ledger",
-    "LedgerEntry": "calibray.engines.ledger.answers",
+    "LedgerEntry": "calibray.engines.ledger.database",
     "Observable": "calibray.engines.observable",
     "OpenedStudy": "calibray.engines.section",
     "PATH_LOSS": "calibray.engines.observable",
     "RadioSettings": "calibray.engines.section",
     "Recorded": "calibray.engines.ledger.recorded",
     "Replay": "calibray.engines.replay",
-    "ReplayCarriers": "calibray.engines.multi_carrier",
+    "ReplayCarriers": "calibray.engines.replay",
     "Request": "calibray.engines.external.exchange",
     "Retrace": "calibray.engines.retrace",
     "Workers": "calibray.engines.cluster.workers",
     "check_candidates": "calibray.engines.protocol",
     "compress": "calibray.engines.compression",
-    "fingerprint": "calibray.engines.problem_fingerprint",
-    "key": "calibray.engines.ledger.answers",
+    "fingerprint": "calibray.engines.make_engine",
+    "key": "calibray.engines.ledger.database",
     "make": "calibray.engines.make_engine",
     "open_ledger": "calibray.engines.ledger.ledger",
     "open_workers": "calibray.engines.cluster.workers",

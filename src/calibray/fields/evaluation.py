@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.fields import coefficient_tables
-from calibray.fields.arithmetic import materialize
+from calibray.fields.arithmetic import materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
 from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
 from calibray.fields.grouping import COEFFICIENT
@@ -38,7 +38,6 @@ from calibray.fields.material_response import (
 )
 from calibray.fields.program import FormulaArguments, GroupedProgram, layout
 from calibray.fields.propagation import path_fields
-from calibray.fields.segment_sums import segment_sums
 from calibray.materials import Material
 from calibray.paths import Paths
 

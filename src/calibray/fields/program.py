@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.errors import InputError
+from calibray.fields.arithmetic import Segments, make_segments
 from calibray.fields.coefficient_tables import (
     Intervals,
     TableLayout,
@@ -31,7 +32,6 @@ from calibray.fields.coefficient_tables import (
 from calibray.fields.diffraction import affine_form
 from calibray.fields.grouping import DIFFRACTION, SCATTERING, PathGroup, exact_groups, padded_groups
 from calibray.fields.jax_context import jax_settings
-from calibray.fields.segment_sums import Segments, make_segments
 from calibray.fields.slab import Mode
 from calibray.paths import Kind, Paths
 

@@ -1,10 +1,14 @@
-"""Checks of constructor arguments."""
+"""Checked constructor arguments: numbers, names, and the search box with its map to and from the unit cube."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from math import inf, isfinite
 from operator import index
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 
@@ -48,3 +52,70 @@ def choice(name: str, value: str, allowed: Iterable[str]) -> str:
     if value not in names:
         raise InputError(f"{name} = {value!r}; choose one of {', '.join(names)}")
     return value
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box lower <= x <= upper; build it with `Box.between`, which checks the bounds.
+
+    Attributes:
+        lower: Lower bounds [d].
+        upper: Upper bounds [d], each above its lower bound.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    @staticmethod
+    def between(lower: ArrayLike, upper: ArrayLike) -> Box:
+        """Build a box from lower and upper bounds [d], which are copied.
+
+        Raises:
+            InputError: The bounds are not two finite vectors of one length >= 1 with lower below upper.
+
+        Example:
+            >>> Box.between([1.0, 0.0], [9.0, 1.0]).to_unit([[5.0, 0.25]])
+            array([[0.5 , 0.25]])
+        """
+        low, high = np.array(lower, dtype=float), np.array(upper, dtype=float)
+        if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+            raise InputError(
+                f"lower has shape {low.shape} and upper {high.shape}; "
+                "both must be vectors [d] with one entry for each of d >= 1 parameters"
+            )
+        for number, (a, b) in enumerate(zip(low, high, strict=True)):
+            if not (np.isfinite(a) and np.isfinite(b) and a < b):
+                raise InputError(
+                    f"lower[{number}] = {a:g} and upper[{number}] = {b:g}; the bounds must be finite with "
+                    "lower below upper: swap them, or leave a fixed parameter out of the search"
+                )
+        low.setflags(write=False)
+        high.setflags(write=False)
+        return Box(low, high)
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters d."""
+        return self.lower.size
+
+    @property
+    def width(self) -> NDArray[np.float64]:
+        """Upper minus lower bounds [d]."""
+        return self.upper - self.lower
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """The middle of the box [d]."""
+        return 0.5 * (self.lower + self.upper)
+
+    def clip(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points outside the box to its nearest face [..., d]."""
+        return np.clip(x, self.lower, self.upper)
+
+    def to_unit(self, x: ArrayLike) -> NDArray[np.float64]:
+        """Map the box onto the unit cube: 0 at `lower`, 1 at `upper` [..., d]."""
+        return (np.asarray(x, dtype=float) - self.lower) / self.width
+
+    def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map the unit cube onto the box, never past its faces by rounding [..., d]."""
+        return self.clip(self.lower + unit * self.width)

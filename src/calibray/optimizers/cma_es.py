@@ -12,12 +12,10 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.library_adapter import library, limited
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 
 STEP = 0.3
 """Initial standard deviation in the unit cube."""

@@ -16,12 +16,10 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.arguments import real, whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.evaluations import Archive, Objective, root_mean_square
 from calibray.optimizers.library_adapter import Evaluate, inverted, library, limited
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 
 
 @final

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import differential_evolution
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
 from calibray.optimizers.library_adapter import Evaluate, inverted, limited
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 
 
 @final

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box
 
 Objective = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Residuals [n, m] to the value [n], which rises with their mean square."""

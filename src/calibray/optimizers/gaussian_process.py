@@ -15,13 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfcx
 from scipy.stats import norm
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive, merge_repeated
 from calibray.optimizers.kriging import Kriging, fit, solve
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
-from calibray.optimizers.session import Search, Session
 
 CANDIDATES = 300
 """Candidates drawn over the box, and as many around the best points."""

@@ -23,11 +23,9 @@ from typing import ClassVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.protocol import Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import Optimizer, Schedule, Search, Session
 
 LEADERS = 3
 """Alpha, beta and delta."""

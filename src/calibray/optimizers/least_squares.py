@@ -25,13 +25,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
 from calibray.errors import InputError
-from calibray.optimizers.arguments import real, whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.descent import Starts, descend, distinct
 from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
-from calibray.optimizers.protocol import Optimizer, Schedule
+from calibray.optimizers.protocol import Optimizer, Schedule, Search, Session
 from calibray.optimizers.sampling import design
-from calibray.optimizers.session import Search, Session
 from calibray.support.messages import shortened
 
 CATCH_UP = 100.0

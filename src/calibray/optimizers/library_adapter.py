@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.optimizers.evaluations import Evaluations
-from calibray.optimizers.session import Search
+from calibray.optimizers.protocol import Search
 
 Evaluate = Callable[[NDArray[np.float64]], Evaluations]
 """The function that a minimiser calls: candidates [n, d] to their evaluations."""

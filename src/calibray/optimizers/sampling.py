@@ -12,11 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist, pdist
 from scipy.stats import qmc
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 from calibray.support.interruption import defer_interruption
 
 

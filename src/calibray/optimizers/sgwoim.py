@@ -36,12 +36,10 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import pdist
 
 from calibray.errors import InputError
-from calibray.optimizers.arguments import choice, real, whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, choice, real, whole
 from calibray.optimizers.evaluations import Archive, Evaluations, merge_repeated, read_only
 from calibray.optimizers.gwo import LEADERS, LEAST_BUDGET, WOLVES, encircle, linear_decay
-from calibray.optimizers.protocol import Optimizer, Schedule
-from calibray.optimizers.session import Search, Session
+from calibray.optimizers.protocol import Optimizer, Schedule, Search, Session
 
 FULL_ITERATIONS = 5
 """Iterations that evaluate all wolves (table II)."""

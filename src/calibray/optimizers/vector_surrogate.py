@@ -33,14 +33,12 @@ from scipy.spatial.distance import cdist, pdist
 from scipy.stats import spearmanr
 
 from calibray.errors import InputError
-from calibray.optimizers.arguments import real, whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.descent import descend_all
 from calibray.optimizers.evaluations import Archive, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.kriging import Kriging, fit, solve
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 from calibray.optimizers.sampling import distance_to_nearest, draw_around, maximin_design
-from calibray.optimizers.session import Search, Session
 
 FIRST = 5
 """Points of the initial design beyond the number of parameters, at most."""

@@ -20,11 +20,11 @@ from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box
 from calibray.optimizers.evaluations import merge_repeated
 from calibray.optimizers.multifidelity import discrepancy
 from calibray.optimizers.multifidelity.correction import Corrected, correct
-from calibray.optimizers.multifidelity.sampled_functions import (
+from calibray.optimizers.multifidelity.discrepancy import (
     SampledFunction,
     sample_function,
     standardized_error,

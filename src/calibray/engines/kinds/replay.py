@@ -18,8 +18,7 @@ from calibray.support.progress import Progress
 if TYPE_CHECKING:
     from calibray.engines.cluster.chunked_replay import ChunkedReplay
     from calibray.engines.cluster.workers import Workers
-    from calibray.engines.multi_carrier import ReplayCarriers
-    from calibray.engines.replay import Replay
+    from calibray.engines.replay import Replay, ReplayCarriers
     from calibray.materials import Material
     from calibray.paths import Paths
 
@@ -108,8 +107,7 @@ def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -
     `compress_db` is the largest error of path loss [dB] if few weighted paths approximate all.
     """
     from calibray.engines.compression import compress
-    from calibray.engines.multi_carrier import CarrierPaths, ReplayCarriers
-    from calibray.engines.replay import Replay
+    from calibray.engines.replay import CarrierPaths, Replay, ReplayCarriers
     from calibray.paths import take_links
 
     links, parameters = study.links, study.parameters

@@ -23,12 +23,13 @@ import numpy as np
 import pandas as pd
 
 from calibray.engines.ledger import claims, database
-from calibray.engines.ledger.answers import LedgerEntry, read_entry
 from calibray.engines.ledger.database import (
+    LedgerEntry,
     check_own_file,
     explain,
     insert_answer,
     insert_problem,
+    read_entry,
     set_up,
     transaction,
 )

@@ -11,7 +11,7 @@ from typing import Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.ledger.answers import LedgerEntry, key
+from calibray.engines.ledger.database import LedgerEntry, key
 from calibray.engines.ledger.ledger import Ledger
 from calibray.engines.protocol import Answer, Answering, check_candidates, gather
 from calibray.errors import EngineError

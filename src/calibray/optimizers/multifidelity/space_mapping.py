@@ -12,7 +12,7 @@ Its minimum is the first call. After every call the cheap model is corrected unt
   exploitation that gained next to nothing, and replaces one that would repeat a point.
 
 Both account for the constants that few answers leave open, and for the errors of the predictions so far
-(`averaging.py`). Without that, steps on planted districts jump half across the box to predicted minima that do not
+(`correction.py`). Without that, steps on planted districts jump half across the box to predicted minima that do not
 exist.
 
 The cheap model is trusted only while it helps. Each point is predicted from all the others, once by the corrected model
@@ -33,18 +33,22 @@ from typing import ClassVar, Final, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibray.optimizers.arguments import whole
-from calibray.optimizers.box import Box
+from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.descent import Residuals, descend_all, distinct
 from calibray.optimizers.evaluations import Archive, Evaluations, Objective, merge_repeated, root_mean_square
 from calibray.optimizers.multifidelity import discrepancy
-from calibray.optimizers.multifidelity.averaging import Averaged, ErrorRecord, average
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
-from calibray.optimizers.multifidelity.correction import Corrected, cheap_and_slope, correct
-from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule
+from calibray.optimizers.multifidelity.correction import (
+    Averaged,
+    Corrected,
+    ErrorRecord,
+    average,
+    cheap_and_slope,
+    correct,
+)
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
 from calibray.optimizers.regression import Inputs
 from calibray.optimizers.sampling import design, distance_to_nearest, draw_around
-from calibray.optimizers.session import Search, Session
 from calibray.optimizers.vector_surrogate import VectorSurrogate, improvement
 
 CLOUD: Final = 64

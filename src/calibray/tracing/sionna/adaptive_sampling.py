@@ -26,8 +26,7 @@ from calibray.errors import EngineError
 from calibray.materials import Material
 from calibray.support.progress import Progress
 from calibray.tracing.settings import RAYS_PER_ROUND, TraceSettings
-from calibray.tracing.sionna.arrays import aligned, to_points
-from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse
+from calibray.tracing.sionna.buffers import TracedBuffer, aligned, drop_repeats, reverse, to_points
 from calibray.tracing.sionna.image_method import (
     Meshes,
     Unobstructed,

@@ -30,7 +30,7 @@ from sionna.rt.utils import first_order_diffraction_point
 
 from calibray.errors import InputError
 from calibray.paths import Kind
-from calibray.tracing.sionna.arrays import aligned, per_interaction
+from calibray.tracing.sionna.buffers import aligned, per_interaction
 from calibray.tracing.sionna.scene import shape_ids
 
 SAME_PLANE: Final = 2e-3

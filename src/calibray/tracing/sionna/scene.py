@@ -26,7 +26,7 @@ from calibray.materials import Material
 from calibray.scenes import COARSE, Mesh, Scene, SurfaceSize, has_copied_meshes, xml_with_copied_meshes
 from calibray.tracing.gain_table import GainTable, read_gain_table
 from calibray.tracing.settings import Antenna
-from calibray.tracing.sionna.arrays import aligned
+from calibray.tracing.sionna.buffers import aligned
 
 _LOG: Final = logging.getLogger(__name__)
 

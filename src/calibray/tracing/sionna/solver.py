@@ -35,15 +35,16 @@ from calibray.scenes import Scene, check_material_name
 from calibray.tracing.antennas import AntennaPattern
 from calibray.tracing.protocol import compile_paths
 from calibray.tracing.settings import Antenna, TraceSettings
-from calibray.tracing.sionna.arrays import (
+from calibray.tracing.sionna.buffers import (
+    TracedBuffer,
     aligned,
+    drop_empty_entries,
     normals_at,
     per_interaction,
     to_numpy_complex,
     to_points,
     vertices_of,
 )
-from calibray.tracing.sionna.buffers import TracedBuffer, drop_empty_entries
 from calibray.tracing.sionna.scene import antenna_patterns, load_scene, scattering_pattern, shape_ids
 
 # Sionna drops candidates whose hashes collide in its table. With its million entries it lost 16 of 6,030 (100 receivers

@@ -30,8 +30,7 @@ from calibray.tracing.positions import link_positions
 from calibray.tracing.protocol import Links, Solution
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna.adaptive_sampling import AdaptiveSearch, SequenceCache
-from calibray.tracing.sionna.arrays import to_points
-from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse
+from calibray.tracing.sionna.buffers import TracedBuffer, drop_repeats, reverse, to_points
 from calibray.tracing.sionna.solver import Rays, Solver
 from calibray.tracing.trace_plan import (
     Launch,
