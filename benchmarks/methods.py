@@ -26,8 +26,7 @@ for library in (
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.compare import compare
-from calibray.comparison.comparison import table
-from calibray.comparison.comparison_files import figure
+from calibray.comparison.comparison import figure, table
 from calibray.comparison.problem import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write

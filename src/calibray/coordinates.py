@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
@@ -101,13 +101,7 @@ class Frame:
 
     @classmethod
     def from_record(cls, record: object) -> Frame:
-        """Read a frame from its record.
-
-        Args:
-            record: The dictionary that `record` returned.
-
-        Returns:
-            The frame.
+        """Read a frame from the dictionary that `record` returned.
 
         Raises:
             InputError: It is not such a record.
@@ -156,27 +150,14 @@ class Frame:
         return np.stack([easting - self.easting, northing - self.northing, z - self.height], axis=-1)
 
     def to_geographic(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """Convert positions in the scene's frame to longitude, latitude and height.
-
-        Args:
-            positions: x, y and z [n, 3], [m].
-
-        Returns:
-            Longitude [deg], latitude [deg] and height [m], one column each [n, 3].
-        """
+        """Convert positions x, y, z [n, 3], [m], to longitude [deg], latitude [deg] and height [m] [n, 3]."""
         x, y, z = np.moveaxis(np.asarray(positions, dtype=float), -1, 0)
         longitude, latitude = transformer(self.crs, WGS84).transform(x + self.easting, y + self.northing)
         return np.stack([longitude, latitude, z + self.height], axis=-1)
 
 
 def parse_crs(crs: object) -> CRS:
-    """Look up a coordinate reference system.
-
-    Args:
-        crs: Anything that PROJ reads.
-
-    Returns:
-        The system.
+    """Look up a coordinate reference system: anything that PROJ reads.
 
     Raises:
         InputError: PROJ does not know it.
@@ -193,13 +174,6 @@ def parse_crs(crs: object) -> CRS:
 
 def transformer(source: object, target: object) -> Transformer:
     """The transformation between two coordinate reference systems, with x (longitude) always first.
-
-    Args:
-        source: System of the given coordinates.
-        target: System to convert to.
-
-    Returns:
-        The transformation.
 
     Raises:
         InputError: PROJ does not know one of them.

@@ -102,11 +102,7 @@ class Diagnosis:
         return all(check.passed for check in self.checks)
 
     def table(self) -> Table:
-        """Versions, libraries, checks with remedies, and a verdict.
-
-        Returns:
-            A table of two columns without headings.
-        """
+        """Versions, libraries, checks with remedies, and a verdict, in two columns without headings."""
         rows = [
             *self.versions,
             ("Mitsuba variant", self.variant),
@@ -123,11 +119,7 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Check this machine, which takes some seconds.
-
-    Returns:
-        The diagnosis; a machine that cannot be used raises no exception.
-    """
+    """Check this machine, which takes some seconds; one that cannot be used raises no exception."""
     variant = llvm.mitsuba_variant()
     return Diagnosis(
         versions=versions(),
@@ -139,13 +131,9 @@ def examine() -> Diagnosis:
 
 
 def check_tracing(variant: str) -> tuple[Check, ...]:
-    """Check what tracing needs: libLLVM for tracing on the CPU, then Dr.Jit, then Sionna RT.
+    """Check what tracing with a Mitsuba variant needs: libLLVM on the CPU, then Dr.Jit, then Sionna RT.
 
-    Args:
-        variant: The Mitsuba variant that is used for tracing.
-
-    Returns:
-        The checks up to the first that failed; later ones depend on it.
+    Returns the checks up to the first that failed; later ones depend on it.
     """
     remedy = "update the NVIDIA driver, or set CUDA_VISIBLE_DEVICES= to trace on the CPU"
     checks = []
@@ -164,16 +152,10 @@ def check_tracing(variant: str) -> tuple[Check, ...]:
 
 
 def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> Check:
-    """Run Python code in a subprocess.
+    """Run Python code in a subprocess to check a library.
 
-    Args:
-        name: The library that is checked.
-        code: The code; it prints what it found, or fails with an exception, an exit status or a signal.
-        arguments: Its `sys.argv[1:]`.
-        remedy: What to do if it fails.
-
-    Returns:
-        The check; its detail is the output, or the line that names the cause of the failure.
+    The code prints what it found, or fails with an exception, an exit status or a signal. The check's detail is the
+    output, or the line that names the cause of the failure.
     """
     command = [sys.executable, "-c", code, *arguments]
     try:
@@ -192,10 +174,9 @@ def run_check(name: str, code: str, arguments: tuple[str, ...], remedy: str) -> 
 
 
 def versions() -> tuple[tuple[str, str], ...]:
-    """Versions of Python, of Calibray and of each package that Calibray's metadata requires.
+    """Versions of Python, of Calibray and of each package that Calibray's metadata requires, by name.
 
-    Returns:
-        Pairs of name and version; for a missing package, the command that installs it.
+    For a missing package it is the command that installs it.
     """
     packages = {"calibray": "pip install calibray"}
     requirements = metadata.requires("calibray") if _version("calibray") else None

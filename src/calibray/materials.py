@@ -150,14 +150,9 @@ def constants_matrix(materials: Mapping[str, Material]) -> NDArray[np.float64]:
 
 
 def complex_relative_permittivity(material: Material, frequency: float) -> complex:
-    """Complex relative permittivity of a material for the time convention e^{+jwt} (ITU-R P.2040-1, eq. 9b).
+    """Complex relative permittivity [1] for the time convention e^{+jwt} (ITU-R P.2040-1, eq. 9b).
 
-    Args:
-        material: The material.
-        frequency: Frequency [Hz], greater than 0.
-
-    Returns:
-        The complex relative permittivity [1]; its imaginary part is not positive.
+    The frequency is in [Hz]; the imaginary part is not positive.
 
     Raises:
         InputError: The frequency is not a positive finite number.
@@ -314,15 +309,7 @@ def itu_material(
 
 
 def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> ItuLaw:
-    """Find the row of ITU-R P.2040 Table 3 for a material and a frequency.
-
-    Args:
-        name: Name as in Sionna RT.
-        frequency: Frequency [Hz].
-        revision: Revision of the recommendation, a key of `ITU_MATERIALS`.
-
-    Returns:
-        The row of the table.
+    """Find the row of ITU-R P.2040 Table 3 for a material, named as in Sionna RT, and a frequency [Hz].
 
     Raises:
         InputError: The revision or the name is unknown, or no law covers the frequency.

@@ -14,9 +14,8 @@ from calibray.calibration.calibrate import calibrate
 from calibray.cli.app import app
 from calibray.comparison import compare as module
 from calibray.comparison.compare import compare
-from calibray.comparison.comparison import Comparison
+from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, figure
 from calibray.comparison.comparison import table as render_table
-from calibray.comparison.comparison_files import FILES, FLOOR_DB, figure
 from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer
 from calibray.comparison.problem import study_problem
 from calibray.errors import InputError

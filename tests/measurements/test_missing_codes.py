@@ -8,7 +8,7 @@ import pytest
 
 from calibray.errors import InputError
 from calibray.measurements import LinkColumns, Preparation, SourceTable, measured_links, select_rows
-from calibray.measurements.missing_codes import find_codes
+from calibray.measurements.selection import find_codes
 
 COLUMNS = LinkColumns((0, 0, 5), ("x", 0, 1), "rssi", "rsrp")
 

@@ -129,11 +129,11 @@ def test_the_thread_ends_even_if_the_library_swallows_every_exception():
     assert threading.active_count() == before
 
 
-@pytest.mark.parametrize(("method", "module", "package"), [(CMAES, "cma", "cma"), (DFOLS, "dfols", "DFO-LS")])
-def test_a_missing_library_is_named_with_the_command_that_installs_it(method, module, package, monkeypatch):
+@pytest.mark.parametrize(("method", "module"), [(CMAES, "cma"), (DFOLS, "dfols")])
+def test_a_missing_library_is_named_with_the_command_that_installs_it(method, module, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(
-        InputError, match=rf"{package} is not installed .*pip install 'calibray\[optimizers\]'"
+        InputError, match=rf"{module} is not installed .*pip install 'calibray\[optimizers\]'"
     ):
         method([0.0], [1.0])
 

@@ -25,7 +25,7 @@ from calibray.reporting.summary import summary
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
 from calibray.result.held_out import Judgement
 from calibray.scenes import read_scene, read_triangles
-from calibray.scenes.building_outlines import _loops
+from calibray.scenes.buildings import _loops
 from calibray.uncertainty.linear_theory import Interval
 from changed import changed
 from small_scenes import block, write_scene

@@ -12,8 +12,16 @@ import trimesh
 from calibray.errors import InputError
 from calibray.scenes import read_frame, read_scene
 from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
-from calibray.scenes.authoring.extrusion import MILLIMETRE, ROOF, UNDERSIDE, WALL, WINDOW, Shell, extrude
-from calibray.scenes.authoring.overlaps import split_overlaps
+from calibray.scenes.authoring.extrusion import (
+    MILLIMETRE,
+    ROOF,
+    UNDERSIDE,
+    WALL,
+    WINDOW,
+    Shell,
+    extrude,
+    split_overlaps,
+)
 from calibray.scenes.authoring.terrain import make_level_ground
 from calibray.scenes.meshes import weld
 from planted_maps import FRAME, L_SHAPE, footprints

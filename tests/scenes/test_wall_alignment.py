@@ -11,8 +11,7 @@ from shapely.affinity import rotate
 
 import calibray as cb
 from calibray.scenes.authoring import Windows, building_scene, make_scene
-from calibray.scenes.authoring.extrusion import Shell, extrude
-from calibray.scenes.authoring.overlaps import split_overlaps
+from calibray.scenes.authoring.extrusion import Shell, extrude, split_overlaps
 from calibray.scenes.authoring.wall_alignment import Alignment, align
 from planted_maps import footprints
 

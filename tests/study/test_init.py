@@ -21,8 +21,7 @@ from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
-from calibray.study.draft import draft
-from calibray.study.draft_text import toml
+from calibray.study.draft import draft, toml
 from calibray.study.link_checks import count_unknowns
 from calibray.study.schema import schema_text
 

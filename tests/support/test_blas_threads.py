@@ -4,7 +4,7 @@ import pytest
 import scipy.linalg  # noqa: F401  (its BLAS library must be loaded to be limited)
 from threadpoolctl import threadpool_info
 
-from calibray.support import blas_threads
+from calibray.support import memory
 
 
 def blas_thread_counts():
@@ -14,22 +14,24 @@ def blas_thread_counts():
 def test_threads_are_limited_in_the_context_only():
     before = blas_thread_counts()
     assert before
-    with blas_threads.single_blas_thread():
+    with memory.single_blas_thread():
         assert set(blas_thread_counts()) == {1}
-        with blas_threads.single_blas_thread(wanted=False):
+        with memory.single_blas_thread(wanted=False):
             assert set(blas_thread_counts()) == {1}
     assert blas_thread_counts() == before
 
 
 def test_nothing_changes_unless_wanted():
     before = blas_thread_counts()
-    with blas_threads.single_blas_thread(wanted=False):
+    with memory.single_blas_thread(wanted=False):
         assert blas_thread_counts() == before
 
 
 def test_libraries_are_searched_once(monkeypatch):
-    with blas_threads.single_blas_thread():
+    with memory.single_blas_thread():
         pass
-    monkeypatch.setattr(blas_threads, "ThreadpoolController", lambda: pytest.fail("searched again"))
-    with blas_threads.single_blas_thread():
+    with monkeypatch.context() as patched:
+        patched.setattr("threadpoolctl.ThreadpoolController", lambda: pytest.fail("searched again"))
+        limited = memory.single_blas_thread()
+    with limited:
         assert set(blas_thread_counts()) == {1}

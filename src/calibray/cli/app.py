@@ -17,14 +17,13 @@ from calibray.cli.console import echo
 from calibray.cli.demo import demo
 from calibray.cli.doctor import doctor
 from calibray.cli.export import export
-from calibray.cli.init import init
+from calibray.cli.init import init, schema
 from calibray.cli.ledger import ledger
 from calibray.cli.map import map
 from calibray.cli.predict import predict
 from calibray.cli.report import report
 from calibray.cli.run import run
 from calibray.cli.scene import scene
-from calibray.cli.schema import schema
 from calibray.cli.suggest import suggest
 from calibray.cli.trace import trace
 from calibray.cli.validate import validate

@@ -45,8 +45,7 @@ def compare(
     from calibray.cli.progress_bars import progress_bars
     from calibray.comparison.compare import compare as run_comparison
     from calibray.comparison.compare import parse_methods
-    from calibray.comparison.comparison import optimum_text, table
-    from calibray.comparison.comparison_files import FILES, write
+    from calibray.comparison.comparison import FILES, optimum_text, table, write
     from calibray.comparison.problem import study_problem
     from calibray.study import Study
     from calibray.support.output_files import check_outputs

@@ -1,4 +1,4 @@
-"""`calibray init`: draft a study from a scene and a table of links."""
+"""`calibray init` drafts a study from a scene and a table of links; `calibray schema` prints the schema of studies."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def init(
     ] = None,
 ) -> None:
     """Draft a study from a scene and a table of links, and list its assumptions with their reasons."""
-    from calibray.cli.link_warnings import warn
+    from calibray.cli.console import warn
     from calibray.cli.progress_bars import progress_bars
     from calibray.support.output_files import check_file, write_text
 
@@ -54,8 +54,8 @@ def init(
     with progress_bars(log()) as progress:
         from calibray.reporting.position_plot import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
+        from calibray.study.draft import SCHEMA_FILE
         from calibray.study.draft import draft as draft_study
-        from calibray.study.draft_text import SCHEMA_FILE
         from calibray.study.link_checks import count_unknowns
         from calibray.study.schema import schema_text
         from calibray.tables.text import render
@@ -90,3 +90,10 @@ def _position(text: str) -> list[float]:
     except ValueError:
         raise InputError(f"--tx {text}: must be x, y and z in metres, such as 0,0,2.5") from None
     return [x, y, z]
+
+
+def schema() -> None:
+    """Print the JSON schema of study files, with which editors complete and check them."""
+    from calibray.study.schema import schema_text
+
+    echo(schema_text(), nl=False)

@@ -56,7 +56,7 @@ def run(
         # Importing libraries and reading the scene take seconds as well, so the progress starts here.
         with progress_bars(log()) as progress:
             from calibray.calibration.calibrate import calibrate
-            from calibray.cli.link_warnings import warn
+            from calibray.cli.console import warn
             from calibray.engines import open_workers
             from calibray.fitting.methods import check_method
             from calibray.reporting import result_tables as tables

@@ -16,7 +16,7 @@ from calibray.engines.protocol import Engine
 from calibray.errors import InputError
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.optimizers import LeastSquares, Optimizer
-from calibray.support.blas_threads import single_blas_thread
+from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 
 Evaluate = Callable[[NDArray[np.float64], bool], Evaluation]

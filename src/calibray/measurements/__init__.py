@@ -4,7 +4,6 @@
 """
 
 from calibray.measurements.links import FREQUENCIES, MIN_DISTANCE, Measurements
-from calibray.measurements.missing_codes import mask_codes
 from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS
 from calibray.measurements.preparation import (
     Averaging,
@@ -21,7 +20,7 @@ from calibray.measurements.reading import (
     measured_links,
     read_measurements,
 )
-from calibray.measurements.selection import melt, select_rows
+from calibray.measurements.selection import mask_codes, melt, select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import PiecedTable, read_table
 from calibray.measurements.tracks import TRACK_COLUMNS

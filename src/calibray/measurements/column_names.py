@@ -12,8 +12,8 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.measurements.links import FREQUENCIES
-from calibray.measurements.missing_codes import without_codes
 from calibray.measurements.preparation import Quantity
+from calibray.measurements.selection import without_codes
 from calibray.measurements.source_table import SourceTable
 
 PATTERNS: Final = {

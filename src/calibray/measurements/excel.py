@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from calibray.errors import InputError
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.messages import first_line, shortened
 
 MAX_UNPACKED: Final = 2**28

@@ -1,4 +1,4 @@
-"""Place both ends of every row in the scene's frame."""
+"""Place both ends of every row in the scene's frame, and receivers outside buildings."""
 
 from __future__ import annotations
 
@@ -61,3 +61,23 @@ def _positions(
             raise InputError(f"{table.source}: {end}: {error}") from None
         positions[:, 2] = ground + height
     return positions
+
+
+def clear_buildings(table: SourceTable, steps: Preparation, rx: Coordinates) -> SourceTable:
+    """Leave out or move receivers that stand inside buildings, seen from above.
+
+    Of the steps, `inside` and `outside` are used; the table itself is returned without them.
+
+    Raises:
+        InputError: No row remains.
+    """
+    if steps.inside is None or steps.outside is None:
+        return table
+    positions, moved = steps.outside(table.positions("rx", rx))
+    if steps.inside == "drop":
+        return table.keep(moved == 0, "receivers inside buildings, left out")
+    too_deep = np.isnan(positions).any(axis=1)
+    if count := int(((moved > 0) & ~too_deep).sum()):
+        table = table.note("receivers inside buildings, moved out", count)
+    table = table.assign(**{str(name): values for name, values in zip(rx, positions.T, strict=True)})
+    return table.keep(np.asarray(~too_deep), "receivers deep inside buildings, left out")

@@ -17,7 +17,7 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.measurements.excel import sheet_text
 from calibray.measurements.source_table import SourceTable
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.limited_process import run_limited
 from calibray.support.memory import available_memory
 from calibray.support.messages import first_line, shortened

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 
 from calibray.optimizers.arguments import Box, whole
 from calibray.optimizers.evaluations import Archive
-from calibray.optimizers.library_adapter import library, limited
+from calibray.optimizers.library_adapter import limited
 from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.support.lazy_imports import library
 
 STEP = 0.3
 """Initial standard deviation in the unit cube."""
@@ -54,7 +55,7 @@ class CMAES(Optimizer):
         default = 4 + int(3 * np.log(self.box.dimension))
         self.population = default if population is None else whole("population", population, at_least=4)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
-        self._cma = library("cma", "cma")
+        self._cma = library("cma", "optimizers")
         self._session = Session(self.box, self.uses, self._search)
 
     def _search(self, archive: Archive) -> Search:

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.optimizers.arguments import Box, real, whole
 from calibray.optimizers.evaluations import Archive, Objective, root_mean_square
-from calibray.optimizers.library_adapter import Evaluate, inverted, library, limited
+from calibray.optimizers.library_adapter import Evaluate, inverted, limited
 from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+from calibray.support.lazy_imports import library
 
 
 @final
@@ -60,7 +61,7 @@ class DFOLS(Optimizer):
         self.radius = real("radius", radius, at_least=1e-6, at_most=0.5)
         self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
         self._rng = np.random.default_rng(whole("seed", seed, at_least=0))
-        self._dfols = library("dfols", "DFO-LS")
+        self._dfols = library("dfols", "optimizers")
         self._session = Session(self.box, self.uses, self._search, objective)
 
     def _search(self, archive: Archive) -> Search:

@@ -9,15 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from importlib import import_module
 from queue import SimpleQueue
 from threading import Thread
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.errors import InputError
 from calibray.optimizers.evaluations import Evaluations
 from calibray.optimizers.protocol import Search
 
@@ -77,17 +74,3 @@ def limited(search: Search, budget: int) -> Search:
             if budget == 0:
                 return
             x = search.send(answers)
-
-
-def library(name: str, package: str, extra: str = "optimizers") -> ModuleType:
-    """Import the module `name` of an optional package, which an extra of Calibray installs.
-
-    Raises:
-        InputError: It is not installed; the message names the command.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{package} is not installed ({error}); install it with: pip install 'calibray[{extra}]'"
-        ) from None

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, cast, final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.optimizers.library_adapter import library
 from calibray.optimizers.sgwoim import SGWOIM
+from calibray.support.lazy_imports import library
 
 if TYPE_CHECKING:
     import optuna
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     Numeric = FloatDistribution | IntDistribution
 else:
-    optuna = library("optuna", "Optuna")
+    optuna = library("optuna", "optimizers")
     BaseSampler = optuna.samplers.BaseSampler
     FloatDistribution = optuna.distributions.FloatDistribution
     IntDistribution = optuna.distributions.IntDistribution

@@ -77,16 +77,10 @@ def check_law(
     exponents: Iterable[float],
     frequencies: Iterable[float],
 ) -> None:
-    """Refuse bounds of a law within which a constant takes an impossible value at some carrier.
+    """Refuse bounds of a law s f^e within which a constant takes an impossible value at some carrier [Hz].
 
-    A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds.
-
-    Args:
-        material: The material's name.
-        constant: "relative_permittivity" or "conductivity".
-        scales: Bounds of the coefficient s, or its fixed value.
-        exponents: Bounds of the exponent e, or its fixed value.
-        frequencies: The carriers [Hz].
+    A power law is monotonic in both coefficients, so it is enough to check the corners of their bounds. A fixed
+    coefficient has one value.
 
     Raises:
         InputError: s f^e lies outside the constant's bound.

@@ -100,12 +100,6 @@ class Parameter:
 def split_name(name: str) -> tuple[str, str]:
     """Split the name of a parameter at the last dot into material and field.
 
-    Args:
-        name: The name.
-
-    Returns:
-        The material's name and the field's.
-
     Raises:
         InputError: The name has no material, or the field is unknown.
 
@@ -178,15 +172,7 @@ def make_parameter(
 
 
 def itu_start(name: str, start: str, frequency: float) -> float:
-    """Look up the value of ITU-R P.2040 for a start such as "itu:concrete@P.2040-1".
-
-    Args:
-        name: The parameter; its field is relative_permittivity, conductivity or a coefficient of their laws.
-        start: "itu:" and the ITU-R material, then "@" and the revision unless it is the default one.
-        frequency: Frequency [Hz].
-
-    Returns:
-        The value, in the field's unit.
+    """Look up the value of ITU-R P.2040, in the field's unit, for a start such as "itu:concrete@P.2040-1".
 
     Raises:
         InputError: The text has another form, the field has no ITU-R law, or as for `itu_material`.
@@ -215,10 +201,6 @@ def _coefficient(law: ItuLaw, field: str) -> float:
 
 def check_material(name: str, materials: Collection[str]) -> None:
     """Refuse a parameter whose material is not in the scene.
-
-    Args:
-        name: The parameter's name.
-        materials: The names of the scene's materials.
 
     Raises:
         InputError: The material is not among them; the message suggests the nearest name.

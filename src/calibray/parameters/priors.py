@@ -32,13 +32,9 @@ class LogNormal:
         return len(self.index)
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Residuals that add the priors to a least-squares problem.
+        """The priors as residuals of a least-squares problem: (log value - log centre) / spread [n, k].
 
-        Args:
-            candidates: Parameter values [n, d], in the fields' units, greater than 0.
-
-        Returns:
-            (log value - log centre) / spread [n, k].
+        Candidates [n, d] are in the fields' units, greater than 0.
         """
         return (np.log(candidates[:, self._columns]) - np.log(self.centre)) / self.spread
 

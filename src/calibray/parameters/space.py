@@ -129,15 +129,9 @@ class Parameters:
     def constants_and_slopes(
         self, candidates: ArrayLike, frequency: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Constants that candidates set at one carrier, and their derivatives.
+        """Constants that candidates set at one carrier, and their derivatives, each [..., parameters].
 
-        Args:
-            candidates: Parameter values [..., parameters], in the fields' units.
-            frequency: The carrier [Hz]; `frequency` of the parameters if None.
-
-        Returns:
-            The constant that each parameter sets [..., parameters], in its unit, and its derivative with respect to the
-            parameter [..., parameters]. Two coefficients of one law have the same constant.
+        The carrier is `frequency` of the parameters if None. Two coefficients of one law have the same constant.
 
         Raises:
             InputError: The candidates have another length.
@@ -157,14 +151,10 @@ class Parameters:
         return constants, slopes
 
     def at_carrier(self, frequency: float) -> tuple[Parameters, NDArray[np.int64]]:
-        """The constants that the parameters set at one carrier, as parameters themselves.
+        """The constants that the parameters set at one carrier [Hz], as parameters themselves.
 
-        Args:
-            frequency: The carrier [Hz].
-
-        Returns:
-            A parameter for each constant, with physical bounds alone if it follows a law, and the number of the
-            constant that each of these parameters sets [parameters].
+        They have physical bounds alone if they follow a law. Returned too is the number of the constant that each of
+        these parameters sets [parameters].
         """
         if not self.has_laws:
             return self, np.arange(len(self))
@@ -180,13 +170,7 @@ class Parameters:
         return Parameters(tuple(constants.values()), frequency), np.array(indices, dtype=np.int64)
 
     def law_coefficients(self, candidate: ArrayLike) -> dict[str, dict[str, float]]:
-        """The coefficients of the laws that a candidate describes.
-
-        Args:
-            candidate: Parameter values [parameters], in the fields' units.
-
-        Returns:
-            By material: both coefficients of each constant that has a coefficient among the parameters.
+        """By material, both coefficients of each constant that has a coefficient among the parameters.
 
         Raises:
             InputError: The candidate has another length.
@@ -203,10 +187,7 @@ class Parameters:
         return coefficients
 
     def check_carriers(self, frequencies: Sequence[float]) -> None:
-        """Refuse bounds of laws within which a constant takes an impossible value at some carrier.
-
-        Args:
-            frequencies: The carriers [Hz].
+        """Refuse bounds of laws within which a constant takes an impossible value at some carrier [Hz].
 
         Raises:
             InputError: A law lies outside its constant's bound; the message names the carrier.
@@ -242,15 +223,9 @@ class Parameters:
     def materials(
         self, candidate: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
     ) -> dict[str, Material]:
-        """The materials that a candidate describes at one carrier.
+        """All materials of `base`, in its order, with a candidate's values [parameters] at one carrier.
 
-        Args:
-            candidate: Parameter values [parameters], in the fields' units.
-            base: The scene's materials by name; constants that no parameter sets stay unchanged.
-            frequency: The carrier [Hz]; `frequency` of the parameters if None.
-
-        Returns:
-            All materials of `base`, in its order, with the candidate's values.
+        The carrier is `frequency` of the parameters if None.
 
         Raises:
             InputError: The candidate has another length, a value is physically impossible, or a material is unknown.
@@ -268,16 +243,10 @@ class Parameters:
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
     def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The cell of a constants matrix [materials, fields] that each parameter sets.
+        """Row and column, in a matrix of constants [materials, fields], of each parameter [parameters].
 
         Replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``. Coefficients of laws
         have no cell; take the parameters `at_carrier` first.
-
-        Args:
-            materials: The names of the matrix's rows, in order; its columns are `FIELDS`.
-
-        Returns:
-            The rows [parameters] and the columns [parameters].
 
         Raises:
             InputError: A parameter's material is not among them, or a parameter is a coefficient of a law.
@@ -297,15 +266,10 @@ class Parameters:
     def constants_of(
         self, candidates: ArrayLike, base: Mapping[str, Material], frequency: float | None = None
     ) -> NDArray[np.float64]:
-        """The constants of the materials that candidates describe at one carrier.
+        """The constants [..., materials, fields] of candidates [..., parameters] at one carrier.
 
-        Args:
-            candidates: Parameter values [..., parameters], in the fields' units.
-            base: The scene's materials by name, in the order of the rows.
-            frequency: The carrier [Hz]; `frequency` of the parameters if None.
-
-        Returns:
-            The constants [..., materials, fields], columns in the order of `FIELDS`.
+        Rows are in the order of `base`, columns in that of `FIELDS`. The carrier is `frequency` of the parameters if
+        None.
 
         Raises:
             InputError: The candidates have another length, or a parameter's material is unknown.

@@ -86,14 +86,7 @@ class Geometry:
 
 
 def compile_chains(chains: Chains) -> Geometry:
-    """Compute the geometry that the fields of traced paths depend on.
-
-    Args:
-        chains: Traced paths.
-
-    Returns:
-        The geometric part of the path program, interactions in path order.
-    """
+    """Compute the geometry that the fields of traced paths depend on; interactions are in path order."""
     count, depth = chains.kind.shape
     present = chains.kind != 0
     length = present.sum(axis=1)
@@ -185,14 +178,9 @@ def compile_chains(chains: Chains) -> Geometry:
 
 
 def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True) -> NDArray[np.float64]:
-    """Basis vector theta of directions of travel, the first axis of the basis (theta, phi).
+    """Basis vector theta [..., 3] of directions of travel [..., 3], the first axis of the basis (theta, phi).
 
-    Args:
-        direction: Unit vectors [..., 3].
-        pole_reference: Near the poles, use Sionna's fixed reference -x instead of the limit of theta.
-
-    Returns:
-        Unit vectors orthogonal to `direction` [..., 3].
+    Near the poles, `pole_reference` uses Sionna's fixed reference -x instead of the limit of theta.
     """
     x, y, z = np.moveaxis(direction, -1, 0)
     rho = np.hypot(x, y)
@@ -212,17 +200,10 @@ def spherical_basis(direction: NDArray[np.float64], pole_reference: bool = True)
 
 
 def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """First axis of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
+    """First axis [..., 3] of the frame of incidence, k x n (ITU-R P.2040 section 2.2.2).
 
     At normal incidence any transverse vector will do, because the transverse electric and magnetic coefficients then
     describe the same reflection.
-
-    Args:
-        direction: Directions of travel [..., 3].
-        normal: Surface normals [..., 3].
-
-    Returns:
-        Unit vectors [..., 3].
     """
     cross = _cross(direction, normal)
     degenerate = _dot(cross, cross) < 1e-12
@@ -234,30 +215,16 @@ def transverse_electric(direction: NDArray[np.float64], normal: NDArray[np.float
 def rotate(
     direction: NDArray[np.float64], current: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(cos, sin) of the rotation of a Jones vector's frame about its direction of travel.
+    """(cos, sin) [..., 2] of the rotation of a Jones vector's frame about its direction of travel.
 
-    The vector (a, b) becomes (cos a + sin b, -sin a + cos b).
-
-    Args:
-        direction: Directions of travel [..., 3].
-        current: First axis of the vector's frame [..., 3].
-        target: First axis of the new frame [..., 3].
-
-    Returns:
-        Cosine and sine [..., 2].
+    The vector (a, b) becomes (cos a + sin b, -sin a + cos b). `current` and `target` are the first axes of both frames
+    [..., 3].
     """
     return np.stack([_dot(current, target), _dot(direction, _cross(current, target))], axis=-1)
 
 
 def zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Zenith and azimuth angles of unit vectors.
-
-    Args:
-        direction: Unit vectors [..., 3].
-
-    Returns:
-        Zenith in [0, pi] and azimuth in (-pi, pi] [..., 2], [rad].
-    """
+    """Zenith in [0, pi] and azimuth in (-pi, pi] of unit vectors [..., 2], [rad]."""
     x, y, z = np.moveaxis(direction, -1, 0)
     return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=-1)
 

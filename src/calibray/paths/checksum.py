@@ -52,14 +52,7 @@ def seal(path: str | Path) -> None:
 
 
 def write_checksum(partial: Path) -> str:
-    """Write the checksum into the empty user block of an HDF5 file.
-
-    Args:
-        partial: The unfinished file, with a user block of `BLOCK` bytes.
-
-    Returns:
-        The checksum in hexadecimal.
-    """
+    """Write the checksum into the empty user block of an HDF5 file; returns it in hexadecimal."""
     with partial.open("r+b") as file:
         file.seek(BLOCK)
         block = _block(file)
@@ -69,13 +62,7 @@ def write_checksum(partial: Path) -> str:
 
 
 def verify(path: Path) -> str:
-    """Refuse a file whose content differs from the sealed one.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The checksum in hexadecimal.
+    """Refuse a file whose content differs from the sealed one; returns its checksum in hexadecimal.
 
     Raises:
         InputError: The file is not a sealed HDF5 file, or was changed since; the message lacks its name.

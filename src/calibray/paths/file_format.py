@@ -108,12 +108,7 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
 
 
 def write(file: h5py.File, content: Content) -> None:
-    """Write the content of a path file.
-
-    Args:
-        file: The open, empty file.
-        content: Its content, with every dataset of `DATASETS`.
-    """
+    """Write the content of a path file, with every dataset of `DATASETS`, to an open, empty file."""
     file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
     file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
     for name, dataset in DATASETS.items():
@@ -123,12 +118,6 @@ def write(file: h5py.File, content: Content) -> None:
 
 def read(file: h5py.File) -> Content:
     """Read a path file and check all of it.
-
-    Args:
-        file: The open file.
-
-    Returns:
-        Its content.
 
     Raises:
         InputError: It has another format or version, or a dataset is missing, has another shape or type, or is out

@@ -135,13 +135,9 @@ class Paths:
         return replace(self, frequency=float(frequency), materials=self._with_materials(materials))
 
     def material_table(self, materials: Mapping[str, Material] | None = None) -> NDArray[np.float64]:
-        """Constants of the materials as a matrix.
+        """Constants of the materials as a matrix [M, 8]; materials not named keep those of the trace.
 
-        Args:
-            materials: Constants by name; materials not named keep those of the trace.
-
-        Returns:
-            Constants in the order of `Paths.materials` and `calibray.materials.FIELDS` [M, 8].
+        Rows are in the order of `Paths.materials`, columns in that of `calibray.materials.FIELDS`.
 
         Raises:
             InputError: A name is not a material of the paths, or a scattering pattern differs from the trace's.
@@ -211,13 +207,7 @@ class Paths:
 
 
 def read_paths(file: str | Path) -> Paths:
-    """Read a path file, its checksum not compared.
-
-    Args:
-        file: The HDF5 file.
-
-    Returns:
-        The path program.
+    """Read the path program of an HDF5 file, its checksum not compared.
 
     Raises:
         InputError: It is not a path file, has another version, or is damaged; the message lacks its name.

@@ -19,15 +19,7 @@ _INTERACTION_ARRAYS = ("kind", "material", "cos_incidence", "rotation", "vertex"
 
 
 def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
-    """The program of some of its paths, in a given order.
-
-    Args:
-        paths: A path program.
-        index: Paths to keep [n].
-
-    Returns:
-        The smaller program over the same links.
-    """
+    """The program of some of its paths [n], in a given order, over the same links."""
     index = np.asarray(index, dtype=np.int64)
     depth = np.diff(paths.first)[index]
     first = np.concatenate([[0], np.cumsum(depth)]).astype(np.int64)
@@ -43,15 +35,7 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
 
 
 def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
-    """The program of some links, in a given order; a link may be taken more than once.
-
-    Args:
-        paths: A path program, its paths ordered by link.
-        links: Links to take [n].
-
-    Returns:
-        A program of n links.
-    """
+    """The program of some links [n], in a given order; a link may be taken more than once."""
     links = np.asarray(links, dtype=np.int64)
     start = np.searchsorted(paths.link, np.arange(paths.num_links + 1))
     count = np.diff(start)[links]
@@ -66,13 +50,9 @@ def take_links(paths: Paths, links: NDArray[np.int64]) -> Paths:
 
 
 def concatenate(parts: Sequence[Paths]) -> Paths:
-    """Join path programs of the same links, and sort their paths by link.
+    """Join path programs of the same links, and sort their paths by link; within a link as in `parts`.
 
-    Args:
-        parts: At least one program; all share frequency, materials and link table.
-
-    Returns:
-        One program whose paths are ordered by link, and within a link as in `parts`.
+    All share frequency, materials and link table.
     """
     offsets = np.cumsum([0, *(part.num_interactions for part in parts)])
     first = [part.first[:-1] + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
@@ -90,14 +70,9 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
 
 
 def join_links(parts: Sequence[tuple[NDArray[np.int64], Paths]]) -> Paths:
-    """Join path programs of different links.
+    """Join path programs of different links, each with the indices of its links in the joined program.
 
-    Args:
-        parts: At least one program, each with the indices of its links in the joined program; together they have every
-            link once. All share frequency and materials.
-
-    Returns:
-        One program of all links, with the settings of the first.
+    Together they have every link once. All share frequency and materials; the settings are those of the first.
     """
     num_links = sum(len(links) for links, _ in parts)
     tx, rx = np.empty((num_links, 3)), np.empty((num_links, 3))

@@ -39,11 +39,7 @@ def remember(digest: str) -> None:
 
 
 def validate(file: Path, digest: str) -> None:
-    """Read a path file in another process, unless its checksum is known.
-
-    Args:
-        file: The file, whose checksum agrees.
-        digest: The checksum.
+    """Read a path file, whose checksum agrees, in another process, unless its checksum is known.
 
     Raises:
         InputError: The file is damaged, or reading it does not end; the message lacks its name.

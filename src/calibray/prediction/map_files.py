@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from calibray.coordinates import Frame, parse_crs
 from calibray.errors import InputError
 from calibray.result.prediction_model import NO_PATH
-from calibray.scenes.building_outlines import footprints
+from calibray.scenes.buildings import footprints
 from calibray.scenes.triangles import Triangles
-from calibray.support.extras import library
 from calibray.support.figure_style import FAINT, INK, LINE, ORANGE, PAPER, dress, styled, write
+from calibray.support.lazy_imports import library
 from calibray.support.output_files import check_outputs, csv_text, write_bytes, write_text
 
 FILES: Final = ("map.tif", "map.png", "map.csv")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibray.reporting.link_survey import Survey
 from calibray.scenes import Triangles
-from calibray.scenes.building_outlines import footprints
+from calibray.scenes.buildings import footprints
 
 WIDTH: Final = 1000
 """Width of the map in its own units."""

@@ -8,10 +8,7 @@ from pathlib import Path
 
 
 def demo_study_path() -> Path:
-    """The study file of the demo district, in the folder of its scene, its links and the truth.
-
-    Returns:
-        Path of `study.toml`.
+    """The `study.toml` of the demo district, in the folder of its scene, its links and the truth.
 
     Example:
         >>> sorted(path.name for path in demo_study_path().parent.iterdir())

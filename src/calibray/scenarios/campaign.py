@@ -1,4 +1,10 @@
-"""The simulated measurement campaign: tracing and sounding the true world, and writing the files of a study."""
+"""The simulated measurement campaign: tracing and sounding the true world, and writing the files of a study.
+
+The channel sounder turns paths into a path loss averaged over noisy snapshots. The paper's sounder sends a PN9 sequence
+of 511 chips over 200 MHz and records 100 impulse responses at every position (section III). Here a snapshot is a power
+delay profile of 511 taps of 5 ns. Between snapshots, traffic and swaying masts change the phases of the paths, so that
+paths within a tap fade. The receiver adds noise.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +16,63 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths
 from calibray.scenarios import demo_study_path
 from calibray.scenarios.district import lamp_positions, scene_objects
-from calibray.scenarios.sounder import sounded_path_loss
 from calibray.scenarios.world import FREQUENCY, PLANTED, SEED, World, world
 from calibray.scenes import write_scene
 from calibray.support.output_files import write_bytes
 from calibray.tracing.default_tracer import trace
+
+BANDWIDTH: Final = 200e6  # [Hz]; a chip and a tap last 1 / BANDWIDTH
+TAPS: Final = 511
+SNAPSHOTS: Final = 100
+NOISE_DB: Final = -143.0
+"""Noise of a tap as a path gain [dB]: -174 dBm/Hz over 200 MHz, noise figure 5 dB, PN9 gain 27 dB, 1 W."""
+THRESHOLD: Final = 2.0
+"""Taps with a mean power below this multiple of the noise count as empty [1]."""
+
+
+def sounded_path_loss(
+    power: NDArray[np.float64],
+    delay: NDArray[np.float64],
+    is_diffuse: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Sound one link: path loss [dB] of the mean power of the snapshots, and their standard deviation [dB].
+
+    Specular paths keep their amplitude and change their phase between snapshots. The many diffuse paths of a tap make
+    its field complex Gaussian. The noise is subtracted; the standard deviation is (10 / ln 10) std / mean.
+
+    Raises:
+        InputError: There is no path, or no tap exceeds the noise.
+    """
+    noise = 10.0 ** (NOISE_DB / 10.0)
+    if not len(power):
+        raise InputError("no path reaches the receiver; move it")
+    tap = np.floor((delay - delay.min()) * BANDWIDTH).astype(np.int64) % TAPS
+    diffuse = np.bincount(tap[is_diffuse], power[is_diffuse], TAPS)
+    normal = rng.standard_normal((2, SNAPSHOTS, TAPS))
+    field = np.sqrt((diffuse + noise) / 2.0) * (normal[0] + 1j * normal[1])
+    # Sorted by delay, so that the result does not depend on the order in which paths were found.
+    specular = np.flatnonzero(~is_diffuse)
+    specular = specular[np.argsort(delay[specular], kind="stable")]
+    phase = rng.uniform(0.0, 2.0 * np.pi, (SNAPSHOTS, len(specular)))
+    rays = np.sqrt(power[specular]) * np.exp(1j * phase)
+    # Unbuffered, since several paths can fall into one tap.
+    np.add.at(field.T, tap[specular], rays.T)
+    profile = np.abs(field) ** 2
+    occupied = profile.mean(axis=0) > THRESHOLD * noise
+    received = profile[:, occupied].sum(axis=1) - noise * occupied.sum()
+    mean = received.mean()
+    if not mean > 0.0:
+        raise InputError(
+            f"no tap exceeds {THRESHOLD:g} times the noise of {NOISE_DB:g} dB; move the receiver"
+        )
+    return float(-10.0 * np.log10(mean)), float(10.0 / np.log(10.0) * received.std(ddof=1) / mean)
+
 
 ANTENNA: Final = {"pattern": "dipole", "polarization": "V"}
 SPECULAR: Final[dict[str, Any]] = {"max_depth": 4, "samples": 500_000}
@@ -34,12 +88,7 @@ MODEL_MATERIALS: Final = {
 
 
 def generate(folder: Path, seed: int = SEED) -> None:
-    """Write the scene to calibrate, the study file, the measured links and the truth.
-
-    Args:
-        folder: Folder to write into; created if needed.
-        seed: Seed of the world and of the measurement.
-    """
+    """Write the scene to calibrate, the study file, the measured links and the truth."""
     truth = world(seed)
     write_model(folder, truth)
     table = links_csv(truth, measure(truth, seed))
@@ -47,12 +96,7 @@ def generate(folder: Path, seed: int = SEED) -> None:
 
 
 def write_model(folder: Path, truth: World) -> None:
-    """Write the scene to calibrate, the study file and the truth, which need no tracing.
-
-    Args:
-        folder: Folder to write into; created if needed.
-        truth: The world whose buildings the scene contains.
-    """
+    """Write the scene to calibrate, the study file and the truth, which need no tracing."""
     study = demo_study_path().read_bytes()
     write_scene(folder / "scene", scene_objects(truth.buildings), MODEL_MATERIALS)
     write_bytes(folder / "study.toml", study)
@@ -60,17 +104,10 @@ def write_model(folder: Path, truth: World) -> None:
 
 
 def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
-    """Measure all links in the true world.
+    """Path loss of every link and standard deviation of its snapshots [L, 2], [dB], in the true world.
 
     Specular paths and paths with a diffuse reflection are traced separately: all of the few specular paths are needed,
     but only a sample of the diffuse ones.
-
-    Args:
-        truth: The world.
-        seed: Seed of fading and noise.
-
-    Returns:
-        Path loss of every link and standard deviation of its snapshots [L, 2], [dB].
     """
     with TemporaryDirectory() as folder:
         scene = write_scene(Path(folder), truth.scene_objects(), truth.materials())
@@ -90,15 +127,7 @@ def measure(truth: World, seed: int = SEED) -> NDArray[np.float64]:
 
 
 def links_csv(truth: World, path_loss: NDArray[np.float64]) -> str:
-    """The measured links as a table.
-
-    Args:
-        truth: The world, whose recorded positions are written.
-        path_loss: Path loss of every link and standard deviation of its snapshots [L, 2], [dB].
-
-    Returns:
-        Text of the CSV file.
-    """
+    """The measured links [L, 2], [dB], as a CSV text with the positions that the world records."""
     lines = ["id,tx,rx,tx_x_m,tx_y_m,tx_z_m,rx_x_m,rx_y_m,rx_z_m,path_loss_db,path_loss_std_db"]
     transmitters = list(dict.fromkeys(map(tuple, truth.tx_recorded)))
     for k, (tx, rx, values) in enumerate(
@@ -110,14 +139,7 @@ def links_csv(truth: World, path_loss: NDArray[np.float64]) -> str:
 
 
 def truth_json(truth: World) -> str:
-    """The planted truth, which a calibration does not know.
-
-    Args:
-        truth: The world.
-
-    Returns:
-        Text of the JSON file: materials, buildings, links and lamp posts, one per line.
-    """
+    """The planted truth, which a calibration does not know: materials, buildings, links and lamp posts, as JSON."""
     content = {
         "materials": {
             name: {

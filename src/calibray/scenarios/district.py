@@ -84,15 +84,7 @@ class Building:
 
 
 def district(seed: int = SEED, layout: Layout = GOLDEN_BEACH) -> tuple[Building, ...]:
-    """Draw the buildings of the district.
-
-    Args:
-        seed: Seed of the generator; it changes the buildings but not the streets.
-        layout: The streets.
-
-    Returns:
-        The buildings, west to east and south to north.
-    """
+    """Draw the buildings of the district, west to east and south to north; the seed does not change the streets."""
     rng = np.random.Generator(np.random.PCG64(seed))
     columns = _between(layout.avenues, layout.extent[0])
     rows = _between(layout.streets, layout.extent[1])[layout.beach :]  # the southernmost row is the beach
@@ -122,15 +114,8 @@ def scene_objects(
 ) -> list[MeshObject]:
     """The district as objects of a scene, one per material.
 
-    Args:
-        buildings: The buildings.
-        concrete: Name of a building's concrete.
-        glass: Name of a building's glass.
-        layout: The streets.
-
-    Returns:
-        Structures, windows, ground (of soil) and streets (of asphalt); structures and windows of several
-        materials are numbered.
+    Structures, windows, ground (of soil) and streets (of asphalt); structures and windows of several materials are
+    numbered. The names of a building's concrete and glass are given.
     """
     structures: dict[str, list[Mesh]] = {}
     windows: dict[str, list[Mesh]] = {}
@@ -148,17 +133,10 @@ def scene_objects(
 
 
 def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
-    """The surface of a building, split by material.
+    """The surface of a building: concrete (piers, band, roof) and glass (bays), without gap or overlap.
 
     A wall consists of alternating piers (concrete) and bays (glass), with a pier at both ends. Corners, band and roof
     are connected concrete, so that the ray tracer finds the wedges for diffraction.
-
-    Args:
-        building: The building.
-
-    Returns:
-        Concrete (piers, band, roof) and glass (bays). Together they cover walls and roof without gap or
-        overlap.
     """
     outline, is_window = _outline(building)
     rings = _rings(outline, (0.0, building.height - BAND, building.height))
@@ -175,11 +153,7 @@ def building_meshes(building: Building) -> tuple[Mesh, Mesh]:
 
 
 def lamp_positions() -> NDArray[np.float64]:
-    """Positions of the lamp posts: along the kerbs of all streets, on alternating sides, none on a crossing.
-
-    Returns:
-        Positions in the plan [n, 2], [m].
-    """
+    """Positions [n, 2], [m], of the lamp posts: along the kerbs, on alternating sides, none on a crossing."""
     kerb = ROADWAY_HALF_WIDTH + 0.5
     positions = []
     for lines, across, length in ((AVENUES, STREETS, EXTENT[1]), (STREETS, AVENUES, EXTENT[0])):
@@ -192,11 +166,7 @@ def lamp_positions() -> NDArray[np.float64]:
 
 
 def lamp_posts() -> Mesh:
-    """The lamp posts as square columns.
-
-    Returns:
-        Their surfaces above the ground.
-    """
+    """The lamp posts as square columns."""
     corner = np.arange(4)
     sides = _quads(corner, np.roll(corner, -1), 4).reshape(-1, 3)
     faces = np.concatenate([sides, [[4, 5, 6], [4, 6, 7]]])
@@ -207,15 +177,7 @@ def lamp_posts() -> Mesh:
 
 
 def inside(building: Building, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Test whether points in plan are inside a building.
-
-    Args:
-        building: The building.
-        points: Positions in the plan [n, 2], [m].
-
-    Returns:
-        True for points inside the footprint or on its outline [n].
-    """
+    """Whether points in plan [n, 2], [m], are inside a building's footprint or on its outline [n]."""
     edge = np.roll(building.footprint, -1, axis=0) - building.footprint
     to_point = np.asarray(points)[:, None, :] - building.footprint
     left_of = edge[:, 0] * to_point[..., 1] - edge[:, 1] * to_point[..., 0] >= 0.0

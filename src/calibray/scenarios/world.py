@@ -58,14 +58,7 @@ class Planted:
     scattering_coefficient: float
 
     def constants(self, relative_permittivity: float) -> dict[str, float]:
-        """The constants for a scene file.
-
-        Args:
-            relative_permittivity: The permittivity of one building, instead of the mean [1].
-
-        Returns:
-            Constants by name.
-        """
+        """The constants by name for a scene file; a building may have another permittivity than the mean [1]."""
         return {
             "relative_permittivity": relative_permittivity,
             "conductivity": self.conductivity,
@@ -129,14 +122,7 @@ class World:
 
 
 def world(seed: int = SEED) -> World:
-    """Plant a world.
-
-    Args:
-        seed: Seed of the permittivities and the position errors, but not of streets and buildings.
-
-    Returns:
-        The world.
-    """
+    """Plant a world; the seed changes permittivities and position errors, but not streets and buildings."""
     rng = np.random.Generator(np.random.PCG64([seed, 1]))
     buildings = district()
     level = np.empty((len(buildings), 2), dtype=np.int64)

@@ -25,7 +25,7 @@ from calibray.measurements import (
     select_rows,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
-from calibray.measurements.missing_codes import find_codes, without_codes
+from calibray.measurements.selection import find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study.link_checks import CELL_SHARE

@@ -35,11 +35,10 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.scene_file import read_content as scene_content
-from calibray.study.engine_keys import split_engine_keys
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
 from calibray.study.summary import summary
-from calibray.study.toml_file import read_content, refuse_unquoted_names
+from calibray.study.toml_file import read_content, refuse_unquoted_names, split_engine_keys
 from calibray.study.validation_errors import explain
 from calibray.support.progress import Progress
 from calibray.tables import display

@@ -1,11 +1,16 @@
-"""Names of a package that are imported when first used, so that importing the package is fast."""
+"""Imports on first use: names of a package, so that importing it is fast, and optional libraries."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
+
+from calibray.errors import InputError
+from calibray.support.messages import first_line
 
 
 def lazy_attributes(
@@ -29,3 +34,27 @@ def lazy_attributes(
         return sorted({*vars(sys.modules[package]), *homes})
 
     return find, names
+
+
+def library(name: str, extra: str) -> ModuleType:
+    """Import an optional module, which an extra of Calibray installs.
+
+    Raises:
+        InputError: It is not installed, or cannot be loaded.
+
+    Example:
+        >>> library("zipfile", "scenes").is_zipfile("no such file")
+        False
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        if sys.modules.get(package, package) is not None and find_spec(package) is not None:
+            raise InputError(
+                f"{package} is installed but cannot be loaded ({first_line(error)}): memory is short, or its "
+                "installation is damaged; free memory, or install it again"
+            ) from None
+        raise InputError(
+            f"{package} is not installed ({error}); install it with: pip install 'calibray[{extra}]'"
+        ) from None

@@ -1,12 +1,16 @@
-"""Memory that this process may still use."""
+"""What of this machine the process may use: memory, and threads of BLAS."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from calibray.errors import InputError
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 LEAST_ADDRESS_SPACE: Final = 2_900_000_000
 """Limit of the address space below which libraries cannot be loaded or end the process [bytes]."""
@@ -52,3 +56,18 @@ def available_memory() -> int:
         if limit != resource.RLIM_INFINITY:
             free.append(limit - psutil.Process().memory_info().vms)
     return max(min(free), 0)
+
+
+def single_blas_thread(wanted: bool = True) -> AbstractContextManager[object]:
+    """Context in which the linear algebra uses one thread; nothing changes unless it is wanted."""
+    return _libraries().limit(limits=1, user_api="blas") if wanted else nullcontext()
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """The loaded libraries; cached, because the search reads all memory maps of the process."""
+    # Import SciPy's library as well, so that it is among them.
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

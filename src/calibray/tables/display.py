@@ -22,38 +22,17 @@ SENTENCE: Final = 200
 
 
 def text(*parts: Table | str) -> str:
-    """Plain text for `__repr__`.
-
-    Args:
-        parts: Tables and sentences, from top to bottom.
-
-    Returns:
-        Text with long tables and cells cut, and control characters escaped.
-    """
+    """Plain text for `__repr__`, with long tables and cells cut, and control characters escaped."""
     return plain.render(*_fitted(parts))
 
 
 def html(*parts: Table | str) -> str:
-    """HTML for `_repr_html_`.
-
-    Args:
-        parts: Tables and sentences, from top to bottom.
-
-    Returns:
-        A fragment of HTML with long tables and cells cut, and all text escaped.
-    """
+    """HTML for `_repr_html_`, with long tables and cells cut, and all text escaped."""
     return markup.render(*_fitted(parts))
 
 
 def named(names: Iterable[str], count: int = 4) -> str:
-    """List names, the first ones if there are many.
-
-    Args:
-        names: The names.
-        count: Most names that are listed.
-
-    Returns:
-        The names with commas between them.
+    """List names with commas between them, the first ones if there are many.
 
     Example:
         >>> named(["east", "west"])
@@ -67,13 +46,7 @@ def named(names: Iterable[str], count: int = 4) -> str:
 
 
 def hertz(frequency: float) -> str:
-    """Format a frequency in GHz or MHz.
-
-    Args:
-        frequency: The frequency [Hz].
-
-    Returns:
-        Its value and unit.
+    """Format a frequency [Hz] in GHz or MHz.
 
     Example:
         >>> hertz(28.5e9)

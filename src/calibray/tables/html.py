@@ -8,13 +8,7 @@ from calibray.tables.table import Table
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as a fragment of HTML.
-
-    Args:
-        parts: Tables and sentences, from top to bottom; empty strings are left out.
-
-    Returns:
-        Elements `p` and `table`, without scripts and links.
+    """Render tables and sentences as HTML: elements `p` and `table`, without scripts and links.
 
     Example:
         >>> render("a < b")

@@ -11,14 +11,7 @@ _RULES = {"left": "---", "right": "---:"}
 
 
 def render(table: Table) -> str:
-    """Render a table in Markdown, without a title above it.
-
-    Args:
-        table: The table.
-
-    Returns:
-        Lines of text, without a line break at the end.
-    """
+    """Render a table in Markdown, without a title above it and a line break at the end."""
     lines = [table.headings, [_RULES[column.align] for column in table.columns], *table.rows]
     return "\n".join(_line(line) for line in lines)
 

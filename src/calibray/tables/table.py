@@ -31,15 +31,7 @@ class Column:
 
 
 def numbers(name: str = "", unit: str = "") -> Column:
-    """A column of numbers, aligned to the right.
-
-    Args:
-        name: Meaning of the numbers.
-        unit: Their unit.
-
-    Returns:
-        The column.
-    """
+    """A column of numbers, aligned to the right."""
     return Column(name, unit, "right")
 
 
@@ -89,13 +81,7 @@ class Table:
         return (first, *(column.heading for column in self.columns[1:]))
 
     def head(self, count: int) -> Table:
-        """The first rows, and a last one with the number of rows that are left out.
-
-        Args:
-            count: Rows to keep, at least 1.
-
-        Returns:
-            The table, unchanged if it has no more rows.
+        """The first rows, and a last one with the number of rows that are left out, if any.
 
         Example:
             >>> Table("", (Column("link"),), (("a",), ("b",), ("c",))).head(1).rows

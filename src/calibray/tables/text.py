@@ -22,13 +22,7 @@ WIDEST: Final = 100_000
 
 
 def render(*parts: Table | str) -> str:
-    """Render tables and sentences as plain text, with an empty line between them.
-
-    Args:
-        parts: Tables and sentences, from top to bottom; empty strings are left out.
-
-    Returns:
-        Lines of text, without a line break at the end.
+    """Render tables and sentences as plain text, with an empty line between them, none for an empty string.
 
     Example:
         >>> from calibray.tables import Column, numbers
@@ -45,13 +39,7 @@ def render(*parts: Table | str) -> str:
 
 
 def rows_text(rows: Sequence[int]) -> str:
-    """List rows of a file, the first ones if there are many.
-
-    Args:
-        rows: Numbers of the rows.
-
-    Returns:
-        The rows as text; empty without rows.
+    """List rows of a file, the first ones if there are many; empty without rows.
 
     Example:
         >>> rows_text([3, 4, 9])
@@ -67,14 +55,7 @@ def rows_text(rows: Sequence[int]) -> str:
 
 
 def decibels(value: float | None) -> str:
-    """Format a value in decibels for tables.
-
-    Args:
-        value: The value [dB]; None if unknown.
-
-    Returns:
-        Two decimals, or a dash if unknown.
-    """
+    """Format a value [dB] for tables with two decimals; a dash if unknown."""
     return "-" if value is None else f"{value:.2f}"
 
 

@@ -17,7 +17,7 @@ from calibray.fitting.search import BASINS, Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
-from calibray.support.blas_threads import single_blas_thread
+from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.between_buildings import population_means
 from calibray.uncertainty.emulator import emulate

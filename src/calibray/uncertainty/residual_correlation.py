@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist, pdist
 
 from calibray.errors import EngineError, InputError
-from calibray.support.blas_threads import single_blas_thread
+from calibray.support.memory import single_blas_thread
 
 SHARES: Final = (0.001, 0.999)
 """Bounds of the correlated share of the variance; at 1 the covariance of near links is singular."""

@@ -24,14 +24,14 @@ from calibray.scenes.authoring.extrusion import (
     Shell,
     Windows,
     extrude,
+    split_overlaps,
 )
 from calibray.scenes.authoring.footprints import WIDEST, Footprints
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, write_made_scene
-from calibray.scenes.authoring.overlaps import split_overlaps
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.meshes import MeshObject, weld
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.output_files import check_outputs
 
 SINK: Final = 0.5

@@ -17,18 +17,18 @@ from calibray.scenes.authoring.extrusion import (
     MILLIMETRE,
     Point,
     Stand,
+    subtract,
     to_millimetres,
     triangulate,
     wall_triangles,
 )
 from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, SurfaceMaterial, write_made_scene
-from calibray.scenes.authoring.overlaps import subtract
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.authoring.wall_faces import MergedPlan, merge_faces
 from calibray.scenes.meshes import MeshObject, weld
 from calibray.scenes.scene import ITU_NAMES
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean
 from calibray.support.output_files import check_outputs
 

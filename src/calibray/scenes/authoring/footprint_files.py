@@ -27,7 +27,7 @@ from calibray.scenes.authoring.footprints import (
     project,
 )
 from calibray.scenes.authoring.geodata import read_features
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 
 _LOG: Final = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 
 GRID: Final = 0.01
 """Grid to which the corners of buildings are rounded [m]."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calibray.coordinates import WGS84, parse_crs
 from calibray.errors import InputError
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.memory import available_memory
 from calibray.support.messages import first_line, shortened
 from calibray.support.output_files import exists

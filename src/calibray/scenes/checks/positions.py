@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.scenes.triangles import is_ground, read_meshes
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 
 CLEARANCE: Final = 0.05
 """A surface is above an antenna if it is higher by more than this [m]."""

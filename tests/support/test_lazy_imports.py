@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from calibray.errors import InputError
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 
 
 def test_a_library_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeypatch):
