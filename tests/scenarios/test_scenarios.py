@@ -14,7 +14,7 @@ import pytest
 
 from calibray.engines import Replay
 from calibray.errors import InputError
-from calibray.scenarios import campaign, demo_study_path, district, sounder, world
+from calibray.scenarios import campaign, demo_study_path, district, world
 from calibray.scenes import Mesh, join_meshes, ply_bytes
 from calibray.study import Study
 from calibray.support.output_files import SIGNATURES
@@ -330,7 +330,7 @@ def test_the_true_world_has_its_own_materials_and_lamp_posts():
 
 def sound(power, delay, is_diffuse, seed=0):
     rng = np.random.Generator(np.random.PCG64(seed))
-    return sounder.sounded_path_loss(np.array(power), np.array(delay), np.array(is_diffuse), rng)
+    return campaign.sounded_path_loss(np.array(power), np.array(delay), np.array(is_diffuse), rng)
 
 
 def test_one_strong_path_is_measured_exactly():
@@ -364,8 +364,8 @@ def test_diffuse_paths_in_one_tap_fade_as_rayleigh():
 
 
 def test_noise_is_subtracted():
-    losses = [sound([10 ** (-sounder.NOISE_DB / -10 + 0.6)], [0.0], [False], k)[0] for k in range(50)]
-    assert np.mean(losses) == pytest.approx(-sounder.NOISE_DB - 6.0, abs=0.2)
+    losses = [sound([10 ** (-campaign.NOISE_DB / -10 + 0.6)], [0.0], [False], k)[0] for k in range(50)]
+    assert np.mean(losses) == pytest.approx(-campaign.NOISE_DB - 6.0, abs=0.2)
 
 
 def test_the_order_of_the_paths_does_not_matter():

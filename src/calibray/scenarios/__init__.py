@@ -1,6 +1,6 @@
 """The demo: a coastal high-rise district like that of the paper, and a simulated measurement campaign.
 
-`district` builds streets and buildings, `world` plants the true constants, `sounder` measures a link, and `campaign`
+`district` builds streets and buildings, `world` plants the true constants, and `campaign` measures the links and
 writes the files. `python -m calibray.scenarios FOLDER` generates them again; `coastal_district/` contains them.
 """
 
