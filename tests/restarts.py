@@ -30,6 +30,9 @@ from calibray.calibration.calibrate import calibrate
 from calibray.engines import Retrace, open_workers
 from calibray.errors import EngineError, InputError
 from calibray.study import Study
+# Else every child would import them.
+import trimesh
+import calibray.engines.make_engine, calibray.engines.external.program
 
 def run(workers, folder):
     answer = Retrace._trace

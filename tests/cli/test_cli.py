@@ -74,8 +74,8 @@ def test_nothing_heavy_is_imported_before_a_command_runs():
 
 def test_help_lists_the_commands_on_stdout():
     for option in ("-h", "--help"):
-        run = calibray(option)
-        assert (run.returncode, run.stderr) == (0, "")
+        run = CliRunner().invoke(app, [option])
+        assert (run.exit_code, run.stderr) == (0, "")
         assert "doctor" in run.stdout
         # Every summary is complete.
         assert "..." not in run.stdout.replace("[ARGS]...", "")
@@ -83,8 +83,8 @@ def test_help_lists_the_commands_on_stdout():
 
 @pytest.mark.parametrize("arguments", [["no-such-command"], ["doctor", "--no-such-option"]])
 def test_a_wrong_command_line_is_bad_input(arguments):
-    run = calibray(*arguments)
-    assert (run.returncode, run.stdout) == (2, "")
+    run = CliRunner().invoke(app, arguments)
+    assert (run.exit_code, run.stdout) == (2, "")
     assert arguments[-1] in run.stderr
 
 

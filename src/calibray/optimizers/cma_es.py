@@ -27,9 +27,6 @@ class CMAES(Optimizer):
     """Covariance matrix adaptation. Uses the value alone; budget as set. Needs `calibray[optimizers]`.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         budget: Number of evaluations.
         population: Candidates per generation, 4 + 3 ln d if None.
 

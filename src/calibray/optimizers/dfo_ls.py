@@ -28,14 +28,10 @@ class DFOLS(Optimizer):
     """Derivative-free least squares. Uses residuals; budget as set. Needs `calibray[optimizers]`.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
         seed: Seed of the random points of restarts.
         budget: Number of evaluations.
         radius: First trust region, as a share of the box.
         tolerance: Trust region at which a start has converged, as a share of the box.
-        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
-            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range, or `DFO-LS` is not installed.

@@ -24,23 +24,11 @@ class DifferentialEvolution(Optimizer):
     """Differential evolution. Uses the value alone; budget as set.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         budget: Number of evaluations.
         population: Candidates per generation as a multiple of d; SciPy uses at least 5 in all.
 
     Raises:
         InputError: An argument is out of range.
-
-    Example:
-        >>> import numpy as np
-        >>> opt = DifferentialEvolution([-5.0, -5.0], [5.0, 5.0])
-        >>> while not opt.done:
-        ...     x = opt.ask()
-        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
-        >>> opt.evaluations, bool(opt.best.y < 0.1)
-        (225, True)
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})

@@ -39,23 +39,11 @@ class GaussianProcess(Optimizer):
     """Bayesian optimization. Uses the value alone; 20 d evaluations by default.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         budget: Number of evaluations, 20 d if None.
         initial: Points of the initial design, 2 (d + 1) if None; points told before the first `ask` count.
 
     Raises:
         InputError: An argument is out of range.
-
-    Example:
-        >>> import numpy as np
-        >>> opt = GaussianProcess([-5.0, -5.0], [5.0, 5.0], budget=25)
-        >>> while not opt.done:
-        ...     x = opt.ask()
-        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
-        >>> opt.evaluations, bool(opt.best.y < 0.01)
-        (25, True)
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})

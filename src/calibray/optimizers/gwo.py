@@ -81,9 +81,6 @@ class GWO(Optimizer):
     """Grey Wolf Optimizer. Uses the value alone; 600 evaluations at the paper's settings.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         population: N, number of wolves.
         iterations: T.
         centred: Measure positions from the middle of the box instead of the origin.

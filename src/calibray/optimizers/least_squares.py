@@ -71,8 +71,6 @@ class LeastSquares(Optimizer):
     """Multi-start Levenberg-Marquardt. Uses residuals and Jacobian; it has no budget and stops by itself.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
         seed: Seed of the scrambled Sobol points that the searches start from.
         starts: Largest number of those points; powers of two are spread best. Each costs about ten evaluations. If all
             are used, combinations of the minima cost some hundred more. The best point told before the first `ask`, if
@@ -83,8 +81,6 @@ class LeastSquares(Optimizer):
             square, or a step shorter than this in the unit cube.
         catch_up: Predicted decreases that a search may be behind the best one before it is given up. Use fewer if
             starts are minima already and the others only have to show whether they lead to a better one.
-        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
-            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.

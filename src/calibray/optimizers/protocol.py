@@ -149,8 +149,11 @@ class Optimizer(ABC):
 
     The value may be any number, such as an error or a negative log likelihood. A method that uses residuals minimises
     their mean square, so the value must rise and fall with it. For a likelihood tell deviance residuals
-    sign(r) sqrt(2 (l(r) - l(0))) of residuals r with negative log likelihood l; the constructor's `objective` computes
-    the value from them.
+    sign(r) sqrt(2 (l(r) - l(0))) of residuals r with negative log likelihood l.
+
+    Every constructor takes `lower` and `upper`, the bounds [d], and `seed`, that of the random generator. Where
+    residuals are used it takes `objective`: residuals [n, m] to the value [n], their root mean square by default. The
+    value must rise with their mean square, which is minimised; both are checked.
 
     Attributes:
         uses: Parts of an evaluation that the method uses, of "value", "residuals" and "jacobian".

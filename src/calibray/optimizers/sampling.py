@@ -65,8 +65,6 @@ class Sampling(Optimizer):
     """A search that evaluates a design and learns nothing; abstract in the kind of design.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
         seed: Seed of the design.
         budget: Number of points, all asked for at once.
 

@@ -90,9 +90,6 @@ class SGWOIM(Optimizer):
     """The paper's optimizer. Uses the value alone; 225 evaluations at the paper's settings.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         population: N, number of wolves.
         iterations: T.
         full_iterations: Iterations that evaluate the whole population before the surrogate screens.
@@ -106,15 +103,6 @@ class SGWOIM(Optimizer):
 
     Raises:
         InputError: An argument is out of range.
-
-    Example:
-        >>> import numpy as np
-        >>> opt = SGWOIM([-5.0, -5.0], [5.0, 5.0], seed=1)
-        >>> while not opt.done:
-        ...     x = opt.ask()
-        ...     opt.tell(x, np.sum((x - 2.0) ** 2, axis=1))
-        >>> opt.evaluations, bool(opt.best.y < 0.01)
-        (225, True)
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"value"})

@@ -73,9 +73,6 @@ class VectorSurrogate(Optimizer):
     """Surrogate of the residual vector. Uses residuals; 20 d evaluations by default.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         budget: Number of evaluations, 20 d if None.
         initial: Points of the initial design, the lesser of 2 (d + 1) and d + 5 if None; points told before the first
             `ask` count, those closer together than half of the design's spacing as one.
@@ -84,8 +81,6 @@ class VectorSurrogate(Optimizer):
         noisy: Whether the engine's answers scatter; the model then smooths instead of interpolating.
         tolerance: Stop before the budget is used when the predicted gain stays below this, in the unit of the
             residuals' root mean square; never if None.
-        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
-            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.

@@ -54,20 +54,7 @@ def trace(
     progress: Progress | None = None,
     **settings: int | bool,
 ) -> Paths:
-    """Find the paths of every link and compile them.
-
-    Args:
-        scene: Mitsuba XML file, `sionna:NAME` for a bundled scene, or a scene already read.
-        links: The links; only their positions count. For another carrier, see `Paths.at`.
-        frequency: Carrier frequency [Hz].
-        tx_antenna: Transmit antenna, as `Antenna` or a mapping with its attributes.
-        rx_antenna: Receive antenna.
-        materials: Constants that replace the scene's, by material name.
-        progress: Called with ("tracing", receivers traced, receivers in all) after every launch.
-        **settings: The attributes of `TraceSettings`.
-
-    Returns:
-        The path program; `links_without_path` lists the links that no path reaches.
+    """Find the paths of every link and compile them; the arguments are those of `calibray.trace` without a study.
 
     Raises:
         InputError: The scene, an antenna, a setting or a position cannot be used.

@@ -83,15 +83,9 @@ class Tracer(Protocol):
     def trace(
         self, links: Links, progress: Progress | None = None, materials: Mapping[str, Material] | None = None
     ) -> Paths:
-        """Find the paths of every link.
+        """Find the paths of every link, with other materials by name in place of the scene's.
 
-        Args:
-            links: The links.
-            progress: Called with ("tracing", receivers traced, receivers in all).
-            materials: Constants that replace the scene's, by name.
-
-        Returns:
-            The path program, with the materials that it was traced with.
+        `progress` is called with ("tracing", receivers traced, receivers in all).
 
         Raises:
             InputError: There is no link, a position is not finite, the ends of a link coincide, or the scene lacks a
@@ -103,14 +97,7 @@ class Tracer(Protocol):
     def solve(self, links: Links, materials: Mapping[str, Material]) -> Solution:
         """Find the paths of every link and compute their gains with the tracer's own field computation.
 
-        A tracer without one can replay the paths: `calibray.path_gains`.
-
-        Args:
-            links: The links.
-            materials: Constants that replace the scene's, by name.
-
-        Returns:
-            The gains.
+        A tracer without one can replay the paths: `calibray.path_gains`. Materials replace the scene's by name.
 
         Raises:
             InputError: As for `trace`.

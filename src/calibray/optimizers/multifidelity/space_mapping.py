@@ -117,15 +117,10 @@ class SpaceMapping(Optimizer):
     """Space mapping. Uses residuals; 20 d evaluations by default.
 
     Args:
-        lower: Lower bounds [d].
-        upper: Upper bounds [d].
-        seed: Seed of the random generator.
         budget: Number of evaluations, 20 d if None.
         cheap_model: The cheap model; without one the vector surrogate searches.
         batch: Candidates asked for at once, for engines that run in parallel.
         noisy: Whether the engine's answers scatter.
-        objective: Residuals [n, m] to the value [n]; their root mean square by default. It must rise with their mean
-            square, which is minimised; both are checked.
 
     Raises:
         InputError: An argument is out of range.

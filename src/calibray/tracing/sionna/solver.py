@@ -83,19 +83,7 @@ class Rays:
 
 
 class Solver:
-    """The stages of Sionna RT's solver on one loaded scene.
-
-    Args:
-        scene: The scene.
-        frequency: Carrier frequency [Hz].
-        settings: The tracer's settings.
-        tx_antenna: Transmit antenna.
-        rx_antenna: Receive antenna.
-
-    Raises:
-        InputError: Sionna cannot load the scene, the frequency is not a positive number, or an antenna's gain table
-            cannot be used.
-    """
+    """The stages of Sionna RT's solver on one loaded scene; its arguments and errors are those of `Tracer`."""
 
     def __init__(
         self,
