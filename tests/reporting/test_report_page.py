@@ -18,14 +18,16 @@ from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.paths import Kind
 from calibray.reporting import page as reports
+from calibray.reporting import result_tables as tables
 from calibray.reporting.link_map import plan, ramp
 from calibray.reporting.link_survey import survey
 from calibray.reporting.result_tables import values
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
-from calibray.result.held_out import Judgement
+from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.buildings import _loops
+from calibray.support.figure_style import plain_number
 from calibray.uncertainty.linear_theory import Interval
 from changed import changed
 from small_scenes import block, write_scene
@@ -113,6 +115,55 @@ def test_every_section_is_there(html):
     assert len(html.ids) == len(set(html.ids))
     assert {"figure-convergence", "figure-cumulative-cost", "figure-path-loss", "figure-residual-over-distance",
             "figure-residual-by-group"} <= set(html.ids)  # fmt: skip
+
+
+def test_the_map_comes_before_the_convergence(written):
+    html = (written / "report.html").read_text(encoding="utf-8")
+    assert html.index('id="links-map"') < html.index('id="values"') < html.index('id="figures"')
+    assert re.search(r"page of \d{4}-\d\d-\d\d<", html)
+
+
+def test_percent_signs_follow_a_space_and_names_break_after_the_material(written, result):
+    html = (written / "report.html").read_text(encoding="utf-8")
+    text = re.sub(r"<(script|style|svg|pre).*?</\1>", "", html, flags=re.DOTALL)
+    assert re.search(r"\d %", text)
+    assert not re.search(r"\d%", re.sub(r"<[^>]*>", "", text))
+    material, _, constant = next(iter(result.parameters)).rpartition(".")
+    assert f"{material}.<wbr>{constant}" in html
+
+
+def test_numbers_on_logarithmic_axes_have_no_exponents():
+    assert [plain_number(value) for value in (1e-5, 0.02, 1.0, 50.0, 2e6)] == [
+        "0.00001",
+        "0.02",
+        "1",
+        "50",
+        "2,000,000",
+    ]
+
+
+def test_the_headline_compares_the_prediction_model_with_its_rivals(result):
+    block = np.arange(len(result.links)) % 2
+    errors = {
+        name: np.full(len(block), size) for name, size in ((Model.INITIAL, 2.5), (Model.CALIBRATED, 3.5))
+    }
+    held_out = HeldOutErrors(
+        ("1", "2"), block, errors, np.zeros((len(block), 3)), result.links.measured_db.to_numpy()
+    )
+    judged = changed(
+        result, held_out=held_out, holdout_rmse_db=3.5, nuisance_only_holdout_rmse_db=2.5,
+        log_distance_holdout_rmse_db=4.5,
+    )  # fmt: skip
+    model = replace(judged.prediction.model, name=Model.INITIAL, residual_db=2.5)
+    judged = replace(judged, prediction=replace(judged.prediction, model=model))
+    (heading, value, comparison), links, *_ = reports._tiles(judged)
+    assert (heading, value) == ("RMSE, held-out links", "2.50 dB")
+    assert "'initial materials'" in comparison
+    assert "offset only 2.50 dB" in comparison
+    assert "log-distance model 4.50 dB" in comparison
+    # No "0 of them held out" next to a held-out RMSE.
+    assert links[2] == f"{len(block)} of them held out in turn, in 2 blocks"
+    assert dict(row[:2] for row in tables.links(judged).rows)["held out"] == str(len(block))
 
 
 def test_nothing_is_loaded_from_anywhere(html, written):

@@ -10,7 +10,8 @@ import shapely
 import trimesh
 
 from calibray.errors import InputError
-from calibray.scenes import read_frame, read_scene
+from calibray.prediction.position_checks import locate
+from calibray.scenes import buildings, read_frame, read_scene, read_triangles
 from calibray.scenes.authoring import Palette, SurfaceMaterial, Terrain, Windows, make_scene
 from calibray.scenes.authoring.extrusion import (
     MILLIMETRE,
@@ -200,6 +201,21 @@ def test_a_made_scene_can_be_read(tmp_path):
     assert record["counts"] == {"buildings": 1}
     assert record["frame"] == FRAME.record()
     assert set(made.triangles) == set(scene.materials)
+
+
+@pytest.mark.parametrize("gap", [8.0, 2.0])
+def test_the_roofs_of_a_town_are_no_ground(tmp_path, gap):
+    """All roofs are one level mesh as wide as the scene; with narrow gaps they cover most of it."""
+    polygons = [BOX(20 * k, 20 * n, 20 * k + 20 - gap, 20 * n + 20 - gap) for k in range(4) for n in range(4)]
+    made = make_scene(footprints(polygons, [10.0] * 16), tmp_path, FRAME, margin=5.0)
+    triangles = read_triangles(read_scene(made.path, 5e9))
+    assert set(triangles.vertex[triangles.face[triangles.ground]][..., 2].ravel()) == {0.0}
+    outlines = buildings.footprints(triangles, -10.0, -10.0, 90.0, 90.0)
+    corners = {tuple(corner) for outline in outlines for corner in outline.round(3)}
+    assert {tuple(corner) for polygon in polygons for corner in polygon.exterior.coords} <= corners
+    # A map is blank inside, and only inside.
+    places = np.array([[10.0, 10.0, 1.5], [20.0 - gap / 2, 10.0, 1.5]])
+    assert locate(triangles, places).tolist() == ["inside a building", ""]
 
 
 def test_meshes_of_one_scene_have_corners_at_the_same_positions(tmp_path):

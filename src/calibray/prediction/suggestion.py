@@ -28,6 +28,7 @@ from calibray.prediction.position_checks import POSITION_COLUMNS
 from calibray.prediction.predict import as_links, check_inputs, traced_materials
 from calibray.result.record import Record
 from calibray.study import Setup
+from calibray.support.messages import percent
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers
 from calibray.uncertainty.residual_correlation import Correlation, shared_errors
@@ -333,7 +334,9 @@ def _table(
             table[f"{name}_sure"] = probabilities
             for gain, probability in zip(gains, probabilities, strict=True):
                 if probability > before + LEAST_GAIN:
-                    gain.append(f"right range of {name} known with {probability:.0%} (now {before:.0%})")
+                    gain.append(
+                        f"right range of {name} known with {percent(probability)} (now {percent(before)})"
+                    )
     table["gain"] = [", ".join(gain) or "no interval narrower by more than 2 %" for gain in gains]
     return pd.DataFrame(table)
 

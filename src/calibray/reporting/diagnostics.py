@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibray.reporting.link_survey import POSITION_COLUMNS, residual
 from calibray.result.record import Record
+from calibray.support.messages import percent
 from calibray.tables import Column, Table
 from calibray.tables.text import rows_text
 from calibray.uncertainty.residual_correlation import variogram
@@ -217,7 +218,7 @@ def _power_text(tables: dict[str, pd.DataFrame]) -> str:
     if "power" not in tables:
         return ""
     rows = tables["power"].head(5).itertuples()
-    shares = (f"{row.material} {row.interaction} {row.share:.0%}".replace("  ", " ") for row in rows)
+    shares = (f"{row.material} {row.interaction} {percent(row.share)}".replace("  ", " ") for row in rows)
     return f"mean share of a link's power: {', '.join(shares)}"
 
 
@@ -261,7 +262,7 @@ def _neighbours_text(tables: dict[str, pd.DataFrame]) -> str:
     # The relative standard error of a semivariance of n independent pairs is sqrt(2 / n).
     if share < CLEAR * np.sqrt(2.0 / nearest["pairs"]):
         return f"the errors of links {nearest['distance_m']:.0f} m apart are not correlated"
-    return f"links {nearest['distance_m']:.0f} m apart share {share:.0%} of the variance of their errors"
+    return f"links {nearest['distance_m']:.0f} m apart share {percent(share)} of the variance of their errors"
 
 
 def _leverage_text(tables: dict[str, pd.DataFrame]) -> str:
@@ -292,4 +293,5 @@ def _moved_text(tables: dict[str, pd.DataFrame]) -> str:
         return ""
     table = tables["moved"]
     row = table.iloc[int(np.argmax(table["moved"].abs()))]
-    return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {abs(row['moved']):.0%} of its range"
+    moved = percent(abs(row["moved"]))
+    return f"{row['parameter']}, from {row['before']:.4g} to {row['after']:.4g}: {moved} of its range"

@@ -200,7 +200,7 @@ def residual_by_group(survey: Survey) -> Figure:
     frame = pd.DataFrame({"group": survey.group, "residual": survey.residual_db})[survey.has_path].dropna()
     sizes = frame.groupby("group").size().sort_values(ascending=False, kind="stable")
     names = sorted(sizes.index[:GROUPS])
-    figure, axes = plain_figure("Calibrated - measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
+    figure, axes = plain_figure("Predicted − measured [dB]", "", height=max(2.2, 1.2 + 0.32 * len(names)))
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x", color=LINE)
     axes.axvline(0, color=INK, lw=0.8)

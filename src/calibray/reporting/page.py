@@ -12,6 +12,7 @@ import shlex
 from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import date
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from calibray.doctor import versions
@@ -31,14 +32,17 @@ from calibray.reporting.link_map import RAMP, WIDTH, Plan, plan, ramp, ramp_limi
 from calibray.reporting.link_survey import Survey, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
+from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
+from calibray.result.wording import held_out_text
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
 from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers
 from calibray.tables.display import hertz
+from calibray.tables.text import decibels
 from calibray.validation.validation import Validation
 
 FILE: Final = "report.html"
@@ -53,7 +57,7 @@ CAPTIONS: Final = {
     "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
     "cumulative-cost": "RT calls and time over the iterations of the method.",
     "path-loss": "Path loss of every link: measured, before and after calibration. Held-out links are shaded.",
-    "residual-over-distance": "Residual (calibrated minus measured path loss) over the distance between the antennas.",
+    "residual-over-distance": "Residual (predicted minus measured) over the distance between the antennas.",
     "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
     "calibration. Solid: calibrated value.",
     "held-out-errors": "Share of held-out links with an error up to the value on the axis, by model. The best model is "
@@ -185,11 +189,13 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = _breakable
     script = _asset("viewer.js")
     layout = None if data.links is None else plan(data.links, data.triangles)
     return environment.get_template("report.html.jinja").render(
         name=result.study.path.stem,
         heading=tables.heading(result),
+        date=date.today().isoformat(),
         css=Markup(_asset("report.css")),
         script=Markup(script),
         checksum=b64encode(sha256(script.encode()).digest()).decode(),
@@ -222,29 +228,50 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
     )
 
 
+def _breakable(name: str) -> Markup:
+    """A parameter's name, which may only break after the material."""
+    material, dot, constant = name.rpartition(".")
+    return escape(material) + dot + Markup("<wbr>") + escape(constant)
+
+
 def _asset(name: str) -> str:
     return (files("calibray.reporting") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _tiles(result: Record) -> list[tuple[str, str, str]]:
     """The key figures at the top of the page: name, value, and a comparison."""
+    model, fit = result.prediction.model, result.fit
     judged = result.holdout_rmse_db is not None
-    after = result.holdout_rmse_db if judged else result.rmse_db
-    before = result.accuracy.initial_holdout_rmse_db if judged else result.initial_rmse_db
-    log_distance = result.accuracy.log_distance_holdout_rmse_db if judged else result.fit.log_distance_rmse_db
+    errors = (
+        _held_out_errors(result)
+        if judged
+        else (fit.rmse_db, fit.nuisance_only_rmse_db, fit.log_distance_rmse_db)
+    )
+    rmse_db, offset_only_db, log_distance_db = errors
+    rivals = {"initial materials with offset only": offset_only_db, "log-distance model": log_distance_db}
     identified = sum(interval.verdict == Verdict.IDENTIFIED for interval in result.intervals.values())
     tiles = [
         (
             f"RMSE, {'held-out' if judged else 'calibration'} links",
-            f"{after:.2f} dB",
-            f"before {before:.2f} dB, log-distance model {log_distance:.2f} dB",
+            f"{decibels(rmse_db)} dB",
+            "; ".join(
+                [f"model {str(model.name)!r}"]
+                + [f"{name} {decibels(value)} dB" for name, value in rivals.items() if value is not None]
+            ),
         ),
-        ("Links", f"{len(result.links):,}", f"{result.counts['held_out']:,} of them held out"),
+        ("Links", f"{len(result.links):,}", held_out_text(result)),
         ("RT calls", f"{result.rt_calls:,}", f"at {hertz(result.study.scene.frequency)}"),
     ]
     if result.intervals:
         tiles.append(("Identified parameters", f"{identified} of {len(result.parameters)}", "see Values"))
     return tiles
+
+
+def _held_out_errors(result: Record) -> tuple[float | None, float | None, float | None]:
+    """Held-out RMSE of the prediction model, of the initial materials with an offset, and of the log-distance model."""
+    model, accuracy = result.prediction.model, result.accuracy
+    own_db = accuracy.holdout_rmse_db if model.name == Model.CALIBRATED else model.residual_db
+    return own_db, accuracy.nuisance_only_holdout_rmse_db, accuracy.log_distance_holdout_rmse_db
 
 
 def _laws(result: Record) -> Table:

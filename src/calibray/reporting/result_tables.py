@@ -91,10 +91,17 @@ def links(result: Record) -> Table:
     rows = [
         *((cause, str(number), "") for cause, number in result.provenance.rows.items()),
         ("calibration links", str(count["calibrated_on"]), ""),
-        ("held out", str(count["held_out"]), ""),
+        ("held out", *_held_out(result)),
         *suspicious_rows(count["rows_without_path"], f", {treatment}", result.provenance.enclosed),
     ]
     return Table("Links", (Column(), numbers(), Column()), tuple(rows))
+
+
+def _held_out(result: Record) -> tuple[str, str]:
+    """Number of held-out links, and in how many blocks if they were held out in turn."""
+    if result.held_out is None:
+        return str(result.counts["held_out"]), ""
+    return str((result.held_out.block >= 0).sum()), f"in turn, in {len(result.held_out.labels)} blocks"
 
 
 def suspicious_rows(

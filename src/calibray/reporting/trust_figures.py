@@ -21,6 +21,7 @@ from calibray.support.figure_style import (
     ORANGE,
     PALETTE,
     dress,
+    logarithmic,
     plain_figure,
     residual_figure,
     styled,
@@ -101,7 +102,7 @@ def _draw_posterior(axes: Axes, result: Record, name: str) -> None:
     axes.axvline(result.parameters[name], color=ORANGE, lw=1.6)
     axes.set(xlim=(lower, upper), ylim=(0, None), yticks=[])
     if log:
-        axes.set_xscale("log")
+        logarithmic(axes, "x")
     axes.spines["left"].set_visible(False)
     if interval is not None:
         axes.set_title(interval.verdict, fontsize=9, color=FAINT, loc="right")

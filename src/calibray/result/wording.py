@@ -11,6 +11,7 @@ from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.result.record import Record
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import Interval, Reason, ReasonKind
+from calibray.support.messages import percent
 
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
@@ -54,15 +55,17 @@ def reason_text(reason: Reason | None) -> str:
 
 
 def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
-    text = f"90 % of the posterior covers {values['share']:.0%} of the range"
+    text = f"90 % of the posterior covers {percent(values['share'])} of the range"
     if ranges:
-        others = ", ".join(f"{low:.4g} to {high:.4g} ({weight:.0%} of it)" for low, high, weight in ranges)
+        others = ", ".join(
+            f"{low:.4g} to {high:.4g} ({percent(weight)} of it)" for low, high, weight in ranges
+        )
         text += f"; the 95 % interval also includes {others}"
     return text
 
 
 def _separate(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:
-    modes = ", ".join(f"{value:.4g} ({weight:.0%} of the posterior)" for value, weight in ranges)
+    modes = ", ".join(f"{value:.4g} ({percent(weight)} of the posterior)" for value, weight in ranges)
     return f"{len(ranges)} separate ranges fit the links, around {modes}"
 
 
@@ -70,8 +73,8 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.WIDTH: _width,
     ReasonKind.SEPARATE_RANGES: _separate,
     ReasonKind.SEEN_BUILDINGS: lambda values, _: (
-        f"for the measured buildings the value is known to {values['share']:.0%} of the range; other buildings of this "
-        "material may differ"
+        f"for the measured buildings the value is known to {percent(values['share'])} of the range; other buildings of "
+        "this material may differ"
     ),
     ReasonKind.AT_BOUND: lambda values, _: (
         f"the interval reaches the {values['side']} bound: the links only show that the value is "
@@ -98,7 +101,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
         f"{values['links']:.0f} links are too few for this number of unknowns"
     ),
     ReasonKind.TOO_FEW_DRAWS: lambda values, _: (
-        f"too few draws fit the data to rule out more than {1 - values['share']:.0%} of the range"
+        f"too few draws fit the data to rule out more than {percent(1 - values['share'])} of the range"
     ),
     ReasonKind.TOO_FEW_CALLS: lambda values, _: (
         f"{values['calls']:.0f} calls of the engine are too few to show how path loss depends on any parameter"
@@ -328,6 +331,21 @@ def scene_alone_text(record: Record) -> str:
         f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links): "
         f"a scene cannot contain {cause}."
     )
+
+
+def held_out_text(record: Record) -> str:
+    """How many links were held out.
+
+    Args:
+        record: The result.
+
+    Returns:
+        A clause.
+    """
+    held_out = record.held_out
+    if held_out is None:
+        return f"{record.counts['held_out']:,} of them held out"
+    return f"{np.count_nonzero(held_out.block >= 0):,} of them held out in turn, in {len(held_out.labels)} blocks"
 
 
 def block_sentence(held_out: HeldOutErrors) -> str:

@@ -19,6 +19,9 @@ from calibray.scenes.scene_file import find_scene, shape_mesh
 LEVEL: Final = 0.5
 """A face is level, like a roof or the ground, if the vertical part of its unit normal is above this [1]."""
 
+WITHOUT_GAPS: Final = 0.9
+"""Share of its extent that a sheet over the whole scene covers, such as a floor or a ceiling [1]."""
+
 _EDGE: Final = 1e-9
 """Points up to this far outside a triangle count as over it, as a share of its size [1]."""
 
@@ -118,19 +121,26 @@ def read_triangles(scene: Scene) -> Triangles:
 
 
 def _ground(triangles: Triangles, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Triangles of the objects that are level and extend under most of the scene [F]."""
+    """Triangles of the objects that are level and extend under most of the scene [F].
+
+    A mesh of all roofs is level and wide as well, but it has gaps, or lies above the walls.
+    """
     ground = np.zeros(len(owner), dtype=bool)
     if not len(owner):
         return ground
     corners, normal = triangles.corners, triangles.normal
-    area = np.linalg.norm(normal, axis=1)
+    area, height = np.linalg.norm(normal, axis=1), corners[:, :, 2].mean(axis=1)
     level = np.abs(normal[:, 2]) > LEVEL * area
+    steep = area * ~level
+    walls = float(np.average(height, weights=steep)) if steep.any() else np.inf
     extent = np.ptp(triangles.vertex[:, :2], axis=0)
     for number in np.unique(owner):
         mask = owner == number
         own_extent = np.ptp(corners[mask][:, :, :2].reshape(-1, 2), axis=0)
         if (own_extent > LEVEL * extent).all() and area[mask & level].sum() > 0.95 * area[mask].sum():
-            ground |= mask
+            covered = np.abs(normal[mask, 2]).sum() / own_extent.prod()
+            below = np.average(height[mask], weights=area[mask]) < walls
+            ground |= mask & bool(covered > WITHOUT_GAPS or (covered > LEVEL and below))
     return ground
 
 

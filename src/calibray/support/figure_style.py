@@ -79,7 +79,7 @@ def plain_figure(x: str, y: str, width: float = 6.4, height: float = 4.2) -> tup
 
 def residual_figure(x: str) -> tuple[Figure, Axes]:
     """An empty figure for what is left of links' path loss, with a line where nothing is left."""
-    figure, axes = plain_figure(x, "Calibrated - measured [dB]")
+    figure, axes = plain_figure(x, "Predicted − measured [dB]")
     axes.axhline(0, color=INK, lw=0.8)
     return figure, axes
 
@@ -92,6 +92,11 @@ def dress(axes: Axes, x: str, y: str) -> None:
     axes.set_axisbelow(True)
 
 
+def plain_number(value: float) -> str:
+    """Write a number without an exponent, as 1,000,000 or 0.00001."""
+    return f"{value:,.12f}".rstrip("0").rstrip(".")
+
+
 def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
     """Make an axis logarithmic, its numbers written out: powers would be formulas, which texts here are not."""
     axes.set(**{f"{direction}scale": "log"})
@@ -99,7 +104,7 @@ def logarithmic(axes: Axes, direction: Literal["x", "y"]) -> None:
     low, high = sorted(axis.get_view_interval())
     if low > 0 and high < 100 * low:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
     axis.set_minor_formatter(NullFormatter())
 
 

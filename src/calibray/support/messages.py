@@ -76,6 +76,16 @@ def first_line(error: Exception) -> str:
     return shortened((str(error).strip() or type(error).__name__).splitlines()[0], 300)
 
 
+def percent(share: float) -> str:
+    """Write a share as a whole number of per cent.
+
+    Example:
+        >>> percent(0.954)
+        '95 %'
+    """
+    return f"{100 * share:.0f} %"
+
+
 def duration(seconds: float) -> str:
     """Write a time [s] in seconds, minutes, hours or days, with the precision of an estimate.
 

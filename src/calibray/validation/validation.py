@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibray.result.held_out import BASELINES, FITTED, HeldOutErrors, Judgement, Model
 from calibray.result.wording import choice_text, judgement_text
+from calibray.support.messages import percent
 from calibray.tables import Column, Table, display, numbers
 from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least
 
@@ -128,11 +129,11 @@ class Validation(HeldOutErrors):
         """
         columns = (
             Column(), numbers("RMSE", "dB"), numbers("standard deviation", "dB"), numbers("log density"),
-            numbers(f"in {self.level:.0%} interval"),
+            numbers(f"in {percent(self.level)} interval"),
         )  # fmt: skip
         rows = tuple(
             (str(name), f"{row.rmse_db:.2f}", f"{row.standard_deviation_db:.2f}", f"{row.log_density:.2f}",
-             f"{row.coverage:.0%}")
+             f"{percent(row.coverage)}")
             for name, row in self.table.iterrows()
         )  # fmt: skip
         title = f"{len(self.labels)} blocks held out in turn, {np.count_nonzero(self.judged)} links"
