@@ -164,6 +164,20 @@ def test_the_list_chooses_by_keyboard_and_sorts(opened):
     assert sizes == sorted(sizes, reverse=True)
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_outlines_and_walls_are_drawn_on_the_map(opened, scheme):
+    page = opened(scheme=scheme)
+    lengths = page.evaluate(
+        "[...document.querySelectorAll('#map .buildings, #map .walls')].map((path) => path.getTotalLength())"
+    )
+    assert min(lengths) > 1000
+    colors = page.evaluate(
+        "[getComputedStyle(document.getElementById('map')).backgroundColor, "
+        "getComputedStyle(document.querySelector('#map .buildings')).fill]"
+    )
+    assert colors[0] != colors[1]
+
+
 def test_a_link_without_a_path_says_so(opened):
     page = opened()
     page.locator("#links").select_option("0")

@@ -371,6 +371,12 @@ def test_the_map_shows_footprints_at_their_positions(tmp_path, result):
         {tuple(point) for point in shown.project(np.array(corner)).round(1).tolist()} for corner in corners
     ]
     assert sorted(map(sorted, outlines)) == sorted(map(sorted, expected))
+    walls = [
+        {tuple(map(float, point.split(","))) for point in wall.split("L")}
+        for wall in shown.walls.removeprefix("M").split("M")
+    ]
+    assert len(walls) == 8
+    assert set.union(*walls) == set.union(*expected)
 
 
 def test_faces_that_share_edges_have_one_outline():

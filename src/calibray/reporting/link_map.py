@@ -19,11 +19,17 @@ MOST_HEIGHT: Final = 1000
 LEAST_ASPECT: Final = 0.45
 """Least height over width, so that links along a street do not make a thin strip."""
 
-MARGIN: Final = 0.08
+MARGIN: Final = 0.12
 """Margin around the links, as a share of their extent."""
 
-LEAST_EXTENT: Final = 40.0
+LEAST_EXTENT: Final = 5.0
 """Least extent of the map [m]."""
+
+MOST_WALLS: Final = 20_000
+"""Most lines that are drawn for vertical faces, the longest first."""
+
+STEEP: Final = 0.1
+"""A face is a wall if the vertical part of its unit normal is below this [1]."""
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
 """Colours from negative to positive residuals; colour-blind people can distinguish the ends."""
@@ -39,6 +45,7 @@ class Plan:
         north: Coordinate of the upper edge [m].
         scale: Units of the map per metre [1/m].
         buildings: Outlines of buildings, as data of an SVG path.
+        walls: Vertical faces seen from above, likewise.
         bar: Length of the scale bar [m].
     """
 
@@ -48,6 +55,7 @@ class Plan:
     scale: float
     buildings: str
     bar: float
+    walls: str = ""
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert positions to the map.
@@ -84,7 +92,9 @@ def plan(survey: Survey, triangles: Triangles | None) -> Plan:
     layout = Plan(
         round(extent[1] * scale), float(west), float(north), float(scale), "", _round(extent[0] / 5)
     )
-    return layout if triangles is None else replace(layout, buildings=_buildings(triangles, layout))
+    if triangles is None:
+        return layout
+    return replace(layout, buildings=_buildings(triangles, layout), walls=_walls(triangles, layout))
 
 
 def ramp(value: NDArray[np.float64], limit: float) -> list[str]:
@@ -138,3 +148,23 @@ def _buildings(triangles: Triangles, layout: Plan) -> str:
         line = layout.project(loop).round(1)
         outlines.setdefault(frozenset(map(tuple, line.tolist())), line.tolist())
     return "".join(f"M{'L'.join(f'{x:g},{y:g}' for x, y in line)}Z" for line in outlines.values())
+
+
+def _walls(triangles: Triangles, layout: Plan) -> str:
+    """The vertical faces within the map, each as the line between its ends in plan; equal lines are drawn once."""
+    normal = triangles.normal
+    area = np.linalg.norm(normal, axis=1)
+    steep = (np.abs(normal[:, 2]) < STEEP * area) & (area > 0)
+    corners = layout.project(triangles.corners[steep].reshape(-1, 3)).round(1).reshape(-1, 3, 2)
+    # The ends of a triangle in plan are the two corners that are furthest apart.
+    sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+    longest = np.linalg.norm(sides[:, :, 0] - sides[:, :, 1], axis=2).argmax(axis=1)
+    lines = sides[np.arange(len(sides)), longest]
+    inside = (lines.max(axis=1) > 0).all(axis=1) & (lines.min(axis=1) < [WIDTH, layout.height]).all(axis=1)
+    lines = lines[inside]
+    backwards = (lines[:, 0] > lines[:, 1]) @ [2, 1] > (lines[:, 0] < lines[:, 1]) @ [2, 1]
+    lines[backwards] = lines[backwards][:, ::-1]
+    lines = np.unique(lines.reshape(-1, 4), axis=0)
+    length = np.hypot(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])
+    drawn = lines[np.argsort(-length, kind="stable")[:MOST_WALLS]]
+    return "".join(f"M{x:g},{y:g}L{u:g},{v:g}" for x, y, u, v in drawn.tolist())

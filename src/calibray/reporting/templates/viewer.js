@@ -237,7 +237,7 @@
       return [low, high];
     });
     const [one, two] = [span(tx), span(rx)], range = one.map(([a, b], k) => [Math.min(a, two[k][0]), Math.max(b, two[k][1])]);
-    const extent = Math.max(range[0][1] - range[0][0], range[1][1] - range[1][0], 30 / data.solid.step);
+    const extent = Math.max(range[0][1] - range[0][0], range[1][1] - range[1][0], 5 / data.solid.step);
     // The initial view looks along the principal axis of the links, for instance down a street.
     const along = () => {
       const mean = [0, 1].map((k) => { let sum = 0; for (let i = k; i < 3 * count; i += 3) sum += moving[i]; return sum / count; });
