@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibray.errors import InputError
 from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
 from calibray.scenes.authoring.geodata import read_features
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, first_line, shortened
 from calibray.support.output_files import exists
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.scenes.authoring.floor_plan import OPENINGS, Segment
-from calibray.support.extras import library
+from calibray.support.lazy_imports import library
 
 THICKEST: Final = 0.6
 """Largest thickness of a wall whose faces are merged [m]."""
