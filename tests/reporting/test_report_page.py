@@ -19,8 +19,9 @@ from calibray.errors import InputError
 from calibray.paths import Kind
 from calibray.reporting import page as reports
 from calibray.reporting import result_tables as tables
+from calibray.reporting.figures import path_loss_by_receiver
 from calibray.reporting.link_map import plan, ramp
-from calibray.reporting.link_survey import survey
+from calibray.reporting.link_survey import in_measured_quantity, survey
 from calibray.reporting.result_tables import values
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import INTERACTIONS, PER_LINK, Grid, strongest
@@ -164,6 +165,21 @@ def test_the_headline_compares_the_prediction_model_with_its_rivals(result):
     # No "0 of them held out" next to a held-out RMSE.
     assert links[2] == f"{len(block)} of them held out in turn, in 2 blocks"
     assert dict(row[:2] for row in tables.links(judged).rows)["held out"] == str(len(block))
+
+
+def test_links_are_shown_in_the_quantity_that_was_measured(result):
+    content = result.study.content()
+    content["links"]["quantity"], content["offset"] = "rsrp", {"per": "half"}
+    study = cb.Study.from_content(content, result.study.path)
+    links = result.links.assign(measured_rsrp_db=-result.links.measured_db)
+    received = replace(result, study=study, links=links)
+    power, residuals = in_measured_quantity(received, "predicted"), survey(received).residual_db
+    reached = links.has_path.to_numpy(bool)
+    assert power[reached] == pytest.approx(-links.predicted_db[reached].to_numpy())
+    assert residuals[reached] == pytest.approx((power + links.measured_db.to_numpy())[reached])
+    headings = [column.heading for column in reports._worst(received, survey(received)).columns]
+    assert "measured [dBm]" in headings
+    assert path_loss_by_receiver({"auto": received}).axes[0].get_ylabel() == "RSRP [dBm]"
 
 
 def test_nothing_is_loaded_from_anywhere(html, written):

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from calibray.optimizers import label
-from calibray.reporting.link_survey import Survey
+from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
 from calibray.reporting.trust_figures import trust_figures
 from calibray.result.record import Record
 from calibray.support.figure_style import (
@@ -132,27 +132,54 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
     # Curves of many links are readable only if the links are sorted by measured path loss.
     order = np.argsort(links["measured_db"].to_numpy(float), kind="stable") if many else number - 1
     x_label = "Receiver" if few else "Link, by measured path loss" if many else "Link"
-    figure, axes = plain_figure(x_label, "Path loss [dB]", width=10.0)
+    first, quantity = next(iter(results.values())), measured_quantity(next(iter(results.values())))
+    y_label = f"{quantity.name[:1].upper()}{quantity.name[1:]} [{quantity.unit}]"
+    figure, axes = plain_figure(x_label, y_label, width=10.0)
     held_out = links["held_out"].to_numpy(bool)
     if not many and 0 < held_out.sum() < len(links):
         for run, (start, end) in enumerate(_runs(held_out)):
             name = None if run else "held out"
             axes.axvspan(start + 0.5, end + 0.5, color=FAINT, alpha=0.12, lw=0, label=name)
 
-    def draw(column: pd.Series, line: str, dots: str, layer: int = 2, **style: Any) -> None:
-        values = column.to_numpy(float)[order]
+    def draw(column: NDArray[np.float64], line: str, dots: str, layer: int = 2, **style: Any) -> None:
+        values = column[order]
         shown = np.where(np.isfinite(values), values, np.nan)
         axes.plot(
             number, shown, line if few else dots, rasterized=len(links) > RASTERIZED, zorder=layer, **style
         )
 
-    draw(links["measured_db"], "o-", "-" if many else ".", 3, color=INK, ms=5, lw=1.5, label="measured")
-    draw(links["before_db"], "s--", ".", color=FAINT, ms=4 if few else 2, lw=1, label="before calibration")
+    draw(
+        in_measured_quantity(first, "measured"),
+        "o-",
+        "-" if many else ".",
+        3,
+        color=INK,
+        ms=5,
+        lw=1.5,
+        label="measured",
+    )
+    draw(
+        in_measured_quantity(first, "before"),
+        "s--",
+        ".",
+        color=FAINT,
+        ms=4 if few else 2,
+        lw=1,
+        label="before calibration",
+    )
     for index, (method, result) in enumerate(results.items()):
         color, size = COLORS.get(method, BLUE), 2 if many else 4
         # Upper lines are thinner, so that lines below them remain visible.
         width = 1.3 + 1.4 * (len(results) - 1 - index)
-        draw(result.links["after_db"], "-", ".", color=color, label=label(method), ms=size, lw=width)
+        draw(
+            in_measured_quantity(result, "after"),
+            "-",
+            ".",
+            color=color,
+            label=label(method),
+            ms=size,
+            lw=width,
+        )
     axes.set_xlim(0, len(links) + 1)
     axes.legend(frameon=False, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,12 +24,14 @@ class Survey:
         tx: Transmitters [L, 3], [m].
         rx: Receivers [L, 3], [m].
         group: Names of the groups [L]; None without groups.
+        sign: 1 if path loss was measured, -1 if power or gain was.
     """
 
     table: pd.DataFrame
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     group: NDArray[np.object_] | None
+    sign: int = 1
 
     @property
     def distance(self) -> NDArray[np.float64]:
@@ -37,13 +40,70 @@ class Survey:
 
     @property
     def residual_db(self) -> NDArray[np.float64]:
-        """Predicted minus measured path loss [L], [dB]; NaN without a prediction."""
-        return residual(self.table)
+        """Predicted minus measured, in the measured quantity [L], [dB]; NaN without a prediction."""
+        return self.sign * residual(self.table)
 
     @property
     def has_path(self) -> NDArray[np.bool_]:
         """Whether a path leads to a link [L]; otherwise the log-distance model predicts it."""
         return self.table["has_path"].to_numpy(bool)
+
+
+class Quantity(NamedTuple):
+    """The quantity that a study measured.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        sign: 1 if it rises with path loss, else -1.
+    """
+
+    name: str
+    unit: str
+    sign: int
+
+
+QUANTITIES: Final = {
+    "path_loss": Quantity("path loss", "dB", 1),
+    "path_gain": Quantity("path gain", "dB", -1),
+    "received_power": Quantity("received power", "dBm", -1),
+    "rsrp": Quantity("RSRP", "dBm", -1),
+}
+
+
+def measured_quantity(result: Record) -> Quantity:
+    """The quantity that the study measured; path loss if the links have no other values.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        The quantity.
+    """
+    quantity = result.study.links.quantity
+    return QUANTITIES[quantity if _column(result) in result.links else "path_loss"]
+
+
+def in_measured_quantity(result: Record, name: str) -> NDArray[np.float64]:
+    """Values of the links in the measured quantity.
+
+    Args:
+        result: The calibration.
+        name: Which values: "measured", "before", "after" or "predicted".
+
+    Returns:
+        The values [L], in the quantity's unit.
+    """
+    path_loss_db, column = result.links[f"{name}_db"].to_numpy(float), _column(result)
+    if column not in result.links:
+        return path_loss_db
+    reference = result.links[column].to_numpy(float) + result.links["measured_db"].to_numpy(float)
+    return reference - path_loss_db
+
+
+def _column(result: Record) -> str:
+    quantity = result.study.links.quantity
+    return f"measured_{quantity}_{'dbm' if quantity == 'received_power' else 'db'}"
 
 
 def residual(table: pd.DataFrame) -> NDArray[np.float64]:
@@ -68,15 +128,17 @@ def survey(result: Record) -> Survey | None:
     Returns:
         The links with positions; None if the measurements cannot be read or have changed.
     """
-    table = result.links
+    table, sign = result.links, measured_quantity(result).sign
     if set(POSITION_COLUMNS) <= set(table.columns):
         positions = table[list(POSITION_COLUMNS)].to_numpy(float)
         group = table["group"].astype(str).to_numpy(object) if "group" in table else None
-        return Survey(table, positions[:, :3], positions[:, 3:], group)
+        return Survey(table, positions[:, :3], positions[:, 3:], group, sign)
     try:
         links = result.study.measurements()
     except InputError:
         return None
     if links.row.tolist() != table["row"].tolist():
         return None
-    return Survey(table, links.tx, links.rx, None if links.group is None else links.group.astype(object))
+    return Survey(
+        table, links.tx, links.rx, None if links.group is None else links.group.astype(object), sign
+    )

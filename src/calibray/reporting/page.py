@@ -29,7 +29,7 @@ from calibray.reporting import result_tables as tables
 from calibray.reporting.diagnostics import diagnostics_table
 from calibray.reporting.figures import result_figures
 from calibray.reporting.link_map import RAMP, WIDTH, Plan, plan, ramp, ramp_limit
-from calibray.reporting.link_survey import Survey, residual, survey
+from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
 from calibray.result.held_out import Model
@@ -56,7 +56,7 @@ OUTLINED: Final = 400
 CAPTIONS: Final = {
     "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
     "cumulative-cost": "RT calls and time over the iterations of the method.",
-    "path-loss": "Path loss of every link: measured, before and after calibration. Held-out links are shaded.",
+    "path-loss": "Every link: measured, before and after calibration. Held-out links are shaded.",
     "residual-over-distance": "Residual (predicted minus measured) over the distance between the antennas.",
     "possible-values": "Posterior of every parameter over its bounds. Wide line: 95 % interval. Dashed: value before "
     "calibration. Solid: calibrated value.",
@@ -196,6 +196,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         name=result.study.path.stem,
         heading=tables.heading(result),
         date=date.today().isoformat(),
+        quantity=measured_quantity(result).name,
         css=Markup(_asset("report.css")),
         script=Markup(script),
         checksum=b64encode(sha256(script.encode()).digest()).decode(),
@@ -286,23 +287,25 @@ def _laws(result: Record) -> Table:
 
 def _worst(result: Record, links: Survey | None) -> Table:
     """The links with the largest residuals."""
-    grouped = links is not None and links.group is not None
+    grouped, unit = links is not None and links.group is not None, measured_quantity(result).unit
     columns = (
         numbers("Row"),
         *([Column("group")] if grouped else []),
-        numbers("measured", "dB"),
-        numbers("predicted", "dB"),
+        numbers("measured", unit),
+        numbers("predicted", unit),
         numbers("residual", "dB"),
         Column("held out"),
         Column("path"),
     )
-    residuals = residual(result.links)
+    quantity = measured_quantity(result)
+    residuals = quantity.sign * residual(result.links)
+    measured, predicted = (in_measured_quantity(result, name) for name in ("measured", "predicted"))
     order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]
     rows = []
     for link in order[np.isfinite(residuals[order])]:
         row = result.links.iloc[int(link)]
         group = [str(links.group[link])] if links is not None and links.group is not None else []
-        cells = (f"{row['measured_db']:.1f}", f"{row['predicted_db']:.1f}", f"{residuals[link]:+.1f}")
+        cells = (f"{measured[link]:.1f}", f"{predicted[link]:.1f}", f"{residuals[link]:+.1f}")
         marks = ("yes" if row[name] else "no" for name in ("held_out", "has_path"))
         rows.append((str(row["row"]), *group, *cells, *marks))
     return Table("", columns, tuple(rows))
@@ -365,13 +368,13 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
     names = [] if links.group is None else sorted(set(links.group.tolist()))
     index = {name: number for number, name in enumerate(names)}
     materials = [] if data.scene is None else list(data.scene.materials)
-    residuals = links.residual_db
+    residuals, quantity = links.residual_db, measured_quantity(result)
     return {
         "links": {
             "row": links.table["row"].tolist(),
             "group": [] if links.group is None else [index[name] for name in links.group],
             **{
-                name: _rounded(links.table[f"{name}_db"].to_numpy(float))
+                name: _rounded(in_measured_quantity(result, name))
                 for name in ("measured", "before", "predicted")
             },
             "held": links.table["held_out"].astype(int).tolist(),
@@ -379,6 +382,7 @@ def _script_data(result: Record, data: PageData, layout: Plan | None) -> dict[st
             "color": ramp(residuals, ramp_limit(residuals)),
         },
         "groups": names,
+        "quantity": quantity._asdict(),
         "materials": materials,
         "map": {"west": layout.west, "north": layout.north, "scale": layout.scale},
         "solid": packed(links, data.triangles, data.rays, materials),

@@ -19,7 +19,7 @@
   };
   // Adding 0 removes the sign of a negative zero.
   const fixed = (value) => (Math.round(10 * value) / 10 + 0).toFixed(1);
-  const decibel = (value) => (value === null ? "none" : `${fixed(value)} dB`);
+  const decibel = (value) => (value === null ? "none" : `${fixed(value)} ${data.quantity.unit}`);
   const signed = (value) => (value === null ? "none" : `${fixed(value) < 0 ? "−" : "+"}${fixed(Math.abs(value))} dB`);
   const links = data.links, count = links.row.length;
   const residual = links.predicted.map((predicted, i) => (predicted === null ? null : predicted - links.measured[i]));
@@ -89,7 +89,7 @@
   const describe = (i) => {
     const end = (which) => metres(which, i).map(fixed).join(", ");
     const facts = [
-      ["measured", decibel(links.measured[i])], ["before calibration", decibel(links.before[i])],
+      [`measured ${data.quantity.name}`, decibel(links.measured[i])], ["before calibration", decibel(links.before[i])],
       ["predicted", decibel(links.predicted[i])], ["predicted − measured", signed(residual[i])],
       ["held out", links.held[i] ? "yes" : "no"], ["basis", links.lost[i] ? "no path: log-distance model" : "prediction model"], ["transmitter [m]", end(tx)], ["receiver [m]", end(rx)],
     ];
