@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -22,10 +23,17 @@ def main() -> int:
     exceeded = 0
     with tempfile.TemporaryDirectory() as folder:
         plain = campaign(Path(folder) / "plain")
-        before = quantities(plain, Path(folder) / "before")
+        befores = {
+            blocks: quantities(
+                replace(plain, sections={} if blocks else {"holdout": None}), Path(folder) / str(blocks)
+            )
+            for blocks in (True, False)
+        }
         print(f"{'transformation':22}{'quantity':18}{'largest change':>15}{'tolerance':>11}")
         for number, (name, transform) in enumerate(TRANSFORMATIONS.items()):
-            after = quantities(transform(plain), Path(folder) / str(number))
+            changed = transform(plain)
+            before = befores["holdout" not in changed.sections]
+            after = quantities(changed, Path(folder) / str(number))
             for quantity, change in largest_changes(before, after).items():
                 wrong = change > TOLERANCES[quantity]
                 exceeded += wrong

@@ -76,7 +76,7 @@ class Campaign:
             "version": 1,
             "scene": {"file": "scene.xml", "frequency": 3.5e9},
             "links": {"file": "links.csv", "tx": list(TX), "rx": list(RX), "value": "path_loss_db"},
-            "trace": {"max_depth": 2, "samples": 200_000},
+            "trace": {"max_depth": 2, "samples": 200_000, "line_of_sight": False},
             "parameters": {
                 f"{name}.relative_permittivity": {"bounds": [1.5, 12.0]} for name in (self.walls, self.ground)
             },
@@ -97,7 +97,7 @@ class Campaign:
 
 
 def campaign(folder: Path) -> Campaign:
-    """Two masts between three houses; path loss of planted materials, offsets of the masts and errors of 1 dB."""
+    """Two masts between three houses; path loss of planted materials, offsets of the masts and errors of 0.5 dB."""
     random = np.random.default_rng(5)
     quads = {name: small_scenes.block(*corners) for name, corners in HOUSES.items()} | {"ground": GROUND}
     objects = {}
@@ -114,7 +114,7 @@ def campaign(folder: Path) -> Campaign:
     materials = {name: replace(paths.materials[name], **constants) for name, constants in TRUTH.items()}
     values = (
         path_loss(paths, materials)
-        + random.normal(0, 1, len(links))
+        + random.normal(0, 0.5, len(links))
         + links["mast"].map({"a": 3.0, "b": -5.0})
     )
     links["path_loss_db"] = np.where(np.arange(len(links)) % 3 < 2, values, np.nan)
@@ -184,14 +184,14 @@ TRANSFORMATIONS: Mapping[str, Callable[[Campaign], Campaign]] = {
 
 TOLERANCES = {
     "paths": 0.0,
-    "traced path loss": 0.001,
+    "traced path loss": 0.002,
     "parameter": 0.01,
     "RMSE": 0.001,
     "held-out error": 0.001,
     "prediction": 0.01,
     "interval": 0.05,
 }
-"""Largest allowed change: [1], [dB], [1], and [dB] for the rest. Single precision moves path loss by some 1e-4 dB."""
+"""Largest allowed change: [1], [dB], [1], and [dB] for the rest. The tracer's single precision leaves 0.001 dB."""
 
 
 def quantities(campaign: Campaign, folder: Path, calibrated: bool = True) -> dict[str, pd.Series]:
