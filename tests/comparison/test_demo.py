@@ -16,8 +16,17 @@ from calibray.comparison import demo as module
 from calibray.comparison.demo import FIGURES, MAPPING, METHODS, run_demo, trust, write_demo
 from calibray.fitting.problem import Problem
 from calibray.scenarios import demo_study_path
-from calibray.study import Study
+from calibray.study import Setup, Study
 from changed import changed
+
+space_mapping = module._space_mapping
+
+
+def mapping_with_few_rays(setup, *arguments):
+    """Space mapping whose ray tracer sends a tenth of the rays."""
+    content = setup.study.content()
+    content["trace"]["samples"] = 50_000
+    return space_mapping(Setup.open(Study.from_content(content, setup.study.path)), *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +34,7 @@ def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "MAPPING_CALLS", 1)  # each is a trace
+        patch.setattr(module, "_space_mapping", mapping_with_few_rays)
         finished = run_demo()
     return finished, out, write_demo(finished, out)
 
