@@ -27,7 +27,7 @@ from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.compare import compare
 from calibray.comparison.comparison import figure, table
-from calibray.comparison.problem import ComparisonProblem, study_problem
+from calibray.comparison.method_runs import ComparisonProblem, study_problem
 from calibray.scenarios import demo_study_path
 from calibray.support.figure_style import write
 from calibray.support.output_files import write_table, write_text

@@ -28,8 +28,13 @@ from numpy.typing import NDArray
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
-from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, code_fingerprint
-from calibray.comparison.problem import ComparisonProblem
+from calibray.comparison.method_runs import (
+    BudgetedMethod,
+    ComparisonProblem,
+    MethodRun,
+    RunFile,
+    code_fingerprint,
+)
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
 from calibray.tables import Column, Table, markdown, numbers
 from problem_families.family_comparison import seed_range

@@ -21,8 +21,14 @@ from numpy.typing import NDArray
 
 from calibray.comparison.compare import parse_methods
 from calibray.comparison.comparison import quantile
-from calibray.comparison.method_runs import LIMITS, BudgetedMethod, MethodRun, RunFile, code_fingerprint
-from calibray.comparison.problem import ComparisonProblem
+from calibray.comparison.method_runs import (
+    LIMITS,
+    BudgetedMethod,
+    ComparisonProblem,
+    MethodRun,
+    RunFile,
+    code_fingerprint,
+)
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, label
 from calibray.support.messages import did_you_mean

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.comparison.problem import ComparisonProblem
+from calibray.comparison.method_runs import ComparisonProblem
 from calibray.fitting.cheap_replay import ReplayedModel, with_constants
 from calibray.fitting.problem import Evaluation
 from problem_families import landscapes

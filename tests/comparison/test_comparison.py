@@ -16,8 +16,7 @@ from calibray.comparison import compare as module
 from calibray.comparison.compare import compare
 from calibray.comparison.comparison import FILES, FLOOR_DB, Comparison, figure
 from calibray.comparison.comparison import table as render_table
-from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer
-from calibray.comparison.problem import study_problem
+from calibray.comparison.method_runs import BudgetedMethod, MethodRun, RunFile, run_optimizer, study_problem
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, SGWOIM, RandomSearch
 from calibray.study import Study

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import planted
-from calibray.engines.observable import PATH_LOSS, Observable
+from calibray.engines.protocol import PATH_LOSS, Observable
 from calibray.errors import InputError
 from calibray.fields.channel import channel_statistics
 from calibray.fitting.methods import choose

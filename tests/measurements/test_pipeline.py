@@ -16,8 +16,8 @@ from calibray.measurements import (
     links_from_table,
     measured_links,
 )
+from calibray.measurements.placement import join_track
 from calibray.measurements.preparation import Track
-from calibray.measurements.tracks import join_track
 
 FRAME = Frame.local(11.5755, 48.1374, height=515.0)
 RX = np.array([[0.0, 0.0, 1.5], [120.0, -35.5, 2.0]])

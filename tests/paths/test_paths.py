@@ -30,8 +30,7 @@ from calibray.paths import (
     take,
     take_links,
 )
-from calibray.paths.checksum import BLOCK
-from calibray.paths.file_format import DATASETS
+from calibray.paths.file_format import BLOCK, DATASETS
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "path-file.md"
 FLOATS = [name for name, entry in DATASETS.items() if entry.kind == "f"]

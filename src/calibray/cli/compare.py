@@ -46,7 +46,7 @@ def compare(
     from calibray.comparison.compare import compare as run_comparison
     from calibray.comparison.compare import parse_methods
     from calibray.comparison.comparison import FILES, optimum_text, table, write
-    from calibray.comparison.problem import study_problem
+    from calibray.comparison.method_runs import study_problem
     from calibray.study import Study
     from calibray.support.output_files import check_outputs
     from calibray.tables.text import render

@@ -13,13 +13,13 @@ from calibray.comparison.comparison import Comparison
 from calibray.comparison.method_runs import (
     LIMITS,
     BudgetedMethod,
+    ComparisonProblem,
     MethodRun,
     RunFile,
     RunKey,
     code_fingerprint,
     run_optimizer,
 )
-from calibray.comparison.problem import ComparisonProblem
 from calibray.errors import InputError
 from calibray.optimizers import METHODS, Optimizer
 from calibray.support.messages import did_you_mean

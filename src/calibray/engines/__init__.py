@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from calibray.engines.ledger.recorded import Recorded as Recorded
     from calibray.engines.make_engine import fingerprint as fingerprint
     from calibray.engines.make_engine import make as make
-    from calibray.engines.observable import PATH_LOSS as PATH_LOSS
-    from calibray.engines.observable import Observable as Observable
+    from calibray.engines.protocol import PATH_LOSS as PATH_LOSS
     from calibray.engines.protocol import Answer as Answer
     from calibray.engines.protocol import Answering as Answering
     from calibray.engines.protocol import Chunked as Chunked
     from calibray.engines.protocol import Differentiable as Differentiable
     from calibray.engines.protocol import Engine as Engine
+    from calibray.engines.protocol import Observable as Observable
     from calibray.engines.protocol import check_candidates as check_candidates
     from calibray.engines.replay import Replay as Replay
     from calibray.engines.replay import ReplayCarriers as ReplayCarriers
@@ -57,9 +57,9 @@ _HOMES = {
     "LEDGER_FILE": "calibray.engines.ledger.ledger",
     "Ledger": "calibray.engines.ledger.ledger",
     "LedgerEntry": "calibray.engines.ledger.database",
-    "Observable": "calibray.engines.observable",
+    "Observable": "calibray.engines.protocol",
     "OpenedStudy": "calibray.engines.section",
-    "PATH_LOSS": "calibray.engines.observable",
+    "PATH_LOSS": "calibray.engines.protocol",
     "RadioSettings": "calibray.engines.section",
     "Recorded": "calibray.engines.ledger.recorded",
     "Replay": "calibray.engines.replay",

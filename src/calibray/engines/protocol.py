@@ -1,17 +1,18 @@
-"""The interfaces of engines, the answers of expensive ones, and the check of candidates."""
+"""The interfaces of engines, their answers, the check of candidates, and observables: what is measured and modelled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from threading import Event
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import EngineError, InputError
 from calibray.materials import Material
+from calibray.measurements import Measurements
 from calibray.parameters import Parameters
 from calibray.support.progress import Progress
 
@@ -172,3 +173,35 @@ def check_candidates(candidates: NDArray[np.float64], width: int) -> NDArray[np.
     if not np.isfinite(values).all():
         raise InputError("candidates: a value is not finite; give numbers within the bounds")
     return values
+
+
+@dataclass(frozen=True)
+class Observable:
+    """A quantity of a link that is both measured and modelled.
+
+    Attributes:
+        name: Its name in messages.
+        unit: Its unit.
+        measured: Its measured values [L] of given links.
+        modelled: An engine's values for candidates [n, d]: [n, L], +inf where a link has no path.
+        derivatives: The same with derivatives by the parameters, [n, L] and [n, L, d]; None if there are none.
+    """
+
+    name: str
+    unit: str
+    measured: Callable[[Measurements], NDArray[np.float64]]
+    modelled: Callable[[Engine, NDArray[np.float64]], NDArray[np.float64]]
+    derivatives: (
+        Callable[[Differentiable, NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+        | None
+    ) = None
+
+
+PATH_LOSS: Final = Observable(
+    "path loss",
+    "dB",
+    measured=lambda links: links.path_loss_db,
+    modelled=lambda engine, candidates: engine.path_loss(candidates),
+    derivatives=lambda engine, candidates: engine.path_loss_and_jacobian(candidates),
+)
+"""Path loss [dB], which the paper calibrates on."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import replay
-from calibray.engines.observable import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS
 from calibray.errors import EngineError, InputError
 from calibray.fitting.methods import AUTO
 from calibray.fitting.problem import Problem

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.observable import PATH_LOSS, Observable
-from calibray.engines.protocol import Chunked, Differentiable, Engine, Reduced
+from calibray.engines.protocol import PATH_LOSS, Chunked, Differentiable, Engine, Observable, Reduced
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective

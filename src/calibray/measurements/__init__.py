@@ -4,7 +4,7 @@
 """
 
 from calibray.measurements.links import FREQUENCIES, MIN_DISTANCE, Measurements
-from calibray.measurements.placement import RX_COLUMNS, TX_COLUMNS
+from calibray.measurements.placement import RX_COLUMNS, TRACK_COLUMNS, TX_COLUMNS
 from calibray.measurements.preparation import (
     Averaging,
     Ground,
@@ -23,7 +23,6 @@ from calibray.measurements.reading import (
 from calibray.measurements.selection import mask_codes, melt, select_rows
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.measurements.table_files import PiecedTable, read_table
-from calibray.measurements.tracks import TRACK_COLUMNS
 
 LINK_COLUMNS = (*TX_COLUMNS, *RX_COLUMNS)
 """The columns [m] of a table of links without measured values."""

@@ -1,15 +1,122 @@
-"""Place both ends of every row in the scene's frame, and receivers outside buildings."""
+"""Place both ends of every row in the scene's frame: by columns or a track, and receivers outside buildings."""
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
-from calibray.measurements.preparation import Preparation
+from calibray.measurements.preparation import Preparation, Track
 from calibray.measurements.source_table import Coordinates, SourceTable
+
+TRACK_COLUMNS: Final = ("track_longitude", "track_latitude")
+"""The columns of a row's position on a track [deg]."""
+
+MAX_FILE_SIZE: Final = 200_000_000
+"""Largest GPX file that is read [bytes]; a track of one point per second reaches it after three weeks."""
+
+
+def join_track(table: SourceTable, track: Track) -> SourceTable:
+    """Give rows the positions of a track, linear in time between its points; rows outside its times are left out.
+
+    Times are texts in ISO 8601 (UTC unless they name a time zone), or seconds since 1970. Altitudes are not used: those
+    of satellite receivers have errors of metres. The new columns are `TRACK_COLUMNS`.
+
+    Raises:
+        InputError: The track or a time cannot be read, or no row lies within the track's times.
+    """
+    points = _read_gpx(Path(track.file))
+    seconds = _row_times(table, track) - track.clock
+    times = _seconds(points["time"])
+    after = np.clip(np.searchsorted(times, seconds, side="left"), 0, len(times) - 1)
+    before = np.where(times[after] == seconds, after, np.maximum(after - 1, 0))
+    # Before and after the track, and at missing times (NaN), one of the comparisons is false.
+    covered = (
+        (times[before] <= seconds)
+        & (seconds <= times[after])
+        & (times[after] - times[before] <= track.longest_gap)
+    )
+    if not covered.any():
+        first, last = points["time"].iloc[0], points["time"].iloc[-1]
+        raise InputError(
+            f"{table.source} with {track.file}: none of {len(table)} times in column {track.time!r} lies on the track, "
+            f"{first} to {last}; check the time zone and the clock"
+        )
+    table = table.keep(covered, "rows at no time of the track, left out")
+    # Across 180 degrees, unwrapped longitudes continue beyond 180.
+    longitude = np.interp(seconds[covered], times, np.unwrap(points["longitude"], period=360.0))
+    latitude = np.interp(seconds[covered], times, points["latitude"])
+    return table.assign(**dict(zip(TRACK_COLUMNS, ((longitude + 180) % 360 - 180, latitude), strict=True)))
+
+
+def _row_times(table: SourceTable, track: Track) -> NDArray[np.float64]:
+    """Times of the rows [rows], [s] since 1970; NaN if missing."""
+    column = table.column(track.time)
+    try:
+        if pd.api.types.is_numeric_dtype(column):
+            return _seconds(pd.to_datetime(column, utc=True, unit="s"))
+        return _seconds(pd.to_datetime(column, utc=True, format="ISO8601"))
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"{table.source}, column {track.time!r}: a time cannot be read ({error}); give ISO 8601 or seconds"
+        ) from None
+
+
+def _seconds(times: pd.Series) -> NDArray[np.float64]:
+    """Seconds since 1970; NaN if missing."""
+    return np.asarray((times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1), dtype=np.float64)
+
+
+def _read_gpx(path: Path) -> pd.DataFrame:
+    """Time (UTC), longitude and latitude [deg] of all track points, in the order of time."""
+    try:
+        if path.stat().st_size > MAX_FILE_SIZE:
+            raise InputError(f"track {path}: larger than {MAX_FILE_SIZE / 1e6:.0f} MB; split it")
+        text = path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"track {path}: does not exist; check the path") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"track {path}: not UTF-8 text ({error.reason}); export it as GPX again") from None
+    # A GPX track needs no document type; entities could expand beyond memory.
+    if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"track {path}: declares a document type, which GPX does not use; export it again")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f"track {path}: not well-formed XML ({error}); export it again") from None
+    rows = [_point(path, element) for element in root.iter() if _tag(element) == "trkpt"]
+    points = pd.DataFrame(rows, columns=["time", "longitude", "latitude"]).dropna(subset=["time"])
+    if points.empty:
+        raise InputError(f"track {path}: no track point has a time; export the track, not a route")
+    try:
+        points["time"] = pd.to_datetime(points["time"], utc=True, format="ISO8601")
+        # Years before 1678 and after 2262 are read, but cannot be subtracted.
+        _seconds(points["time"])
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"track {path}: a time is not ISO 8601 or out of range ({error}); export it again"
+        ) from None
+    return points.sort_values("time", kind="stable").drop_duplicates("time").reset_index(drop=True)
+
+
+def _point(path: Path, element: ElementTree.Element) -> tuple[str | None, float, float]:
+    times = [(child.text or "").strip() for child in element if _tag(child) == "time"]
+    try:
+        longitude, latitude = float(element.get("lon", "")), float(element.get("lat", ""))
+    except ValueError as error:
+        raise InputError(f"track {path}: a point is malformed ({error}); export it again") from None
+    return (times[-1] or None) if times else None, longitude, latitude
+
+
+def _tag(element: ElementTree.Element) -> str:
+    """Name of an element without its XML namespace."""
+    return element.tag.rpartition("}")[2]
+
 
 TX_COLUMNS: Final = ("tx_x", "tx_y", "tx_z")
 """The columns of transmitter positions in the scene's frame [m]."""

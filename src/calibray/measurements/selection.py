@@ -11,9 +11,9 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.placement import join_track
 from calibray.measurements.preparation import Preparation
 from calibray.measurements.source_table import SourceTable
-from calibray.measurements.tracks import join_track
 from calibray.support.messages import did_you_mean, shortened
 
 NAMED: Final = 20

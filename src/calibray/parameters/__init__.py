@@ -1,8 +1,7 @@
 """Parameters: what a calibration may change, the search space they span, and the laws that some of them belong to."""
 
 from calibray.parameters.parameter import Parameter, Scale, itu_start, make_parameter, split_name
-from calibray.parameters.priors import NO_PRIOR, LogNormal
-from calibray.parameters.space import Parameters
+from calibray.parameters.space import NO_PRIOR, LogNormal, Parameters
 
 __all__ = [
     "NO_PRIOR",

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from calibray.support.lazy_imports import lazy_attributes
 
 if TYPE_CHECKING:
-    from calibray.paths.checksum import seal as seal
     from calibray.paths.file_format import FORMAT_VERSION as FORMAT_VERSION
+    from calibray.paths.file_format import seal as seal
     from calibray.paths.interactions import Diffraction as Diffraction
     from calibray.paths.interactions import Diffuse as Diffuse
     from calibray.paths.interactions import Kind as Kind
@@ -24,7 +24,7 @@ _HOMES = {
     "Paths": "calibray.paths.program",
     "concatenate": "calibray.paths.selection",
     "join_links": "calibray.paths.selection",
-    "seal": "calibray.paths.checksum",
+    "seal": "calibray.paths.file_format",
     "take": "calibray.paths.selection",
     "take_links": "calibray.paths.selection",
 }

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.observable import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS
 from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import BASINS, Trail, find_minima, relevant_minima

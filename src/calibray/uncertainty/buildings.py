@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.observable import PATH_LOSS
+from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
 from calibray.fitting.problem import Problem
 from calibray.materials import BOUNDS
