@@ -128,7 +128,7 @@ def test_an_error_that_follows_ctrl_c_is_printed(monkeypatch, tmp_path):
 
 
 def test_ctrl_c_prints_the_kept_calls_and_the_same_command_continues(monkeypatch, tmp_path):
-    method = {"name": "auto", "options": {"budget": 18}}
+    method = {"name": "random", "options": {"budget": 8}}
     content = programs.content(tmp_path, before="import time; time.sleep(0.3)")
     write_study(tmp_path, content | {"method": method})
     out = tmp_path / "out"
@@ -145,7 +145,7 @@ def test_ctrl_c_prints_the_kept_calls_and_the_same_command_continues(monkeypatch
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     again = CliRunner().invoke(app, words)
     assert again.exit_code == 0, again.stderr
-    # The first call is the uncalibrated scene, which the method's budget of 18 does not count.
+    # The first call is the uncalibrated scene, which the method's budget of 8 does not count.
     assert re.search(rf"answered by the ledger +{kept - 1}\n", again.stdout)
-    assert len(programs.calls(tmp_path)) == calls_before + 19 - kept
+    assert len(programs.calls(tmp_path)) == calls_before + 9 - kept
     assert "\x1b" not in again.stderr  # no terminal, no bars

@@ -98,7 +98,7 @@ def redirected(folder: Path, slow: list[str], *words: object) -> tuple[int, dict
 )  # fmt: skip
 def test_a_calibration_whose_steps_last(tmp_path, slow):
     """One silent call of an external program, the checks before it, the search, and the report after it."""
-    method = {"name": "auto", "options": {"budget": 18}}
+    method = {"name": "random", "options": {"budget": 6}}
     before = "" if slow else f"{SLOW}\nlast('program')"
     write_study(tmp_path, programs.content(tmp_path, before, timeout=DEADLINE) | {"method": method})
     status, durations, printed = redirected(tmp_path, slow, "run", "study.toml", "--out", "out")

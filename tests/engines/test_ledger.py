@@ -27,7 +27,7 @@ from calibray.study import Study
 
 CANDIDATES = np.array([[3.0, 4.0, 5.0], [2.0, 9.0, 1.5], [3.0, 4.0, 5.0]])
 PARAMETERS = Parameters(tuple(Parameter(name, 1.0, 12.0, 5.0) for name in planted.TRUTH))
-SGWOIM = "{ population = 6, iterations = 8, full_iterations = 3, elites = 2 }"
+SGWOIM = "{ population = 5, iterations = 6, full_iterations = 2, elites = 2 }"
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def runner():
 
 @pytest.mark.parametrize(
     ("method", "options", "workers"),
-    [("sgwo-im", SGWOIM, 0), ("random", "{ budget = 30 }", 3), ("auto", "{ budget = 20, batch = 3 }", 3)],
+    [("sgwo-im", SGWOIM, 0), ("random", "{ budget = 16 }", 3), ("auto", "{ budget = 14, batch = 3 }", 3)],
 )
 def test_a_run_that_is_killed_and_started_again_ends_as_an_undisturbed_one(
     runner, tmp_path, method, options, workers
