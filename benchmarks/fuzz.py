@@ -35,6 +35,8 @@ LIMIT = 30.0
 START = 600.0
 """Time that a worker may take to start [s]."""
 INSIDE = "CALIBRAY_FUZZ_PLACE"  # the temporary folder, set within the mount namespace
+PROGRAMS = ("study", "answer", "ledger", "line", "paths", "cache", "table", "bomb", "occupied")
+"""Kinds that may start programs: the study's, or Calibray itself to read a file within limits."""
 COST = re.compile(r"\b(GiB|MiB|GB|rays|minutes|hours|seconds|calls)\b")
 
 
@@ -66,7 +68,7 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
         # Told first, for who cannot be asked any more.
         print(json.dumps({"number": number, "kind": case.kind, "note": case.note}), file=answers, flush=True)
         started = time.monotonic()
-        watch.programs = case.kind in ("study", "answer", "ledger", "line", "paths", "cache")
+        watch.programs = case.kind in PROGRAMS
         verdict = judge(case, folder, watch)
         if peak() > MEMORY:
             verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")

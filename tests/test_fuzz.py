@@ -24,10 +24,19 @@ from calibray.support.output_files import check_file, check_folder
 from calibray.tracing import gain_table
 from calibray.validation.validate import validate
 from commands import run, write_wall_study
-from fuzzing import geometry, inputs, stored, workbooks, world
+from fuzzing import accidents, geometry, inputs, stored, workbooks, world
 from fuzzing.outcome import ALLOWED, Watch, judge
 
-LIGHT = (inputs.study, inputs.row_filter, inputs.table, workbooks.workbook, geometry.mesh, geometry.antenna)
+LIGHT = (
+    inputs.study,
+    inputs.row_filter,
+    inputs.table,
+    workbooks.workbook,
+    geometry.mesh,
+    geometry.antenna,
+    accidents.polyline,
+    accidents.terrain,
+)
 """Kinds that need nothing calibrated; cases that trace or run are the benchmark's."""
 SLOW = (HealthCheck.too_slow, HealthCheck.data_too_large)
 """Not failures: the machine is busy when the whole suite runs."""

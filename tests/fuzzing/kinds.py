@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from random import Random
 
-from fuzzing import geometry, inputs, making, maps, outside, stored, workbooks
+from fuzzing import accidents, geometry, inputs, making, maps, outside, stored, workbooks
 from fuzzing.outcome import Case
 from fuzzing.world import World
 
@@ -27,6 +27,13 @@ SHARES = {
     workbooks.workbook: 5,
     maps.coverage: 3,
     making.making: 4,
+    accidents.name: 4,
+    accidents.occupied: 4,
+    accidents.elsewhere: 2,
+    accidents.repeats: 2,
+    accidents.bomb: 2,
+    accidents.terrain: 4,
+    accidents.polyline: 2,
 }
 """Cases of each kind of a hundred or so."""
 

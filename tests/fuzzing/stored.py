@@ -16,6 +16,7 @@ import numpy as np
 from calibray.engines.ledger.database import LedgerEntry
 from calibray.fields import path_loss
 from calibray.paths import seal
+from calibray.paths.checksum import BLOCK
 from calibray.study import Study
 from fuzzing import world
 from fuzzing.mutations import NUMBERS, TEXTS, damage, edited, hostile
@@ -30,6 +31,18 @@ def paths(rng: Random, found: World, folder: Path) -> Case:
     if rng.random() < 0.4:
         file.write_bytes(damage(rng, file.read_bytes()))
         return Case("paths", "bytes", lambda: world.loss(file), True, names=("paths.h5",))
+    if rng.random() < 0.3:
+        raw = bytearray(file.read_bytes())
+        for _ in range(rng.choice((1, 1, 2, 8))):
+            raw[rng.randrange(BLOCK, len(raw))] ^= 1 << rng.randrange(8)
+        file.write_bytes(raw)
+        try:
+            seal(file)
+        except Exception:  # the HDF5 library itself is used to seal
+            return Case(
+                "paths", "bits, cannot be sealed", lambda: world.loss(file), True, names=("paths.h5",)
+            )
+        return Case("paths", "bits, sealed", lambda: world.loss(file), names=("paths.h5",), own=OWN)
     note, bad = _field(rng, file)
     return Case("paths", note, lambda: world.loss(file), bad, names=("paths.h5",), own=OWN)
 

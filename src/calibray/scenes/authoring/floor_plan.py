@@ -142,7 +142,8 @@ def _read_table(path: Path) -> tuple[pd.DataFrame, Lines]:
     lines = []
     for index, text in enumerate(frame["wkt"]):
         try:
-            lines.append(_parts(shapely.from_wkt(text)))
+            with np.errstate(invalid="ignore"):  # what is no number is refused below
+                lines.append(_parts(shapely.from_wkt(text)))
         except (shapely.GEOSException, TypeError) as error:
             raise InputError(
                 f"floor plan {path}, row {index + 2}: wkt = {shortened(repr(text))} is no geometry "
