@@ -16,7 +16,7 @@ import numpy as np
 from calibray.engines.ledger.database import LedgerEntry
 from calibray.fields import path_loss
 from calibray.paths import seal
-from calibray.paths.checksum import BLOCK
+from calibray.paths.file_format import BLOCK
 from calibray.study import Study
 from fuzzing import world
 from fuzzing.mutations import NUMBERS, TEXTS, damage, edited, hostile
