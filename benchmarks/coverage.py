@@ -29,10 +29,10 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -41,13 +41,16 @@ from scipy.stats import t as student
 
 import districts
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import search
+from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
 from calibray.tables import Column, Table, markdown, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible, credible_sets
-from calibray.uncertainty.importance_sampling import Draws
+from calibray.uncertainty.draws import Draws
+from calibray.uncertainty.joint_model import joint_model
+from calibray.uncertainty.noise_models import GAUSSIAN, Marginal, NoiseModel
+from calibray.uncertainty.sequential_monte_carlo import draw_posterior
 from districts import District
 
 NOISE_DB = 3.0
@@ -139,9 +142,6 @@ KNOWN: dict[str, Callable[[District, np.ndarray], np.ndarray]] = {
 DETERMINED: Final = 0.1
 """Width of the posterior with the noise known, of the range, below which a parameter is well determined."""
 
-FAR: Final = 30.0
-"""Draws whose density is lower by this, in its logarithm, count for nothing."""
-
 
 @cache
 def _district(name: str, folder: Path) -> District:
@@ -177,19 +177,19 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     problem = replace(problem, objective=objective)
     trail = search(problem, LeastSquares(lower, upper, starts=starts, seed=turn))
     told = certainty(problem, trail)
-    draws, means, found = told.posterior, told.means, []
-    if draws is None or means is None:
+    posterior, found = told.posterior, []
+    if posterior is None:
         raise RuntimeError(f"{name}, {world}, {turn}: no draws; {told.remarks}")
-    known_weight = _known(district, world, problem, draws) if known.all() and not draws.flattened else None
-    narrow = draws.weight * np.exp((UNDERSTATED - 1) * (draws.density - draws.density.max()))
+    means = posterior.means
+    reference = _known(district, world, problem, trail, turn) if known.all() else None
+    narrow = means.weight * np.exp((UNDERSTATED - 1) * (means.density - means.density.max()))
     for k, parameter in enumerate(problem.parameters.names):
-        value = draws.point[:, k]
         told_sets = credible_sets(means.point[:, k], means.weight, lower[k], upper[k], LEVELS)
         sets = dict(zip(map(str, LEVELS), told_sets, strict=True))
-        control = credible(value, narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
+        control = credible(means.point[:, k], narrow / narrow.sum(), lower[k], upper[k], LEVELS[0])
         luck = None
-        if known_weight is not None:
-            alike = credible(value, known_weight, lower[k], upper[k], LEVELS[0])
+        if reference is not None:
+            alike = credible(reference.point[:, k], reference.weight, lower[k], upper[k], LEVELS[0])
             luck = {"held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])}
         found.append({
             "name": parameter,
@@ -201,22 +201,42 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
         })  # fmt: skip
     return {
         "district": name, "world": world, "repetition": turn, "seed": seed, "parameters": found,
-        "noise": told.noise, "effective": draws.effective, "calls": told.calls,
+        "noise": told.noise, "agree": means.agree, "calls": told.calls,
         "seconds": time.process_time() - started,
     }  # fmt: skip
 
 
-def _known(district: District, world: str, problem: Problem, draws: Draws) -> np.ndarray | None:
-    """Weights of the draws where the noise is known as it was made [n]; None where it cannot be."""
+@dataclass(frozen=True)
+class KnownNoise:
+    """The density of the errors as a world makes them, in place of the noise models.
+
+    With `censored` links, the sampler asks for the densities themselves.
+    """
+
+    district: District
+    world: str
+    models: tuple[NoiseModel, ...] = (NoiseModel(GAUSSIAN, 1.0),)
+
+    censored: np.ndarray = field(default_factory=lambda: np.ones(1, dtype=bool))
+    column: np.ndarray = field(default_factory=lambda: np.ones(1))
+
+    def densities(self, gap: np.ndarray) -> np.ndarray:
+        """Log density of gaps [n, L]: [n, 1]."""
+        density = np.where(np.isfinite(gap).all(axis=1), KNOWN[self.world](self.district, gap), -np.inf)
+        return density[:, None]
+
+
+def _known(district: District, world: str, problem: Problem, trail: Trail, seed: int) -> Draws | None:
+    """Draws where noise and constants are known and buildings are alike; None where the world has no such density."""
     if world not in KNOWN:
         return None
-    near = np.flatnonzero(draws.density > draws.density.max() - FAR)
-    left = problem.objective.measured - problem.evaluate(draws.point[near]).modelled
-    found = np.full(len(draws.weight), -np.inf)
-    # Draws stand for a density: another one stands beside it by its ratio.
-    found[near] = np.log(draws.weight[near]) - draws.density[near] + KNOWN[world](district, left)
-    weight = np.exp(found - found.max())
-    return weight / weight.sum()
+    study = problem.setup.study
+    exact = study.noise.model_copy(update={"constants_spread": 0.0, "heterogeneity": 0.0})
+    setup = replace(problem.setup, study=study.model_copy(update={"noise": exact}))
+    best, freedom = problem.parameters.to_search(trail.best), max(problem.freedom, 1)
+    model = joint_model(replace(problem, setup=setup), best, float(trail.best_value**2), freedom)
+    known = KnownNoise(district, world, column=np.ones(problem.objective.num_counted))
+    return draw_posterior(replace(model, marginal=cast(Marginal, known)), seed).means
 
 
 def _width(pieces: tuple[tuple[float, float], ...]) -> float:

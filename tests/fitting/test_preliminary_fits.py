@@ -25,7 +25,7 @@ from calibray.measurements import (
 )
 from calibray.parameters import Parameter, Parameters
 from calibray.study import Setup
-from calibray.uncertainty.likelihood import PosteriorDensity
+from calibray.uncertainty.joint_model import joint_model
 
 STONE = Parameter("stone.relative_permittivity", 1.5, 12.0, 8.0)
 SLOPE, SPREAD_DB, LIMIT_DB = 5.0, 2.0, 115.0
@@ -153,7 +153,7 @@ def test_censored_links_inform_intervals_but_not_the_rmse(tmp_path):
     assert all(held)
     problem = Problem.of(Setup.open(planted.study(tmp_path, table, links=links)), planted.engine())
     best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
-    explaining = PosteriorDensity.of(problem, best, 0.3**2, 5)
+    explaining = joint_model(problem, best, 0.3**2, 5)
     assert explaining.marginal.censored.tolist() == missing.tolist()
     kinds = {model.kind for model in explaining.marginal.models}
     assert "correlated" not in kinds

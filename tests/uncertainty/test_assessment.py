@@ -14,7 +14,7 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import BASINS, search
+from calibray.fitting.search import search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.paths import take_links
@@ -23,9 +23,7 @@ from calibray.result.held_out import Model
 from calibray.result.wording import NOT_JUDGED, reason_text
 from calibray.study import Setup, Study
 from calibray.tables.text import render
-from calibray.uncertainty.assessment import POINTS_PER_START, certainty
-from calibray.uncertainty.importance_sampling import sample
-from calibray.uncertainty.likelihood import PosteriorDensity
+from calibray.uncertainty.assessment import certainty
 from calibray.validation import variants
 from calibray.validation.validate import validate_problem
 
@@ -73,23 +71,6 @@ def test_intervals_come_from_draws_and_have_reasons(result):
     text = render(*tables.tables(result))
     assert reason_text(result.intervals[MARBLE].reason) in text
     assert f"{result.cost.uncertainty_replays:,} in" in text
-
-
-def test_draws_start_from_as_many_minima_as_the_first_round_allows(tmp_path, noisy, monkeypatch):
-    """With parameters of little effect, each mode of the others has many minima; 24 starts could miss one of two."""
-    problem = Problem.of(Setup.open(planted.study(tmp_path, noisy)), planted.engine())
-    lower, upper = problem.parameters.search_bounds
-    trail = search(problem, LeastSquares(lower, upper, starts=64, seed=0))
-    many = np.random.default_rng(0).uniform(lower, upper, (150, len(lower)))
-    seen = {}
-
-    def spy(density, lower, upper, minima, covariance, *, batch, **rest):
-        seen.update(places=len(minima), batch=batch)
-        return sample(density, lower, upper, minima, covariance, batch=batch, **rest)
-
-    monkeypatch.setattr("calibray.uncertainty.assessment.sample", spy)
-    certainty(problem, replace(trail, minima=many))
-    assert seen["places"] == seen["batch"] // POINTS_PER_START > BASINS
 
 
 def test_draws_fit_the_links_about_as_well_as_the_optimum(result):
@@ -311,29 +292,3 @@ def test_a_well_determined_parameter_is_never_not_identifiable():
             elif noise_db == 60.0:
                 assert interval.verdict == "not identifiable"
     assert well >= 4
-
-
-def test_heterogeneous_models_are_skipped_at_points_of_low_density():
-    """The relevant densities are the same and cost fewer replays."""
-    study = Study.from_content(planted.content("links.csv"))
-    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
-    measured = planted.campaign(noise_db=0.02).path_loss_db.to_numpy()
-    problem = replace(problem, objective=replace(problem.objective, measured=measured))
-    lower, upper = problem.parameters.search_bounds
-    best = problem.parameters.to_search(np.array([planted.TRUTH[name] for name in problem.parameters.names]))
-    square = float(problem.squares(best[None]).value[0] ** 2)
-    whole = PosteriorDensity.of(problem, best, square, problem.freedom)
-    screened = replace(whole.without_negligible(whole(best[None])), marginal=whole.marginal)
-    near = best + 0.001 * (upper - lower) * np.random.default_rng(2).standard_normal((20, 3))
-    points = np.concatenate(
-        [np.random.default_rng(1).uniform(lower, upper, (300, 3)), near.clip(lower, upper)]
-    )
-    calls = problem.engine.calls
-    all_of_them = whole(points)
-    every, calls = problem.engine.calls - calls, problem.engine.calls
-    found = screened(points)
-    assert problem.engine.calls - calls < 0.8 * every
-    high = all_of_them.max(axis=1) > all_of_them.max() - 20.0
-    assert high.sum() >= 5
-    assert found[high] == pytest.approx(all_of_them[high], abs=1e-9)
-    assert (np.isneginf(found) | np.isclose(found, all_of_them)).all()

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 import planted
+from calibray import fields
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
+from calibray.parameters import Parameter
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
-from calibray.uncertainty import between_buildings, indirect_inference
 from calibray.uncertainty.assessment import certainty
-from calibray.uncertainty.buildings import split_by_building
+from calibray.uncertainty.buildings import split_replay
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])
@@ -61,83 +62,67 @@ def problem() -> Problem:
     return Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
 
 
-def test_equal_buildings_reproduce_the_material_and_factors_act_on_one_building(problem):
+def test_factors_act_on_one_building_and_further_constants_on_all(problem):
     """A factor on all buildings of a material acts like one on the material; the ground is no building."""
-    apart = split_by_building(problem)
-    assert apart is not None
-    means = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
-    alike = apart.draw_factors(np.zeros(2))
-    assert (alike == 1).all()
-    assert apart.path_loss(means, alike) == pytest.approx(problem.engine.path_loss(means), abs=1e-9)
-    factor = np.where(apart.parameter_of == 1, 1.1, 1.0)[None].repeat(2, axis=0)
-    found = problem.engine.path_loss(means * [1.0, 1.1, 1.0])
-    assert apart.path_loss(means, factor) == pytest.approx(found, abs=1e-9)
+    study = problem.parameters
+    thickness = Parameter("marble.thickness", 0.05, 1.0, 0.2, "log")
+    both = replace(study, items=(*study.items, thickness))
+    replay = split_replay(problem, both, by_building=True)
+    values = np.array([list(planted.TRUTH.values()), [5.0, 4.0, 3.0]])
+    traced = problem.engine.paths.materials["marble"].thickness
+    every = np.hstack([values, [[traced], [traced]]])
+    equal = np.ones((2, len(replay.parameter_of)))
+    assert replay.path_loss(every, equal) == pytest.approx(problem.engine.path_loss(values), abs=1e-9)
+    factor = np.where(replay.parameter_of == 1, 1.1, equal)
+    scaled = problem.engine.path_loss(values * [1.0, 1.1, 1.0])
+    assert replay.path_loss(every, factor) == pytest.approx(scaled, abs=1e-9)
     # Concrete is the ground here, which is one and does not differ from itself.
-    assert set(apart.building_of[apart.parameter_of == 0]) == {-1}
-    assert (apart.building_of[apart.parameter_of > 0] >= 0).all()
-    slope = apart.slopes(means)
-    _, whole = problem.engine.path_loss_and_jacobian(means)
-    for index in range(3):
-        together = slope[:, :, apart.parameter_of == index].sum(axis=2)
-        assert together == pytest.approx(whole[:, :, index] * means[:, None, index], abs=5e-3)
-        assert np.abs(together).max() > 1.0
-    drawn = np.log(apart.draw_factors(np.full(4000, 0.15)))
-    assert drawn.std(axis=0) == pytest.approx(np.where(apart.building_of >= 0, 0.15, 0.0), rel=0.05)
-    assert (
-        np.abs(np.corrcoef(drawn[:, apart.building_of >= 0].T) - np.eye((apart.building_of >= 0).sum())).max()
-        < 0.06
-    )
+    assert set(replay.building_of[replay.parameter_of == 0]) == {-1}
+    assert (replay.building_of[replay.parameter_of > 0] >= 0).all()
+    # The thickness of marble acts as in the materials of the paths.
+    paths = problem.engine.paths
+    materials = study.materials(values[0], paths.materials)
+    materials["marble"] = replace(materials["marble"], thickness=0.3)
+    thicker = fields.path_loss(paths, materials)
+    assert replay.path_loss(every * [1, 1, 1, 0.3 / traced], equal)[0] == pytest.approx(thicker, abs=1e-6)
+    assert np.abs(thicker - problem.engine.path_loss(values)[0]).max() > 0.1
+    alike = split_replay(problem, both, by_building=False)
+    assert set(alike.building_of) == {-1}
+    assert len(alike.parameter_of) == 4
 
 
-def test_intervals_cover_the_mean_over_buildings():
-    """Marble and wood are on one building each, which may differ from others; the ground does not differ."""
+def _assessed(problem, **noise):
+    """A planted campaign with 0.5 dB of noise, and what the study says of it."""
+    study = Study.from_content(planted.content("links.csv", noise=noise))
     measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
-
-    def told(spread: float):
-        study = Study.from_content(planted.content("links.csv", noise={"heterogeneity": spread}))
-        here = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
-        here = replace(here, objective=replace(here.objective, measured=measured))
-        return certainty(here, search(here, LeastSquares(*here.parameters.search_bounds, starts=16)))
-
-    alike = told(0.0)
-    assert alike.means is alike.posterior
-    apart = told(0.15)
-    found = {}
-    for name, draws in (("seen", apart.posterior), ("mean", apart.means)):
-        assert draws is not None
-        mean = draws.weight @ np.log(draws.point)
-        found[name] = np.sqrt(draws.weight @ (np.log(draws.point) - mean) ** 2)
-    marble = np.hypot(found["seen"][1], 0.15)
-    # In straight lines it would be this. Populations of 1,000 that move 40 times a step, whose weights count in full,
-    # find an eighth more; fewer moves and half the weight some 15 % more again. Without buildings it were a third less.
-    assert 1.0 < found["mean"][1] / marble < 1.4
-    assert found["seen"][1] < 0.75 * marble
-    # The ground is one; but what walls have of their own may be taken for it: a quarter more, by 1,000 draws.
-    assert 1.0 < found["mean"][0] / found["seen"][0] < 1.4
+    setup = Setup.open(study, links=links_from_frame(planted.links()))
+    here = Problem.of(setup, planted.engine())
+    here = replace(here, objective=replace(here.objective, measured=measured))
+    return certainty(here, search(here, LeastSquares(*here.parameters.search_bounds, starts=16)))
 
 
-def test_sampling_and_indirect_inference_agree_roughly(problem, monkeypatch):
-    measured = planted.campaign(noise_db=0.5).path_loss_db.to_numpy()
-    here = replace(problem, objective=replace(problem.objective, measured=measured))
-    trail = search(here, LeastSquares(*here.parameters.search_bounds, starts=16))
-    drawn = certainty(here, trail)
-    monkeypatch.setattr(between_buildings, "SWEPT_INTERACTIONS", 0)
-    seldom = certainty(here, trail)
-    monkeypatch.setattr(between_buildings, "MAX_INTERACTIONS", 0)
-    behind = certainty(here, trail)
-    assert seldom.means is not None
-    assert drawn.means is not None
-    assert behind.means is not None
-    assert drawn.posterior is not drawn.means
-    np.testing.assert_array_equal(drawn.posterior.point, behind.posterior.point)
-    count = len(drawn.means.weight)
-    assert count == between_buildings.POPULATION * between_buildings.KEPT_SWEEPS
-    assert len(seldom.means.weight) == between_buildings.POPULATION * between_buildings.SWEEPS[0]
-    assert len(behind.means.weight) <= indirect_inference.DRAWS[1]
-    assert len(np.unique(drawn.means.point, axis=0)) > 0.2 * count
-    # The last of every line of draws stands for how well it explains the links.
-    last = np.arange(count) >= count - between_buildings.POPULATION
-    np.testing.assert_array_equal(np.isfinite(drawn.means.density), last)
-    # Two ways to the same answer, roughly: marble is on one building, and told by the same links.
-    spread = [np.log(each.point[:, 1]).std() for each in (drawn.means, behind.means)]
-    assert 0.5 < spread[0] / spread[1] < 2.0
+def _deviation(draws):
+    """Standard deviation of the parameters' logarithms [d]."""
+    value = np.log(draws.point)
+    return np.sqrt(draws.weight @ (value - draws.weight @ value) ** 2)
+
+
+def test_intervals_cover_the_mean_over_buildings(problem):
+    """Marble is on one building, which may differ from others; the ground does not differ."""
+    equal = _assessed(problem, heterogeneity=0, constants_spread=0).posterior
+    differing = _assessed(problem, heterogeneity=0.15, constants_spread=0).posterior
+    np.testing.assert_array_equal(equal.means.point, equal.seen.point)
+    alone = np.hypot(_deviation(differing.seen)[1], 0.15)
+    # If path loss were linear in the constants it would be this.
+    assert 0.85 < _deviation(differing.means)[1] / alone < 1.4
+    assert _deviation(differing.seen)[1] < 0.75 * alone
+    assert _deviation(equal.means)[1] < 0.75 * alone
+
+
+def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
+    exact = _assessed(problem, heterogeneity=0, constants_spread=0)
+    uncertain = _assessed(problem, heterogeneity=0, constants_spread=0.3)
+    ratio = _deviation(uncertain.posterior.means) / _deviation(exact.posterior.means)
+    assert ratio.max() > 1.3
+    assert ratio.min() > 0.8
+    assert uncertain.posterior.joint.shape[1] > exact.posterior.joint.shape[1] == 3

@@ -107,7 +107,7 @@ def test_a_censored_link_without_a_path_agrees_with_the_model():
         [[1.0, -2.0, 0.5, 3.0, -np.inf], [1.0, -2.0, 0.5, 3.0, -500.0], [1.0, -2.0, 0.5, -np.inf, -3.0]]
     )
     censored = np.array([False, False, False, False, True])
-    models = noise_models(np.zeros((5, 3)), range_m=0.0, spread=0.0)
+    models = noise_models(np.zeros((5, 3)), range_m=0.0)
     marginal = Marginal.of(np.ones((5, 1)), np.zeros(1), np.ones(5), np.zeros((5, 3)), 2.0, models, censored)
     found = marginal.densities(gap)
     assert found[0] == pytest.approx(found[1], abs=1e-4)

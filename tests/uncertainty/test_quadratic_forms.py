@@ -15,11 +15,7 @@ LINKS, COUNT = 30, 120
 def _marginal(columns, censored=None):
     random = np.random.default_rng(1)
     position = random.uniform(0, 300, (LINKS, 3))
-    models = [
-        model
-        for model in noise_models(position, censored=censored is not None)
-        if model.kind != "heterogeneous"
-    ]
+    models = list(noise_models(position, censored=censored is not None))
     if censored is not None:
         models = [model for model in models if model.kind != "correlated"]
     return Marginal.of(

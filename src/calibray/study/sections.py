@@ -404,12 +404,15 @@ class NoiseSection(Section):
         kind: "gaussian", "student-t", or "auto" for intervals that cover both.
         range_m: Correlation distance of neighbouring links' errors [m], 0 for none, or "auto".
         heterogeneity: Between-building spread of a material's constants, 0 for none, or "auto".
+        constants_spread: Standard deviation of the logarithm of thickness, conductivity and scattering coefficient of
+            calibrated materials, where they are no parameters: how well the scene's values are known; 0 if exactly.
     """
 
     std_db: Annotated[float, Field(gt=0)] | None = None
     kind: Literal["auto", "gaussian", "student-t"] = "auto"
     range_m: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
     heterogeneity: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = "auto"
+    constants_spread: Annotated[float, Field(ge=0, le=2)] = 0.3
 
     @model_validator(mode="after")
     def _one_departure(self) -> Self:

@@ -13,42 +13,20 @@ from numpy.typing import NDArray
 from calibray.engines.protocol import PATH_LOSS
 from calibray.fitting.cheap_replay import ReplayedModel
 from calibray.fitting.problem import Problem
-from calibray.fitting.search import BASINS, Trail, find_minima, relevant_minima
+from calibray.fitting.search import Trail, find_minima, relevant_minima
 from calibray.parameters import Parameters
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
-from calibray.uncertainty.between_buildings import population_means
+from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.emulator import emulate
-from calibray.uncertainty.importance_sampling import ENOUGH, Draws, pooled, sample
-from calibray.uncertainty.likelihood import PosteriorDensity
-from calibray.uncertainty.linear_theory import covariances, local_intervals, with_reason
+from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
+from calibray.uncertainty.linear_theory import local_intervals, with_reason
+from calibray.uncertainty.noise_models import DIFFERING
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
-from calibray.uncertainty.verdicts import Axes, consistent, verdicts, widened
-
-COST: Final = 10
-"""Replays for draws, at most, per replay of the calibration; the latter compute derivatives and cost twice as much."""
-
-INTERACTIONS: Final = 100_000_000
-"""Interactions times replays that draws may take in any case: some seconds."""
-
-SIZES: Final = ((512, 20), (512, 8), (384, 6), (256, 5), (128, 4), (64, 3))
-"""Points per round and number of rounds; the first pair within the cost is used. Most posteriors take two to four
-rounds."""
-
-SHARED_SIZES: Final = ((128, 4), (64, 3))
-"""`SIZES` if several engines share the cost."""
-
-POINTS_PER_START: Final = 4
-"""Points of the first round per start, if that gives more starts than `BASINS`. With many parameters of little effect,
-each mode of the others is found at many minima."""
-
-MAX_ROUNDS: Final = 20
-"""Largest number of rounds if earlier rounds cost less than planned: points of low density need fewer replays."""
-
-MORE_ROUNDS: Final = 3
-"""Largest ratio of these rounds to the planned ones."""
+from calibray.uncertainty.sequential_monte_carlo import BUDGET, Posterior, draw_posterior, joined
+from calibray.uncertainty.verdicts import Axes, consistent, verdicts
 
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
@@ -56,8 +34,8 @@ EQUAL: Final = 0.1
 MINIMA: Final = 200
 """Largest number of least-squares minima evaluated as starts."""
 
-NOISE_DRAWS: Final = 250
-"""Draws at which noise models are compared."""
+MOST_PROBABLE: Final = 64
+"""Draws of highest density of which the most probable one is chosen."""
 
 KEPT_DRAWS: Final = 128
 """Draws kept with the result."""
@@ -65,8 +43,8 @@ KEPT_DRAWS: Final = 128
 FEW_LINKS: Final = 500
 """Links up to which linear algebra takes one thread."""
 
-MAX_LINKS: Final = 10_000
-"""Links beyond which no draws are made: the correlation models need all pairs of links."""
+MAX_LINKS: Final = 100_000
+"""Links beyond which no draws are made: the whitening of correlated errors would take minutes."""
 
 MAX_COLUMNS: Final = 100
 """Columns of the nuisance up to which the draws include its coefficients."""
@@ -82,8 +60,7 @@ class Certainty:
     Attributes:
         intervals: Interval and verdict by parameter.
         draws: Posterior draws of parameters and nuisance coefficients, by name.
-        posterior: All draws for the measured buildings, in the search space; None if none were made.
-        means: Draws of the means over all buildings; the posterior itself if buildings do not differ.
+        posterior: All draws; None if none were made.
         noise: Posterior weights of the kinds of noise, and of an undeclared offset.
         undeclared_offset_db: The best offset in addition to the study's model; None if the study declares one [dB].
         undeclared_offset_error_db: Its standard error [dB].
@@ -94,29 +71,13 @@ class Certainty:
 
     intervals: dict[str, Interval] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
-    posterior: Draws | None = None
-    means: Draws | None = None
+    posterior: Posterior | None = None
     noise: dict[str, float] = field(default_factory=dict)
     undeclared_offset_db: float | None = None
     undeclared_offset_error_db: float | None = None
     remarks: tuple[Remark, ...] = ()
     calls: int = 0
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Budget:
-    """Cost of the draws from one engine.
-
-    Attributes:
-        points: Points per round.
-        rounds: Planned rounds.
-        replays: Largest number of replays in total.
-    """
-
-    points: int
-    rounds: int
-    replays: int
 
 
 def certainty(
@@ -137,9 +98,10 @@ def certainty(
     # Matrices of few links are small; BLAS threads cost more than they save.
     with single_blas_thread(problem.objective.num_counted <= FEW_LINKS):
         if problem.differentiable:
-            calls = problem.engine.calls
-            assessment = _assess(problem, [problem], trail, trail.rt_calls, progress)
-            calls = problem.engine.calls - calls
+            before = problem.engine.calls
+            assessment = _assess(problem, [problem], trail, progress)
+            draws = 0 if assessment.posterior is None else assessment.posterior.replays
+            calls = max(problem.engine.calls - before, draws)
         else:
             assessment, calls = _assess_emulated(problem, trail, progress, model)
     return replace(assessment, calls=calls, seconds=time.perf_counter() - started)
@@ -157,8 +119,7 @@ def _assess_emulated(
         replace(problem, engine=engine, observable=PATH_LOSS) for engine in (ensemble.mean, *ensemble.drawn)
     )
     equal = ensemble.apart_db < EQUAL * trail.best_value
-    spent = trail.rt_calls if model is None else model.calls
-    assessment = _assess(mean, [mean] if equal else drawn, trail, spent, progress)
+    assessment = _assess(mean, [mean] if equal else drawn, trail, progress)
     remark = Remark(
         RemarkKind.APPROXIMATE_INTERVALS,
         {
@@ -189,7 +150,7 @@ def _full_ranges(parameters: Parameters, reason: Reason) -> dict[str, Interval]:
 
 
 def _assess(
-    problem: Problem, engines: Sequence[Problem], trail: Trail, spent: int, progress: Progress | None
+    problem: Problem, engines: Sequence[Problem], trail: Trail, progress: Progress | None
 ) -> Certainty:
     """Uncertainty of a problem; draws come from problems with equally likely engines."""
     optimum = problem.squares(problem.parameters.to_search(trail.best)[None], derivatives=True)
@@ -214,89 +175,71 @@ def _assess(
     if problem.objective.num_counted > MAX_LINKS:
         reason = Reason(ReasonKind.TOO_MANY_LINKS, {"limit": MAX_LINKS})
         return replace(assessment, intervals=with_reason(local, reason))
-    density = PosteriorDensity.of(problem, relevant[0], least, freedom)
-    budget = _budget(problem, spent, len(engines), density.replays)
-    if budget is None:
-        return replace(assessment, intervals=with_reason(local, Reason(ReasonKind.TOO_EXPENSIVE)))
-    tried = density.marginal.models
-    # A higher minimum of least squares may have the highest density under correlated or heavy-tailed errors.
-    points = np.concatenate([minima[np.argsort(squares)[:MINIMA]], offset.minima[:BASINS]])
-    at_minima = density(points)
-    order = np.argsort(-np.logaddexp.reduce(at_minima, axis=1), kind="stable")
-    starts = points[order[: max(BASINS, budget.points // POINTS_PER_START)]]
-    density = density.without_negligible(at_minima)
-    posterior = _draw(density, engines, starts, covariances(problem, starts, freedom), budget, progress)
-    at_draws = density(posterior.resampled(NOISE_DRAWS))
-    noise = density.noise_weights(np.exp(at_draws - np.logaddexp.reduce(at_draws, axis=1, keepdims=True)))
-    means = population_means(density, posterior, at_draws, tried)
-    intervals = _intervals(density, posterior, means, local)
-    log_odds = float(posterior.density.max() - np.logaddexp.reduce(at_minima[0]))
-    most_probable = problem.parameters.from_search(posterior.point[np.argmax(posterior.density)])
-    best, most_probable = problem.parameters.named(trail.best), problem.parameters.named(most_probable)
+    models = [joint_model(engine, relevant[0], least, freedom) for engine in engines]
+    model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
+    noise = _noise_weights(model, posterior, offset=not has_offset(problem))
+    intervals = _intervals(problem, posterior, local, model.marginal.noise_db)
+    best, most_probable = problem.parameters.named(trail.best), _most_probable(model, posterior)
+    at_both = model.at_scene_constants(np.stack([relevant[0], most_probable]))
+    log_odds = float(at_both[1] - at_both[0])
+    most_probable = problem.parameters.named(problem.parameters.from_search(most_probable))
     remarks = [*offset.remarks, *departures(noise)]
     if problem in engines:
-        remarks += missed(problem, posterior, trail)
+        remarks += missed(problem, posterior.means, trail)
     remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)
     intervals = {name: consistent(interval, best[name]) for name, interval in intervals.items()}
-    if posterior.flattened:
+    if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
     return replace(
         assessment,
         intervals=intervals,
-        draws=_named_draws(problem, posterior),
+        draws=_named_draws(problem, posterior.seen),
         posterior=posterior,
-        means=means,
         noise=noise,
         remarks=tuple(remarks),
     )
 
 
-def _draw(
-    density: PosteriorDensity,
-    engines: Sequence[Problem],
-    starts: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    budget: _Budget,
-    progress: Progress | None,
-) -> Draws:
-    """Draw from the posterior of every engine: starts [k, d] with covariances [k, d, d]."""
-    done = 0
+def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None) -> Posterior:
+    """Draw from the posterior of every model."""
+    parts = []
+    for number, model in enumerate(models):
 
-    def draw(engine: Problem) -> Draws:
-        of_engine, before, first = replace(density, problem=engine), engine.engine.calls, done
-
-        def more() -> bool:
-            within_rounds = done - first <= min(MAX_ROUNDS, MORE_ROUNDS * budget.rounds)
-            spent = engine.engine.calls - before
-            return within_rounds and spent + budget.points * density.replays <= budget.replays
-
-        def log_density(points: NDArray[np.float64]) -> NDArray[np.float64]:
-            nonlocal done
-            done += 1
+        def drawn(share: float, number: int = number) -> None:
             if progress is not None:
-                progress("drawing", done, max(done, (budget.rounds + 1) * len(engines)))
-            return np.logaddexp.reduce(of_engine(points), axis=1)
+                progress("drawing", round(100 * (number + share) / len(models)), 100)
 
-        return sample(
-            log_density,
-            *engine.parameters.search_bounds,
-            starts,
-            covariance,
-            batch=budget.points,
-            rounds=budget.rounds,
-            more=more,
-            enough=ENOUGH / len(engines),
-            seed=engine.setup.study.method.seed,
-        )
+        parts.append(draw_posterior(model, seed, drawn, BUDGET // len(models)))
+    return joined(parts)
 
-    return pooled([draw(engine) for engine in engines])
+
+def _noise_weights(model: JointModel, posterior: Posterior, *, offset: bool) -> dict[str, float]:
+    """Posterior weight of each kind of noise, of differing buildings, and of an undeclared offset."""
+    models, weight = model.marginal.models, posterior.means.weight
+    weights = {kind: 0.0 for kind in dict.fromkeys(each.kind for each in models)}
+    by_model = np.bincount(posterior.model, weight, len(models))
+    for each, share in zip(models, by_model.tolist(), strict=True):
+        weights[each.kind] += share
+    if len(model.parameter_of):
+        weights[DIFFERING] = float(weight[posterior.spread > 0].sum())
+    if offset:
+        with_offset = np.array([each.offset for each in models])
+        weights["offset"] = float(by_model[with_offset].sum())
+    return weights
+
+
+def _most_probable(model: JointModel, posterior: Posterior) -> NDArray[np.float64]:
+    """The most probable of the draws, with the constants of the scene, in the search space [d]."""
+    draws = posterior.means
+    top = draws.point[np.argsort(-draws.density)[:MOST_PROBABLE]]
+    return np.asarray(top[np.argmax(model.at_scene_constants(top))])
 
 
 def _intervals(
-    density: PosteriorDensity, posterior: Draws, means: Draws, local: dict[str, Interval]
+    problem: Problem, posterior: Posterior, local: dict[str, Interval], noise_db: float
 ) -> dict[str, Interval]:
-    """Interval and verdict by parameter, from draws for the measured buildings and of the means over all."""
-    parameters = density.problem.parameters
+    """Interval and verdict by parameter."""
+    parameters, counted = problem.parameters, problem.objective.weight > 0
     lower, upper = parameters.search_bounds
 
     def value_at(index: int, coordinate: float) -> float:
@@ -305,54 +248,28 @@ def _intervals(
         return float(parameters.from_search(point)[index])
 
     judged = verdicts(
-        means,
-        density.modelled,
+        posterior.means,
+        lambda points: problem.objective.capped(problem.modelled(points))[:, counted],
         Axes(parameters.names, lower, upper, value_at),
-        density.marginal.noise_db,
+        noise_db,
         level=CONFIDENCE,
-        seen=posterior,
+        seen=posterior.seen,
     )
     intervals = {}
     for index, (name, verdict) in enumerate(zip(parameters.names, judged, strict=True)):
         pieces = tuple((value_at(index, low), value_at(index, high)) for low, high in verdict.pieces)
-        interval = Interval(
+        intervals[name] = Interval(
             local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
         )
-        if posterior.flattened:
-
-            def to_unit(value: float, index: int = index) -> float:
-                point = parameters.lower.copy()
-                point[index] = value
-                return float(parameters.to_unit(point)[index])
-
-            interval = widened(interval, local[name], to_unit)
-        intervals[name] = interval
     return intervals
 
 
-def _budget(problem: Problem, spent: int, engines: int, replays: int) -> _Budget | None:
-    """The largest budget within the cost; None if the smallest is too expensive.
-
-    Args:
-        problem: The problem.
-        spent: Replays of the calibration.
-        engines: Number of engines that share the cost.
-        replays: Replays per point.
-    """
-    interactions = getattr(problem.engine, "interactions", 1)
-    allowed = max(COST * spent, INTERACTIONS // max(interactions, 1)) // engines
-    for points, rounds in SIZES if engines == 1 else SHARED_SIZES:
-        if points * (rounds + 2) * replays <= allowed:
-            return _Budget(points, rounds, allowed)
-    return None
-
-
-def _named_draws(problem: Problem, posterior: Draws) -> dict[str, list[float]]:
+def _named_draws(problem: Problem, draws: Draws) -> dict[str, list[float]]:
     """Draws of equal weight by name: parameters in the fields' units, and coefficients of the nuisance."""
     parameters, columns = problem.parameters, problem.objective.nuisance.columns
-    points = posterior.resampled(KEPT_DRAWS, problem.setup.study.method.seed)
-    draws = dict(zip(parameters.names, parameters.from_search(points).T.tolist(), strict=True))
+    points = draws.resampled(KEPT_DRAWS, problem.setup.study.method.seed)
+    by_name = dict(zip(parameters.names, parameters.from_search(points).T.tolist(), strict=True))
     if len(columns) <= MAX_COLUMNS:
         coefficients = problem.objective.coefficients(problem.modelled(points))
-        draws |= dict(zip(columns, coefficients.T.tolist(), strict=True))
-    return draws
+        by_name |= dict(zip(columns, coefficients.T.tolist(), strict=True))
+    return by_name

@@ -1,4 +1,4 @@
-"""Replay with separate constants for each building: path loss if the buildings of one material differ.
+"""Replay with constants that the study does not vary: those of single buildings, and those that the scene fixes.
 
 The building of every interaction follows from its position and the scene's meshes (`scenes/buildings.py`). Each pair of
 building and material becomes a material of its own.
@@ -20,37 +20,32 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
-MAX_INTERACTIONS: Final = 30_000
-"""Largest path program that is split by building: replays with separate constants are expensive."""
+BATCHES: Final = (1, 128)
+"""Fewest and most candidates per replay."""
 
-BATCH: Final = 96
-"""Candidates per replay: the population of the sampler in `between_buildings`."""
-
-DIFFERENCE: Final = 1e-5
-"""Relative step of a constant for difference quotients."""
+BATCH_INTERACTIONS: Final = 400_000
+"""Interactions per replay, which bounds the memory: larger programs take fewer candidates at once."""
 
 
 @dataclass(frozen=True, eq=False)
-class BuildingReplay:
-    """A replay with separate constants for each building.
+class SplitReplay:
+    """A replay whose candidates set more constants than the study's parameters.
 
     Attributes:
-        shared: The study's replay, with one constant for all buildings of a material.
-        engine: The split replay; its c parameters are the constants of one building each, or of the ground.
-        parameter_of: Index of the study's parameter that each constant belongs to [c].
+        engine: The replay; its c parameters are the constants of one building each, or of all objects.
+        parameter_of: Index of the parameter that each constant belongs to [c].
         building_of: Building of each constant, from 0; -1 for objects that are no building, as the ground [c].
     """
 
-    shared: Replay
     engine: Replay
     parameter_of: NDArray[np.int64]
     building_of: NDArray[np.int64]
 
-    def path_loss(self, means: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def path_loss(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of buildings that differ.
 
         Args:
-            means: Parameter values, in the fields' units [n, d].
+            values: Values of the parameters, in the fields' units [n, d].
             factors: Factor of every constant [n, c].
 
         Returns:
@@ -58,86 +53,60 @@ class BuildingReplay:
         """
         bounds = [BOUNDS[parameter.field] for parameter in self.engine.parameters]
         lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
-        return self.engine.path_loss(np.clip(means[:, self.parameter_of] * factors, lower, upper))
-
-    def slopes(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of path loss by each building's constants.
-
-        Difference quotients: compiling a reverse pass of the split replay would take longer.
-
-        Args:
-            candidates: Parameter values [n, d], in the fields' units, the same for all buildings.
-
-        Returns:
-            Derivatives by the logarithm of every constant [n, L, c], [dB].
-        """
-        count, width = len(candidates), len(self.parameter_of)
-        factors = np.concatenate([np.ones((1, width)), 1.0 + DIFFERENCE * np.eye(width)])
-        loss = self.path_loss(np.repeat(candidates, width + 1, axis=0), np.tile(factors, (count, 1)))
-        loss = loss.reshape(count, width + 1, -1)
-        with np.errstate(invalid="ignore"):  # inf - inf for a link without a path
-            slope = (loss[:, 1:] - loss[:, :1]) / np.log1p(DIFFERENCE)
-        return slope.transpose(0, 2, 1)
-
-    def draw_factors(self, spread: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
-        """Draw log-normal factors of the buildings' constants.
-
-        Args:
-            spread: Standard deviations of the logarithm of a factor [n].
-            seed: Seed of the random numbers.
-
-        Returns:
-            Factor of every constant, 1 for objects that are no building [n, c].
-        """
-        normal = np.random.default_rng(seed).standard_normal((len(spread), len(self.parameter_of)))
-        return np.exp(spread[:, None] * np.where(self.building_of >= 0, normal, 0.0))
+        return self.engine.path_loss(np.clip(values[:, self.parameter_of] * factors, lower, upper))
 
 
-def split_by_building(problem: Problem) -> BuildingReplay | None:
-    """Give each building of a problem's scene its own constants.
+def can_split(problem: Problem) -> bool:
+    """Whether a problem's engine replays one carrier from this process, so that further constants can vary."""
+    engine = problem.engine
+    return (
+        isinstance(engine, Replay)
+        and problem.observable is PATH_LOSS
+        and not engine.parameters.has_laws
+        and engine.paths.num_interactions > 0
+    )
+
+
+def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool) -> SplitReplay:
+    """Give a problem's replay further parameters, and each building of its scene its own constants.
 
     Args:
-        problem: The problem.
+        problem: A problem that `can_split`.
+        parameters: The parameters: the study's first.
+        by_building: Whether buildings have their own constants.
 
     Returns:
-        The split replay; None if the engine is no replay of one carrier, if the path program is too large, or if the
-        paths meet fewer than two buildings.
+        The replay. No constant belongs to a building if the paths meet fewer than two.
     """
-    engine, study = problem.engine, problem.setup.study
-    if not isinstance(engine, Replay) or problem.observable is not PATH_LOSS or engine.parameters.has_laws:
-        return None
-    paths, parameters = engine.paths, engine.parameters
-    if not 0 < paths.num_interactions <= MAX_INTERACTIONS:
-        return None
-    # One material per pair of building and material, numbered by the sorted pairs.
+    study, paths = problem.setup.study, problem.engine.paths  # type: ignore[attr-defined]
     names = list(paths.materials)
-    interaction_building = _interaction_buildings(paths, problem.setup.scene)
-    pairs, split_material = np.unique(
-        (interaction_building + 1) * len(names) + paths.material, return_inverse=True
-    )
-    building, original = (pairs // len(names) - 1).tolist(), [names[k] for k in pairs % len(names)]
-    split_names = [f"{name} of {number}" for name, number in zip(original, building, strict=True)]
+    building = np.full(paths.num_interactions, -1)
+    if by_building:
+        building = _interaction_buildings(paths, problem.setup.scene)
+        if len(np.unique(building[building >= 0])) < 2:
+            building[:] = -1
+    # One material per pair of building and material, numbered by the sorted pairs.
+    pairs, split_material = np.unique((building + 1) * len(names) + paths.material, return_inverse=True)
+    number, original = (pairs // len(names) - 1).tolist(), [names[k] for k in pairs % len(names)]
+    split_names = [f"{name} of {of}" for name, of in zip(original, number, strict=True)]
     items, parameter_of, building_of = [], [], []
     for index, parameter in enumerate(parameters):
-        for split_name, name, number in zip(split_names, original, building, strict=True):
+        for split_name, name, of in zip(split_names, original, number, strict=True):
             if name == parameter.material:
                 items.append(replace(parameter, name=f"{split_name}.{parameter.field}"))
                 parameter_of.append(index)
-                building_of.append(number)
-    if len({number for number in building_of if number >= 0}) < 2:
-        return None
-    materials = {
-        split_name: paths.materials[name] for split_name, name in zip(split_names, original, strict=True)
-    }
-    split = Replay(
+                building_of.append(of)
+    materials = {new: paths.materials[name] for new, name in zip(split_names, original, strict=True)}
+    batch = int(np.clip(BATCH_INTERACTIONS // paths.num_interactions, *BATCHES))
+    engine = Replay(
         replace(paths, material=split_material.reshape(-1), materials=materials),
         Parameters(tuple(items), parameters.frequency),
         study.objective.combining,
         study.scene.bandwidth,
         tabulate=False,
-        batch=BATCH,
+        batch=1 << (batch.bit_length() - 1),
     )
-    return BuildingReplay(engine, split, np.array(parameter_of), np.array(building_of))
+    return SplitReplay(engine, np.array(parameter_of), np.array(building_of))
 
 
 def _interaction_buildings(paths: Paths, scene: Scene) -> NDArray[np.int64]:

@@ -1,9 +1,8 @@
 """Noise models, and the marginal density of the measurements under each.
 
-Errors may be independent and Gaussian, correlated between neighbours, heavy-tailed, or larger for links that depend
-more on materials, because walls of one material differ between buildings. An offset may be undeclared. The right model
-is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model therefore gets a prior
-weight, and results are averages over all models (Bayesian model averaging).
+Errors may be independent and Gaussian, correlated between neighbours, or heavy-tailed, and an offset may be undeclared.
+The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
+therefore gets a prior weight, and results are averages over all models (Bayesian model averaging).
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
 with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with
@@ -13,27 +12,20 @@ whitened errors y and design Z, ridge R, A = Z'Z + R'R and S = y'y - y'Z A^-1 Z'
 
 where f is the number of links minus the number of columns with a flat prior. For heavy tails both integrals use
 Laplace's approximation (`heavy_tails.py`).
-
-Heterogeneity: if the constant of a material differs between buildings by a factor exp(tau z), the mean path loss of a
-link shifts, and path loss varies about it. We compute both from the corners theta_k exp(+-tau) of a two-level factorial
-design (R. L. Plackett and J. P. Burman, Biometrika 33, 1946). Mean and variance are right to second order in tau; the
-variance is added to that of the noise. Path loss oscillates with the constants because of reflections inside walls; the
-corners stay within the oscillation, whereas derivatives would extrapolate it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import hadamard
 from scipy.special import gammaln
 
 from calibray.uncertainty.censoring import log_evidence
-from calibray.uncertainty.heavy_tails import evidence, gross, products, regular, student
+from calibray.uncertainty.heavy_tails import evidence, gross, regular, student
 from calibray.uncertainty.whitening import Whitener, pairwise, whitener
 
 OFFSET_DB: Final = 6.0
@@ -48,11 +40,11 @@ SHARES: Final = (0.4, 0.7, 0.95)
 RANGES: Final = 4
 """Number of correlation ranges tried, from the distance of neighbours to a third of the campaign."""
 
+SAME_PLACE: Final = 0.01
+"""Range, relative to the distance of neighbours, of errors that only links of one position share."""
+
 FREEDOMS: Final = (2.0, 4.0)
 """Degrees of freedom of Student's t that are tried."""
-
-SPREADS: Final = (0.07, 0.15, 0.3)
-"""Between-building spreads that are tried."""
 
 DEPARTURE: Final = 2.0
 """Prior weight of each departure from independent Gaussian errors, relative to these: measured errors rarely are."""
@@ -61,36 +53,10 @@ NEGLIGIBLE: Final = 1e-3
 """Relative weight below which a model is dropped."""
 
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
-GAUSSIAN, CORRELATED, HEAVY, DIFFERING = "gaussian", "correlated", "student-t", "heterogeneous"
+GAUSSIAN, CORRELATED, HEAVY = "gaussian", "correlated", "student-t"
 
-
-def corners(parameters: int) -> NDArray[np.float64]:
-    """Corners of a two-level factorial design that separates the effects of all parameters.
-
-    Args:
-        parameters: Number of parameters d.
-
-    Returns:
-        Signs [k, d], with columns orthogonal to each other and to a constant.
-
-    Example:
-        >>> corners(2).tolist()
-        [[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]
-    """
-    count = 1 << parameters.bit_length()
-    return np.asarray(hadamard(count)[:, 1 : parameters + 1], dtype=np.float64)
-
-
-class BuildingEffect(NamedTuple):
-    """Effect of differing buildings on path loss, at one spread.
-
-    Attributes:
-        shift: Change of the mean, times the square roots of the weights [n, m], [dB].
-        variance: Variance about the mean, times the weights [n, m], [dB^2].
-    """
-
-    shift: NDArray[np.float64]
-    variance: NDArray[np.float64]
+DIFFERING: Final = "heterogeneous"
+"""Buildings that differ, which has a weight like the kinds of noise."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +64,13 @@ class NoiseModel:
     """One model of the errors.
 
     Attributes:
-        kind: "gaussian", "correlated", "student-t" or "heterogeneous".
+        kind: "gaussian", "correlated" or "student-t".
         weight: Its prior weight.
         offset: Whether it includes an undeclared offset.
         range_m: Correlation range, if "correlated" [m].
         share: Correlated share of the variance, if "correlated".
         freedom: Degrees of freedom, if "student-t".
         gross: Whether the errors are Gaussian with some gross errors instead of Student's t, if "student-t".
-        spread: Between-building spread, if "heterogeneous".
     """
 
     kind: str
@@ -115,7 +80,6 @@ class NoiseModel:
     share: float = 0.0
     freedom: float = np.inf
     gross: bool = False
-    spread: float = 0.0
 
 
 def noise_models(
@@ -123,7 +87,6 @@ def noise_models(
     *,
     kind: str | None = None,
     range_m: float | None = None,
-    spread: float | None = None,
     offset: bool = True,
     censored: bool = False,
 ) -> tuple[NoiseModel, ...]:
@@ -133,7 +96,6 @@ def noise_models(
         position: Positions of the links' ends [m, 3 or 6], [m].
         kind: "gaussian" or "student-t" if declared; both are tried if None.
         range_m: Correlation range, 0 for none [m]; several are tried if None.
-        spread: Between-building spread, 0 for none; several are tried if None.
         offset: Whether to try an undeclared offset.
         censored: Whether some links are censored; gross errors are then left out, because their probability of
             censoring is not implemented.
@@ -142,19 +104,16 @@ def noise_models(
         The models; their weights sum to one.
     """
     kinds = []
-    if kind != HEAVY and not range_m and not spread:
+    if kind != HEAVY and not range_m:
         kinds.append([NoiseModel(GAUSSIAN, 1.0)])
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
-    if kind != HEAVY and ranges and not spread:
+    if kind != HEAVY and ranges:
         kinds.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
-    if kind != GAUSSIAN and not range_m and not spread:
+    if kind != GAUSSIAN and not range_m:
         tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
         if kind != HEAVY and not censored:
             tails.append(NoiseModel(HEAVY, 1.0, gross=True))
         kinds.append(tails)
-    if kind != HEAVY and spread != 0 and not range_m:
-        tried = SPREADS if spread is None else (spread,)
-        kinds.append([NoiseModel(DIFFERING, 1.0, spread=s) for s in tried])
     offset_weights = {False: 1.0, True: DEPARTURE} if offset else {False: 1.0}
     kind_weights = [1.0 if models[0].kind == GAUSSIAN else DEPARTURE for models in kinds]
     return tuple(
@@ -170,16 +129,19 @@ def noise_models(
 
 
 def _ranges(position: NDArray[np.float64]) -> tuple[float, ...]:
-    """Correlation ranges to try; none if fewer than three links have a neighbour at another position."""
-    distance = pairwise(position)
-    np.fill_diagonal(distance, np.inf)
-    near = distance.min(axis=1)
-    near = near[near > 0]
-    distance[~np.isfinite(distance)] = 0.0
-    if len(near) < 3:
+    """Correlation ranges to try; none for fewer than three positions.
+
+    Where several links have one position, errors that only these share are tried as well.
+    """
+    places = np.unique(position, axis=0)
+    distance = pairwise(places)
+    if len(distance) < 3:
         return ()
-    low, high = float(np.median(near)), float(distance.max()) / 3
-    return tuple(np.geomspace(low, max(high, 2 * low), RANGES).tolist())
+    high = float(distance.max()) / 3
+    np.fill_diagonal(distance, np.inf)
+    low = float(np.median(distance.min(axis=1)))
+    repeated = (SAME_PLACE * low,) if len(places) < len(position) else ()
+    return (*repeated, *np.geomspace(low, max(high, 2 * low), RANGES).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +152,7 @@ class Marginal:
         design: Columns of the nuisance, times the square roots of the weights [m, q].
         ridge: Noise level over the standard deviations of the coefficients' priors [q]; 0 for a flat prior.
         column: The column of an undeclared offset, scaled likewise [m].
-        noise_db: Approximate noise level, which scales priors and the building effect [dB].
+        noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
         whiteners: Whitener of each correlated model, by range and share.
         censored: Mask of the censored links, whose gaps are lower limits [m]; no model is "correlated" then.
@@ -234,45 +196,28 @@ class Marginal:
         }
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
 
-    @property
-    def spread(self) -> float:
-        """Spread at which the building effect is computed: the middle one of the models; 0 without such models."""
-        spreads = sorted({model.spread for model in self.models if model.kind == DIFFERING})
-        return spreads[len(spreads) // 2] if spreads else 0.0
-
-    def densities(
-        self, gap: NDArray[np.float64], effect: BuildingEffect | None = None
-    ) -> NDArray[np.float64]:
+    def densities(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log density of the measurements plus the log weight, for each model.
 
         Args:
             gap: Measured minus modelled path loss, without the nuisance, times the square roots of the weights [n, m],
                 [dB].
-            effect: Effect of buildings that differ by `spread`; required if that is not 0.
 
         Returns:
             The log densities [n, models]; -inf if a gap is not finite.
-
-        Raises:
-            ValueError: A heterogeneous model lacks the building effect.
         """
         log_density = np.full((len(gap), len(self.models)), -np.inf)
         finite = np.asarray((np.isfinite(gap) | (self.censored & (gap < 0))).all(axis=1))
         if not finite.any():
             return log_density
         gap, white = gap[finite], {}
-        if effect is not None:
-            effect = BuildingEffect(effect.shift[finite], effect.variance[finite])
         for index, model in enumerate(self.models):
             design, ridge = self._with_offset(model.offset)
             if self.censored.any():
-                value = self._censored_density(gap, model, effect)
+                value = self._censored_density(gap, model)
             elif model.kind == HEAVY:
                 tail = gross() if model.gross else student(model.freedom)
                 value = evidence(gap, design, ridge / self.noise_db, tail)
-            elif model.kind == DIFFERING:
-                shift, weight = self._shift_and_weight(model, effect)
-                value = _weighted(gap - shift, design, ridge, weight)
             elif model.kind == CORRELATED:
                 key = (model.range_m, model.share)
                 filter_ = self.whiteners[key]
@@ -334,28 +279,10 @@ class Marginal:
         kept = np.flatnonzero(best - best.max() > np.log(NEGLIGIBLE))
         return replace(self, models=tuple(self.models[k] for k in kept))
 
-    def _censored_density(
-        self, gap: NDArray[np.float64], model: NoiseModel, effect: BuildingEffect | None
-    ) -> NDArray[np.float64]:
+    def _censored_density(self, gap: NDArray[np.float64], model: NoiseModel) -> NDArray[np.float64]:
         """Log density with censored links [n]."""
         design, ridge = self._with_offset(model.offset)
-        if model.kind != DIFFERING:
-            return log_evidence(gap, self.censored, design, ridge / self.noise_db, model.freedom)
-        shift, weight = self._shift_and_weight(model, effect)
-        finite = np.isfinite(shift) & np.isfinite(weight)  # False if a corner loses the only path of a link
-        gap, weight = gap - np.where(finite, shift, 0.0), np.where(finite, weight, 1.0)
-        return log_evidence(gap, self.censored, design, ridge / self.noise_db, weight=weight)
-
-    def _shift_and_weight(
-        self, model: NoiseModel, effect: BuildingEffect | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Shift of the mean and weights of the links for differing buildings [n, m]."""
-        if effect is None:
-            raise ValueError("a heterogeneous noise model needs the building effect")
-        # To second order, shift and variance are proportional to the square of the spread.
-        part = (model.spread / self.spread) ** 2
-        weight = 1.0 / (1.0 + part / self.noise_db**2 * effect.variance)
-        return part * effect.shift, weight
+        return log_evidence(gap, self.censored, design, ridge / self.noise_db, model.freedom)
 
     def _with_offset(self, offset: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Design and ridge, with an undeclared offset as the last column if asked for."""
@@ -381,23 +308,3 @@ def _plain(
         square = square - np.sum(np.linalg.solve(factor, design.T @ gap.T) ** 2, axis=0)
         log_root = float(np.log(np.diag(factor)).sum())
     return _constant(freedom, ridge) - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
-
-
-def _weighted(
-    gap: NDArray[np.float64],
-    design: NDArray[np.float64],
-    ridge: NDArray[np.float64],
-    weight: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Like `_plain`, with weights of the links that differ between points [n, m]."""
-    freedom = gap.shape[1] - int((ridge == 0).sum())
-    square, log_root = np.sum(weight * gap**2, axis=1), 0.0
-    if design.shape[1]:
-        matrix = regular(products(design, weight) + np.diag(ridge**2))
-        side = (weight * gap) @ design
-        square = square - np.einsum("nq,nq->n", side, np.linalg.solve(matrix, side[..., None])[..., 0])
-        log_root = 0.5 * np.linalg.slogdet(matrix)[1]
-    log_weight = 0.5 * np.log(weight).sum(axis=1)
-    return (
-        _constant(freedom, ridge) + log_weight - 0.5 * freedom * np.log(np.maximum(square, 1e-300)) - log_root
-    )

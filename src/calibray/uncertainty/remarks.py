@@ -16,8 +16,8 @@ from calibray.fitting.search import BASINS, Trail, least_squares, relevant_minim
 from calibray.result.remark import Remark, RemarkKind, Value
 from calibray.result.verdict import CONFIDENCE, Interval
 from calibray.result.wording import MOST_ODDS
-from calibray.uncertainty.importance_sampling import Draws
-from calibray.uncertainty.likelihood import has_offset
+from calibray.uncertainty.draws import Draws
+from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 
 LIKELY: Final = 0.5

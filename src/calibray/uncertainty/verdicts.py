@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibray.result.verdict import Interval, Reason, ReasonKind
 from calibray.result.verdict import Verdict as VerdictName
 from calibray.uncertainty.credible_sets import credible_sets
-from calibray.uncertainty.importance_sampling import Draws
+from calibray.uncertainty.draws import Draws
 
 JUDGED: Final = 0.9
 """Level of the credible sets behind the verdicts. The last few per cent of a 95 % interval can lie far out, under a
@@ -224,31 +224,6 @@ def _confounding(index: int, draws: Draws, names: Sequence[str], change: float, 
     if change > LARGE_EFFECT * noise_db:
         return Reason(ReasonKind.CONFOUNDED, {"change_db": change})
     return Reason(ReasonKind.NOISE, {"change_db": change, "noise_db": noise_db})
-
-
-def widened(drawn: Interval, local: Interval, to_unit: Callable[[float], float]) -> Interval:
-    """Combine an interval from too few draws with one by linear theory, to be wide rather than narrow.
-
-    Args:
-        drawn: The interval from draws of a flattened posterior.
-        local: The interval from the curvature at the optimum.
-        to_unit: Maps a value to its position between the bounds, 0 to 1.
-
-    Returns:
-        The hull of both intervals; the verdict follows from its width.
-
-    Example:
-        >>> few = Interval(0.1, 2.0, 3.0, VerdictName.IDENTIFIED, ((2.0, 3.0),))
-        >>> wide = widened(few, Interval(0.1, 4.0, 9.0, VerdictName.IDENTIFIED), lambda value: value / 10)
-        >>> wide.lower, wide.upper, str(wide.verdict)
-        (2.0, 9.0, 'not identifiable')
-    """
-    lower, upper = min(drawn.lower, local.lower), max(drawn.upper, local.upper)
-    share, verdict, reason = to_unit(upper) - to_unit(lower), drawn.verdict, drawn.reason
-    if verdict in (VerdictName.IDENTIFIED, VerdictName.WEAKLY_IDENTIFIED) and share > IDENTIFIED:
-        verdict = VerdictName.WEAKLY_IDENTIFIED if share <= WEAKLY else VerdictName.NOT_IDENTIFIABLE
-        reason = Reason(ReasonKind.TOO_FEW_DRAWS, {"share": float(share)})
-    return replace(drawn, lower=lower, upper=upper, pieces=((lower, upper),), verdict=verdict, reason=reason)
 
 
 def consistent(interval: Interval, value: float) -> Interval:

@@ -1,0 +1,171 @@
+"""Simulation-based calibration: do posteriors contain truths that were drawn from the prior?
+
+    python benchmarks/simulation_based.py --runs 100 --districts development
+    python benchmarks/simulation_based.py --runs 20 --reference 1000000 --districts development
+
+Each run draws all unknowns of the joint model from its prior in one district: permittivities, two thicknesses with the
+study's prior, and the constants that the scene fixes. Noise is Gaussian with a standard deviation of 3 dB. If sampler
+and model are right, a 90 % set contains its parameter in 90 % of the runs (S. Talts et al., arXiv 1804.06788).
+
+With `--reference`, the distribution function of every parameter is compared with that of so many draws from the prior,
+weighted by the likelihood: an independent computation of the same posterior.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import districts
+from calibray import engines
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import search
+from calibray.optimizers import LeastSquares
+from calibray.study import Study
+from calibray.tables import Column, Table, numbers
+from calibray.tables.text import render
+from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.joint_model import JointModel, joint_model
+from calibray.uncertainty.sequential_monte_carlo import BUDGET, draw_posterior
+
+NOISE_DB = 3.0
+LEVEL = 0.9
+BATCH = 4096
+
+
+def five_parameters(name: str, folder: Path) -> Problem:
+    """A district whose study also varies two thicknesses, with declared Gaussian noise."""
+    study = districts.make(name, folder).problem.setup.study
+    content = study.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    walls, windows = ("concrete", "glass") if name == districts.DEMO else ("walls", "windows")
+    setup = study.opened()
+    for material in (walls, windows):
+        thickness = setup.scene.materials[material].thickness
+        content["parameters"][f"{material}.thickness"] = {
+            "bounds": [thickness / 2.5, thickness * 2.5],
+            "scale": "log",
+            "prior": {"value": thickness, "spread": 0.3},
+        }
+    content["noise"] = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0}
+    opened = Study.from_content(content, study.path).opened()
+    return Problem.of(opened, engines.make(opened))
+
+
+def planted(problem: Problem, model: JointModel, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
+    """The problem with measurements of a truth from the prior, and the truth in the unit cube."""
+    truth = model.draw_prior(1, random)
+    gap = model.gaps(truth, np.zeros((1, len(model.parameter_of))))[0]
+    measured = problem.objective.measured.copy()
+    measured[problem.objective.weight > 0] -= gap - NOISE_DB * random.standard_normal(len(gap))
+    return replace(problem, objective=replace(problem.objective, measured=measured)), truth[0]
+
+
+def run(problem: Problem, number: int, seed: int, reference: int, budget: int) -> dict[str, Any]:
+    """One truth: whether the sets contain it, and the distance from the reference."""
+    random = np.random.default_rng([seed, number])
+    parameters, width = problem.parameters, len(problem.parameters)
+    start = parameters.to_search(parameters.start)
+    problem, truth = planted(problem, joint_model(problem, start, NOISE_DB**2, 10), random)
+    lower, upper = parameters.search_bounds
+    trail = search(problem, LeastSquares(lower, upper, starts=32, seed=number))
+    started = time.process_time()
+    best = parameters.to_search(trail.best)
+    freedom = problem.objective.num_counted - problem.unknowns
+    model = joint_model(problem, best, float(trail.best_value**2), freedom)
+    posterior = draw_posterior(model, number, budget=budget)
+    seconds = time.process_time() - started
+    draws = posterior.means
+    unit = (draws.point - lower) / (upper - lower)
+    inside = [
+        any(low <= truth[k] <= high for low, high in credible(unit[:, k], draws.weight, 0.0, 1.0, LEVEL))
+        for k in range(width)
+    ]
+    rank = [float(draws.weight[unit[:, k] <= truth[k]].sum()) for k in range(width)]
+    line: dict[str, Any] = {
+        "inside": inside, "rank": rank, "seconds": seconds, "agree": draws.agree, "names": parameters.names
+    }  # fmt: skip
+    if reference:
+        line |= _distances(model, unit, draws.weight, reference, random)
+    return line
+
+
+def _distances(
+    model: JointModel, unit: np.ndarray, weight: np.ndarray, count: int, random: np.random.Generator
+) -> dict[str, Any]:
+    """Largest distance between distribution functions of the draws and of weighted draws from the prior."""
+    points, logs = [], []
+    for _ in range(0, count, BATCH):
+        point = model.draw_prior(BATCH, random)
+        gap = model.gaps(point, np.zeros((BATCH, len(model.parameter_of))))
+        logs.append(np.logaddexp.reduce(model.marginal.densities(gap), axis=1))
+        points.append(point[:, : unit.shape[1]])
+    log, point = np.concatenate(logs), np.concatenate(points)
+    share = np.exp(log - log.max())
+    share /= share.sum()
+    distance = []
+    for k in range(unit.shape[1]):
+        order, mine = np.argsort(point[:, k]), np.argsort(unit[:, k])
+        at = np.linspace(0, 1, 2001)
+        one = np.interp(at, point[order, k], np.cumsum(share[order]), left=0.0, right=1.0)
+        other = np.append(0.0, np.cumsum(weight[mine]))[np.searchsorted(unit[mine, k], at, side="right")]
+        distance.append(float(np.abs(one - other).max()))
+    return {"distance": distance, "effective": float(1 / np.sum(share**2))}
+
+
+def main() -> None:
+    """Run and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--districts", default="development", help="names, or development or judging")
+    parser.add_argument("--reference", type=int, default=0, help="draws from the prior; 0 for no reference")
+    parser.add_argument("--budget", type=int, default=BUDGET, help="interactions per posterior")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
+    parser.add_argument("--out", type=Path, help="append one line of JSON per run")
+    given = parser.parse_args()
+    groups = {"development": districts.DEVELOPMENT, "judging": districts.JUDGING}
+    names = groups.get(given.districts, tuple(given.districts.split(",")))
+    problems = [five_parameters(name, given.folder) for name in names]
+    lines = []
+    for number in range(given.runs):
+        line = run(problems[number % len(problems)], number, given.seed, given.reference, given.budget)
+        lines.append(line)
+        if given.out is not None:
+            with given.out.open("a") as file:
+                file.write(json.dumps(line) + "\n")
+        print(f"{number + 1} of {given.runs}", end="\r", file=sys.stderr)
+    print(render(summary(lines)))
+
+
+def summary(lines: list[dict[str, Any]]) -> Table:
+    """Coverage and distance from the reference by parameter."""
+    names = [name.partition(".")[2] if "concrete" in name else name for name in lines[0]["names"]]
+    columns = (
+        Column("parameter"), numbers("runs"), numbers("in 90 % set"), numbers("mean rank"),
+        numbers("distance from reference, mean"), numbers("largest"),
+    )  # fmt: skip
+    rows = []
+    for k, name in enumerate(names):
+        mine = [line for line in lines if len(line["inside"]) > k]
+        distance = [line["distance"][k] for line in mine if line.get("effective", 0.0) > 300]
+        rows.append((
+            name, str(len(mine)), f"{np.mean([line['inside'][k] for line in mine]):.2f}",
+            f"{np.mean([line['rank'][k] for line in mine]):.2f}",
+            f"{np.mean(distance):.3f}" if distance else "-", f"{np.max(distance):.3f}" if distance else "-",
+        ))  # fmt: skip
+    seconds = np.mean([line["seconds"] for line in lines])
+    agree = np.mean([line["agree"] for line in lines])
+    title = f"{len(lines)} runs, {seconds:.1f} s of CPU each, populations agree in {agree:.0%}"
+    return Table(title, columns, tuple(rows))
+
+
+if __name__ == "__main__":
+    main()

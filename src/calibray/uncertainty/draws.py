@@ -1,0 +1,71 @@
+"""Weighted draws from a posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Weighted points.
+
+    Attributes:
+        point: The points [n, d].
+        density: Log posterior at the points, up to a constant [n].
+        weight: Their weights, with sum one [n].
+        agree: Whether independent populations of the sampler agree on them.
+    """
+
+    point: NDArray[np.float64]
+    density: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    agree: bool = True
+
+    @property
+    def effective(self) -> float:
+        """Number of independent draws that would be as informative."""
+        return float(1.0 / np.sum(self.weight**2))
+
+    def resampled(self, count: int, seed: int = 0) -> NDArray[np.float64]:
+        """Points of equal weight.
+
+        Args:
+            count: Their number.
+            seed: Seed of the random numbers.
+
+        Returns:
+            Points drawn by their weights, in the order of the draws [count, d].
+        """
+        return self.point[systematic_resampling(self.weight, count, np.random.default_rng(seed))]
+
+
+def pooled(draws: Sequence[Draws]) -> Draws:
+    """Draws from the mean of several posteriors, with equal weight of each."""
+    return Draws(
+        np.concatenate([each.point for each in draws]),
+        np.concatenate([each.density for each in draws]),
+        np.concatenate([each.weight for each in draws]) / len(draws),
+        all(each.agree for each in draws),
+    )
+
+
+def systematic_resampling(
+    weight: NDArray[np.float64], count: int, random: np.random.Generator
+) -> NDArray[np.intp]:
+    """Draw indices by weight with evenly spaced quantiles and a common random shift.
+
+    Args:
+        weight: Weights, with sum one [n].
+        count: Number of indices.
+        random: Random numbers.
+
+    Returns:
+        Indices, ascending [count].
+    """
+    total = np.cumsum(weight)
+    quantile = (np.arange(count) + random.random()) / count * total[-1]
+    return np.minimum(np.searchsorted(total, quantile), len(weight) - 1)

@@ -1,0 +1,281 @@
+"""The joint model of everything that is unknown: parameters, fixed constants, buildings and errors.
+
+- The study's parameters have flat priors over their bounds, or the priors that the study declares.
+- Constants of the same materials that the scene fixes, such as thickness, have a log-normal prior around the scene's
+  value, since nobody knows them exactly.
+- The walls of building b have the constants x exp(s z_b): x is the material's mean, z_b is standard normal. The
+  between-building spread s is zero with probability `ALIKE`, otherwise exponential.
+- Errors follow one of several noise models (`noise_models.py`), whose level, nuisances and undeclared offset are
+  integrated out.
+
+`sequential_monte_carlo.py` draws from the posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.fitting.nuisance import CONSTANT
+from calibray.fitting.problem import Problem
+from calibray.materials import BOUNDS
+from calibray.parameters import LogNormal, Parameter, Parameters
+from calibray.uncertainty.buildings import can_split, split_replay
+from calibray.uncertainty.noise_models import Marginal, noise_models
+from calibray.uncertainty.quadratic_forms import QuadraticForms
+
+FEWEST: Final = 8
+"""Links below which only independent Gaussian noise is tried; fewer cannot distinguish other noise models."""
+
+FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
+"""Constants that are taken from the scene where they are no parameters."""
+
+FIXED_RANGE: Final = 4.0
+"""Range of such a constant, in standard deviations to either side."""
+
+NO_EFFECT: Final = 0.02
+"""Change of path loss by one standard deviation of a fixed constant, relative to the noise, below which it stays
+fixed: its variance then is below 0.04 % of that of the noise."""
+
+ALIKE: Final = 0.5
+"""Prior probability that buildings do not differ."""
+
+MEAN_SPREAD: Final = 0.15
+"""Mean of the exponential prior of the between-building spread if buildings differ."""
+
+SPREAD_BOUNDS: Final = (0.004, 0.8)
+"""Range of the spread of buildings that differ."""
+
+GRID: Final = 2001
+"""Points over the range of a parameter at which its prior is tabulated."""
+
+
+Gaps = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""Maps points of the unit cube [n, d + k] and logarithms of the factors of buildings' constants [n, c] to measured
+minus modelled path loss, without the nuisance, times the square roots of the links' weights [n, m], [dB]."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointModel:
+    """The joint model. Points are in the unit cube of its parameters.
+
+    Attributes:
+        study: The study's d parameters.
+        parameters: These, then k constants that the scene fixes.
+        priors: Log-normal priors, on top of flat ones over the unit cube.
+        gaps: Computes measured minus modelled path loss.
+        marginal: The density of the gaps under every noise model.
+        parameter_of: Index of the parameter that each of the c constants of single buildings belongs to [c].
+        building_of: Building of each of these constants, from 0 [c].
+        only_buildings: Indices of the parameters whose constants all belong to buildings, so that these determine the
+            mean.
+        spread: The between-building spread if the study declares it; else None.
+        interactions: Interactions that one evaluation takes.
+    """
+
+    study: Parameters
+    parameters: Parameters
+    priors: LogNormal
+    gaps: Gaps
+    marginal: Marginal
+    parameter_of: NDArray[np.int64]
+    building_of: NDArray[np.int64]
+    only_buildings: NDArray[np.int64]
+    spread: float | None = None
+    interactions: int = 1
+
+    @cached_property
+    def forms(self) -> QuadraticForms:
+        """The density of gaps that have one noise model each."""
+        return QuadraticForms.of(self.marginal)
+
+    def at_scene_constants(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log posterior with equal buildings and the scene's constants, averaged over the noise models.
+
+        Args:
+            points: Points of the study's search space [n, d].
+
+        Returns:
+            Its values up to a constant [n].
+        """
+        constants = [item.start for item in self.parameters.items[len(self.study) :]]
+        values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
+        unit = self.parameters.to_unit(values)
+        gaps = self.gaps(unit, np.zeros((len(points), len(self.parameter_of))))
+        return np.logaddexp.reduce(self.marginal.densities(gaps), axis=1) + self.log_prior(unit)
+
+    def log_prior(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Logarithm of the prior density over the unit cube [n, d + k], up to a constant [n]."""
+        if not len(self.priors):
+            return np.zeros(len(points))
+        return -0.5 * np.sum(self.priors.residuals(self.parameters.from_unit(points)) ** 2, axis=1)
+
+    def draw_prior(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Draw points from the prior [count, d + k]."""
+        grid = np.linspace(0.0, 1.0, GRID)
+        line = np.tile(grid[:, None], (1, len(self.parameters)))
+        density = np.ones_like(line)
+        if len(self.priors):
+            residual = self.priors.residuals(self.parameters.from_unit(line))
+            density[:, list(self.priors.index)] = np.exp(-0.5 * residual**2)
+        cumulative = np.cumsum(0.5 * (density[1:] + density[:-1]), axis=0)
+        points = np.empty((count, len(self.parameters)))
+        for index in range(len(self.parameters)):
+            total = np.append(0.0, cumulative[:, index])
+            points[:, index] = np.interp(random.random(count) * total[-1], total, grid)
+        return points
+
+    def draw_spread(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Draw between-building spreads from their prior, 0 where buildings are equal [count]."""
+        if self.spread is not None or not len(self.parameter_of):
+            return np.full(count, self.spread or 0.0)
+        differing = np.clip(random.exponential(MEAN_SPREAD, count), *SPREAD_BOUNDS)
+        return np.where(random.random(count) < ALIKE, 0.0, differing)
+
+
+def joint_model(problem: Problem, best: NDArray[np.float64], square: float, freedom: int) -> JointModel:
+    """Set up what a study leaves open.
+
+    Args:
+        problem: The problem.
+        best: The optimum, a point of the search space [d].
+        square: Mean square of the residuals at the optimum [dB^2].
+        freedom: Number of links minus unknowns.
+
+    Returns:
+        The model.
+    """
+    objective, links, section = problem.objective, problem.setup.links, problem.setup.study.noise
+    weight, censored = _weights_and_censoring(problem)
+    counted = np.flatnonzero(weight > 0)
+    weight, censored = weight[counted], censored[counted]
+    scale = np.sqrt(weight * len(weight) / weight.sum())
+    noise_db = float(np.sqrt(square * (freedom + len(problem.parameters)) / freedom))
+    nuisance, position = objective.nuisance, np.hstack([links.rx, links.tx])[counted]
+    coefficients = objective.coefficients(problem.modelled(best[None]))[0]
+    at_bound = (coefficients <= nuisance.lower) | (coefficients >= nuisance.upper)
+    design = nuisance.design[counted].toarray() if nuisance.terms else np.zeros((len(counted), 0))
+    used = objective.determined & ~at_bound
+    few = len(counted) < FEWEST
+    # With correlated errors, the probability of censoring is an integral over all censored links.
+    uncorrelated = few or censored.any()
+    models = noise_models(
+        position,
+        kind="gaussian" if few else None if section.kind == "auto" else section.kind,
+        range_m=0.0 if uncorrelated else None if section.range_m == "auto" else float(section.range_m),
+        offset=not has_offset(problem),
+        censored=bool(censored.any()),
+    )
+    ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
+    measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]
+
+    def gap(loss: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (measured - objective.capped(loss)[:, counted]) * scale
+
+    def of_study(points: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
+        candidates = problem.parameters.from_unit(points)
+        return gap(problem.observable.modelled(problem.engine, candidates))
+
+    none = np.zeros(0, dtype=np.int64)
+    spread = 0.0 if few else None if section.heterogeneity == "auto" else float(section.heterogeneity)
+    model = JointModel(
+        problem.parameters,
+        problem.parameters,
+        problem.priors,
+        of_study,
+        Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored),
+        none,
+        none,
+        none,
+        spread,
+        max(int(getattr(problem.engine, "interactions", 1)), 1),
+    )
+    return _with_constants(model, problem, best, gap) if can_split(problem) else model
+
+
+def _with_constants(
+    model: JointModel,
+    problem: Problem,
+    best: NDArray[np.float64],
+    gap: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> JointModel:
+    """The model with the constants that the scene fixes and have an effect, and with buildings."""
+    study, known_to = model.study, problem.setup.study.noise.constants_spread
+    fixed = _fixed_constants(problem, known_to) if known_to > 0 else []
+    if fixed:
+        every = split_replay(problem, replace(study, items=(*study.items, *fixed)), by_building=False)
+        values = np.append(study.from_search(best), [item.start for item in fixed])
+        steps = np.exp(known_to * np.eye(len(values))[len(study) :])
+        gaps = gap(
+            every.path_loss(np.vstack([values, values * steps]), np.ones((1, len(every.parameter_of))))
+        )
+        with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
+            change = gaps[1:] - gaps[:1]
+        effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
+        kept = effect_db > NO_EFFECT * model.marginal.noise_db
+        fixed = [item for item, has_effect in zip(fixed, kept, strict=True) if has_effect]
+    parameters = replace(study, items=(*study.items, *fixed))
+    replay = split_replay(problem, parameters, by_building=model.spread != 0)
+    of_building = np.flatnonzero((replay.building_of >= 0) & (replay.parameter_of < len(study)))
+    parameter_of = replay.parameter_of[of_building]
+    constants = np.bincount(replay.parameter_of, minlength=len(parameters))
+    of_buildings = np.bincount(parameter_of, minlength=len(parameters))
+
+    def gaps_of(points: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
+        factors = np.ones((len(points), len(replay.parameter_of)))
+        factors[:, of_building] = np.exp(logarithms)
+        return gap(replay.path_loss(parameters.from_unit(points), factors))
+
+    return replace(
+        model,
+        parameters=parameters,
+        priors=LogNormal(
+            (*model.priors.index, *range(len(study), len(parameters))),
+            (*model.priors.centre, *(item.start for item in fixed)),
+            (*model.priors.spread, *(known_to for _ in fixed)),
+        ),
+        gaps=gaps_of,
+        parameter_of=parameter_of,
+        building_of=np.unique(replay.building_of[of_building], return_inverse=True)[1],
+        only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
+    )
+
+
+def has_offset(problem: Problem) -> bool:
+    """Whether the study declares an offset, or a constant term without a prior."""
+    constant = any(
+        term.by == CONSTANT and not np.isfinite(term.prior) for term in problem.objective.nuisance.terms
+    )
+    return problem.setup.study.offset is not None or constant
+
+
+def _fixed_constants(problem: Problem, spread: float) -> list[Parameter]:
+    """Constants that the scene fixes, of the materials that have a parameter; `spread` of their logarithms."""
+    names, materials = problem.parameters.names, problem.engine.materials
+    factor, items = float(np.exp(FIXED_RANGE * spread)), []
+    for material in dict.fromkeys(parameter.material for parameter in problem.parameters):
+        for field in FIXED_FIELDS:
+            value, name = float(getattr(materials[material], field)), f"{material}.{field}"
+            lower, upper = value / factor, min(value * factor, BOUNDS[field].upper)
+            if name not in names and value > 0.0 and lower in BOUNDS[field] and upper in BOUNDS[field]:
+                items.append(Parameter(name, lower, upper, value, "log"))
+    return items
+
+
+def _weights_and_censoring(problem: Problem) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Weights of the links in the likelihood [L], and mask of the censored ones [L].
+
+    With censored links in the likelihood, links measured near the noise floor are used as well: both together are no
+    selection by measured values.
+    """
+    objective, links = problem.objective, problem.setup.links
+    if links.censored is None or problem.faint is None:
+        return objective.weight, np.zeros(len(links), dtype=bool)
+    # A censored link without a path agrees with the model whatever the parameters.
+    informative = problem.faint & ~problem.setup.held_out & np.isfinite(problem.before)
+    return np.where(informative, links.weight, objective.weight), links.censored

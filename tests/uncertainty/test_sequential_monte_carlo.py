@@ -1,0 +1,243 @@
+"""Draws of means, buildings, spread and noise models against closed forms."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
+from calibray.uncertainty import sequential_monte_carlo as module
+from calibray.uncertainty.joint_model import ALIKE, MEAN_SPREAD, SPREAD_BOUNDS, JointModel
+from calibray.uncertainty.noise_models import Marginal, NoiseModel
+from calibray.uncertainty.sequential_monte_carlo import EFFECTIVE, SIZE, draw_posterior
+
+GAUSSIAN = NoiseModel("gaussian", 1.0)
+LOWER, UPPER = 1.5, 12.0
+LARGE = 3_000_000
+"""Interactions with which a population is as small as it can be."""
+
+
+def _parameters(scale="linear", names=("walls.relative_permittivity",)):
+    return Parameters(
+        tuple(Parameter(name, lower=LOWER, upper=UPPER, start=5.0, scale=scale) for name in names)
+    )
+
+
+def _marginal(links, models=(GAUSSIAN,)):
+    return Marginal.of(np.zeros((links, 0)), np.zeros(0), np.ones(links), np.zeros((links, 3)), 1.0, models)
+
+
+def _model(parameters, gaps, links, buildings=6, priors=NO_PRIOR, spread=None, **changes):
+    arguments = {
+        "parameter_of": np.zeros(buildings, dtype=int),
+        "building_of": np.arange(buildings),
+        "only_buildings": np.zeros(1, dtype=int)[:buildings],
+    }
+    marginal = _marginal(links, changes.pop("models", (GAUSSIAN,)))
+    return JointModel(parameters, parameters, priors, gaps, marginal, spread=spread, **arguments | changes)
+
+
+def _uninformative(point, logarithms):
+    """The same gaps everywhere."""
+    return np.tile([1.0, -1.0, 2.0, -2.0], (len(point), 1))
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+@pytest.mark.parametrize("spread", [0.7, None])
+def test_undetermined_means_are_uniform(scale, spread):
+    parameters = _parameters(scale)
+    posterior = draw_posterior(_model(parameters, _uninformative, 4, buildings=2, spread=spread), seed=2)
+    lower, upper = parameters.search_bounds
+    unit = ((posterior.means.point - lower) / (upper - lower))[:, 0]
+    assert np.quantile(unit, [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.05)
+    if spread is None:
+        assert np.mean(posterior.spread == 0) == pytest.approx(ALIKE, abs=0.07)
+        differing = posterior.spread[posterior.spread > 0]
+        assert differing.mean() == pytest.approx(MEAN_SPREAD, rel=0.15)
+    assert posterior.means.agree
+
+
+def test_undetermined_means_follow_a_declared_prior():
+    prior = LogNormal((0,), (4.0,), (0.1,))
+    draws = draw_posterior(_model(_parameters(), _uninformative, 4, priors=prior), seed=3).means
+    # Flat in x and normal in log x: the mean of log x is larger by the variance.
+    assert np.log(draws.point).mean() == pytest.approx(np.log(4.0) + 0.01, abs=0.015)
+    assert np.log(draws.point).std() == pytest.approx(0.1, rel=0.12)
+
+
+BUILDINGS, EACH, SLOPE = 6, 10, 20.0
+"""Buildings, links dominated by each, and derivative of path loss by the logarithm of its constant [dB]."""
+
+
+def _planted(spread, seed=4):
+    """Measured path loss of links dominated by one building each, linear in its constant, with 1 dB of noise."""
+    random = np.random.default_rng(seed)
+    own = np.log(4.0) + spread * random.standard_normal(BUILDINGS)
+    return SLOPE * np.repeat(own, EACH) + random.standard_normal(BUILDINGS * EACH)
+
+
+def _linear(parameters, measured):
+    def gaps(point, logarithms):
+        constants = np.log(parameters.from_unit(point)) + logarithms
+        return measured - SLOPE * np.repeat(constants, EACH, axis=1)
+
+    return gaps
+
+
+def _closed_form(measured, spreads, weights):
+    """Density of log x over a grid: y ~ N(slope log x, size^2 I + (slope s)^2 within buildings), size as 1 / size."""
+    at = np.linspace(np.log(LOWER), np.log(UPPER), 2001)
+    own = measured.reshape(BUILDINGS, EACH)
+    within = np.sum((own - own.mean(axis=1)[:, None]) ** 2)
+    density = np.zeros((len(spreads), len(at)))
+    for size in np.geomspace(0.5, 2.0, 61):
+        for index, (spread, weight) in enumerate(zip(spreads, weights, strict=True)):
+            deviation = np.sqrt(size**2 / EACH + (SLOPE * spread) ** 2)
+            between = norm.logpdf(own.mean(axis=1)[:, None], SLOPE * at, deviation).sum(axis=0)
+            log_within = -0.5 * within / size**2 - BUILDINGS * (EACH - 1) * np.log(size)
+            density[index] += weight * np.exp(between + log_within + 100.0)
+    total = density.sum()
+    return at, density.sum(axis=0) / total, density.sum(axis=1) / total
+
+
+def _moments(at, share):
+    mean = np.sum(share * at)
+    return mean, np.sqrt(np.sum(share * (at - mean) ** 2))
+
+
+@pytest.mark.parametrize("known", [0.15, None])
+@pytest.mark.parametrize("planted", [0.15, 0.0])
+def test_means_agree_with_the_closed_form(known, planted):
+    parameters, measured = _parameters("log"), _planted(planted)
+    spreads, weights = [known], [1.0]
+    if known is None:
+        grid = np.linspace(*SPREAD_BOUNDS, 400)
+        density = np.exp(-grid / MEAN_SPREAD)
+        spreads, weights = [0.0, *grid], [ALIKE, *((1 - ALIKE) * density / density.sum())]
+    at, share, by_spread = _closed_form(measured, spreads, weights)
+    mean, deviation = _moments(at, share)
+    model = _model(parameters, _linear(parameters, measured), len(measured), BUILDINGS, spread=known)
+    posterior = draw_posterior(model, seed=5)
+    draws = posterior.means.point[:, 0]
+    weight = posterior.means.weight
+    assert weight @ draws == pytest.approx(mean, abs=0.25 * deviation)
+    assert np.sqrt(weight @ (draws - weight @ draws) ** 2) == pytest.approx(deviation, rel=0.25)
+    if known is None:
+        assert weight @ (posterior.spread == 0) == pytest.approx(by_spread[0], abs=0.15)
+        # Negative control: where buildings differ, those that were seen say more than the mean of all.
+        if planted:
+            assert by_spread[0] < 0.05
+            seen = posterior.seen.point[:, 0]
+            assert np.std(seen) < 0.6 * deviation
+
+
+def test_links_on_one_building_determine_the_mean_only_to_the_spread():
+    parameters, measured = _parameters("log"), _planted(0.15)
+    gaps = _linear(parameters, measured)
+
+    def of_one(point, logarithms):
+        return gaps(point, logarithms)[:, :EACH]
+
+    draws = draw_posterior(_model(parameters, of_one, EACH, BUILDINGS, spread=0.15), seed=6).means
+    assert draws.point.std() == pytest.approx(np.hypot(0.15, 1.0 / SLOPE / np.sqrt(EACH)), rel=0.2)
+
+
+def test_distant_ranges_get_their_shares():
+    """Two permittivities with the same path loss, one with twice the prior; and a needle in five dimensions."""
+    parameters = _parameters(names=[f"m{k}.relative_permittivity" for k in range(5)])
+    random = np.random.default_rng(1)
+    noise, weights = random.standard_normal(30), random.standard_normal((5, 30))
+    prior = LogNormal((0,), (4.0,), (np.log(2.0) / np.sqrt(2.0 * np.log(2.0)),))
+
+    def gaps(point, _):
+        values = parameters.from_unit(point)
+        first = np.minimum(np.abs(values[:, 0] - 4.0), np.abs(values[:, 0] - 8.0))
+        rest = np.column_stack([5.0 * first, values[:, 1:] - 6.0])
+        return noise + 2.0 * rest @ weights
+
+    posterior = draw_posterior(_model(parameters, gaps, 30, buildings=0, priors=prior), seed=7)
+    first = posterior.means.point[:, 0]
+    low = posterior.means.weight @ (first < 6.0)
+    # A log-normal prior has half its density a factor of two from its centre.
+    assert low == pytest.approx(2 / 3, abs=0.15)
+    assert np.abs(first - np.where(first < 6.0, 4.0, 8.0)).max() < 0.5
+    assert np.abs(posterior.means.point[:, 1:] - 6.0).max() < 1.0
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Gaps that are log densities themselves."""
+
+    models: tuple[NoiseModel, ...] = (GAUSSIAN,)
+    column: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    censored: np.ndarray = field(default_factory=lambda: np.ones(1, dtype=bool))
+
+    def densities(self, gap):
+        return gap
+
+
+@pytest.mark.parametrize("size", [0.006, 0.003])
+def test_many_narrow_modes_of_each_parameter_are_all_sampled(size):
+    """As from reflections inside walls: six modes for each of four parameters, 1296 together."""
+    places, share = np.array([0.1, 0.263, 0.419, 0.58, 0.741, 0.9]), np.arange(1.0, 7.0) / 21.0
+
+    def log_density(point, _):
+        each = np.log(share) - 0.5 * ((point[..., None] - places) / size) ** 2
+        return np.logaddexp.reduce(each, axis=2).sum(axis=1)[:, None]
+
+    parameters = _parameters(names=[f"m{k}.relative_permittivity" for k in range(4)])
+    model = replace(_model(parameters, log_density, 1, buildings=0), marginal=Exact())
+    draws = draw_posterior(model, seed=1).means
+    for value in ((draws.point - LOWER) / (UPPER - LOWER)).T:
+        near = np.abs(value[:, None] - places) < 5 * size
+        assert draws.weight @ near == pytest.approx(share, abs=0.08)
+
+
+def test_the_noise_models_get_their_posterior_weights():
+    heavy = NoiseModel("student-t", 0.5, freedom=2.0)
+    models = (NoiseModel("gaussian", 0.5), heavy)
+    gaps = np.array([0.3, -0.5, 0.8, -0.2, 1.1, -0.9, 3.5, 0.1])
+    marginal = _marginal(8, models)
+    log = marginal.densities(gaps[None])[0]
+    expected = 1.0 / (1.0 + np.exp(log[0] - log[1]))
+    model = _model(_parameters(), lambda point, _: np.tile(gaps, (len(point), 1)), 8, models=models)
+    posterior = draw_posterior(model, seed=8)
+    assert 0.1 < expected < 0.9
+    assert posterior.means.weight @ (posterior.model == 1) == pytest.approx(expected, abs=0.06)
+
+
+def test_populations_that_disagree_are_reported():
+    """A likelihood that depends on the order of evaluation has no posterior that populations could agree on."""
+    turn = [0]
+
+    def gaps(point, _):
+        turn[0] += 1
+        centre = 3.0 if turn[0] < first else 10.0
+        return 20.0 * (_parameters().from_unit(point) - centre) + np.linspace(-1, 1, 20)
+
+    first = np.inf
+    model = _model(_parameters(), gaps, 20, buildings=0, interactions=LARGE)
+    assert draw_posterior(model, seed=1).means.agree
+    first, turn[0] = turn[0] // 2, 0
+    posterior = draw_posterior(model, seed=1)
+    assert not posterior.means.agree
+    assert posterior.means.weight[: SIZE[0]].sum() == pytest.approx(0.5)
+
+
+def test_each_step_leaves_half_of_the_members_effective():
+    log_likelihood = 30.0 * np.random.default_rng(10).standard_normal(1000)
+    power = module._next_power(log_likelihood, 0.1)
+    weight = np.exp((power - 0.1) * log_likelihood)
+    assert 0.1 < power < 0.2
+    assert np.sum(weight) ** 2 / np.sum(weight**2) == pytest.approx(EFFECTIVE * 1000, rel=0.01)
+    assert module._next_power(0.01 * log_likelihood, 0.1) == 1.0
+
+
+def test_draws_are_the_same_for_a_seed():
+    one, two, other = (
+        draw_posterior(_model(_parameters(), _uninformative, 4, interactions=LARGE), seed=seed).means.point
+        for seed in (7, 7, 8)
+    )
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, other)
