@@ -35,7 +35,10 @@ def _model(parameters, gaps, links, buildings=6, priors=NO_PRIOR, spread=None, *
         "only_buildings": np.zeros(1, dtype=int)[:buildings],
     }
     marginal = _marginal(links, changes.pop("models", (GAUSSIAN,)))
-    return JointModel(parameters, parameters, priors, gaps, marginal, spread=spread, **arguments | changes)
+    no_loss = lambda values: np.zeros((len(values), links))  # noqa: E731
+    return JointModel(
+        parameters, parameters, priors, gaps, no_loss, marginal, spread=spread, **arguments | changes
+    )
 
 
 def _uninformative(point, logarithms):

@@ -175,6 +175,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         uncertainty=Uncertainty(
             intervals=certainty.intervals,
             draws=certainty.draws,
+            constants_db=certainty.constants_db,
             noise=certainty.noise,
             undeclared_offset_db=certainty.undeclared_offset_db,
             undeclared_offset_error_db=certainty.undeclared_offset_error_db,

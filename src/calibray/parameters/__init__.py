@@ -1,6 +1,13 @@
 """Parameters: what a calibration may change, the search space they span, and the laws that some of them belong to."""
 
-from calibray.parameters.parameter import Parameter, Scale, itu_start, make_parameter, split_name
+from calibray.parameters.parameter import (
+    Parameter,
+    Scale,
+    fixed_constant,
+    itu_start,
+    make_parameter,
+    split_name,
+)
 from calibray.parameters.space import NO_PRIOR, LogNormal, Parameters
 
 __all__ = [
@@ -9,6 +16,7 @@ __all__ = [
     "Parameter",
     "Parameters",
     "Scale",
+    "fixed_constant",
     "itu_start",
     "make_parameter",
     "split_name",

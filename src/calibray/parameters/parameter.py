@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from math import isfinite
+from math import exp, isfinite
 from typing import Final, Literal, get_args
 
 from calibray.errors import InputError
@@ -95,6 +95,28 @@ class Parameter:
     def constant(self) -> str:
         """The constant of the material that it changes, one of `FIELDS`."""
         return CONSTANT_OF_FIELD[self.field]
+
+
+def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
+    """A parameter for a constant that a scene fixes, within four standard deviations of its logarithm.
+
+    Args:
+        name: Material and constant, as "walls.thickness".
+        value: The scene's value.
+        spread: Standard deviation of the logarithm.
+
+    Returns:
+        The parameter; None if the constant is 0 or cannot take such values.
+
+    Example:
+        >>> fixed_constant("walls.thickness", 0.2, 0.1).upper
+        0.298364939528...
+    """
+    bound, factor = PARAMETER_BOUNDS[split_name(name)[1]], exp(4.0 * spread)
+    lower, upper = value / factor, min(value * factor, bound.upper)
+    if value <= 0.0 or spread <= 0.0 or lower not in bound or upper not in bound or lower >= upper:
+        return None
+    return Parameter(name, lower, upper, value, "log")
 
 
 def split_name(name: str) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +15,7 @@ from calibray.engines.kinds.replay import replay
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
+from calibray.parameters import fixed_constant, split_name
 from calibray.prediction.fallback import fill_missing, without_scene
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
@@ -226,6 +228,26 @@ def interval(
     return fill_missing(result.prediction, result.study, links, table, level, half_width)
 
 
+def with_constants(result: Record, setup: Setup) -> Setup:
+    """The study with the constants of its scene that vary in the draws as further parameters.
+
+    Args:
+        result: The calibration.
+        setup: Its study, opened.
+
+    Returns:
+        The study with these parameters, after its own.
+    """
+    spread, materials = result.study.noise.constants_spread, setup.scene.materials
+    items = []
+    for name in result.uncertainty.constants_db:
+        material, constant = split_name(name)
+        item = fixed_constant(name, float(getattr(materials[material], constant)), spread)
+        items += [] if item is None else [item]
+    parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
+    return replace(setup, parameters=parameters)
+
+
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
     """Predictions in the quantity that the study's links were measured in.
 
@@ -294,7 +316,11 @@ def _modelled(
         return without_scene(result.study, links)[None]
     values = np.array([[prediction.model.parameters[name] for name in names]])
     if draws:
-        values = np.vstack([values, np.stack([draws[name] for name in names], axis=1)])
+        setup = with_constants(result, setup)
+        names = setup.parameters.names
+        scene_values = setup.parameters.start[None, values.shape[1] :]
+        drawn = np.stack([draws[name] for name in names], axis=1)
+        values = np.vstack([np.hstack([values, scene_values]), drawn])
     paths = setup.trace(traced_materials(result, prediction.materials), progress)
     path_loss_db = replay(setup, paths).path_loss(values)
     # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.

@@ -15,6 +15,7 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
+from calibray.parameters import LogNormal
 from calibray.prediction.cost import announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
@@ -25,7 +26,7 @@ from calibray.prediction.experiment_design import (
     initial_range_probability,
 )
 from calibray.prediction.position_checks import POSITION_COLUMNS
-from calibray.prediction.predict import as_links, check_inputs, traced_materials
+from calibray.prediction.predict import as_links, check_inputs, traced_materials, with_constants
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.messages import percent
@@ -93,7 +94,8 @@ def suggest(
     setup = calibrated.at(links)
     check_inputs(result, setup, allow_changed_inputs)
     announce(result, len(links), "candidates")
-    model = _ReplayedDraws(result, calibrated, progress)
+    model = _ReplayedDraws(result, with_constants(result, calibrated), progress)
+    setup = with_constants(result, setup)
     predicted, slope, errors = model.at(setup)
     reached = np.flatnonzero(np.isfinite(predicted).all(axis=0))
     if not len(reached):
@@ -153,7 +155,7 @@ class _ReplayedDraws:
     def __init__(self, result: Record, setup: Setup, progress: Progress | None) -> None:
         self.result, self.progress = result, progress
         self.engine = self._engine(setup)
-        problem = Problem.of(setup, self.engine)
+        problem = _with_priors(result, Problem.of(setup, self.engine))
         parameters, objective = problem.parameters, problem.objective
         if problem.freedom < 1:
             raise InputError(
@@ -302,6 +304,20 @@ class _ReplayedDraws:
         residuals = evaluation.residuals[0, : objective.num_counted]
         links = problem.setup.links
         return shared_errors(residuals, np.hstack([links.rx, links.tx])[objective.weight > 0])
+
+
+def _with_priors(result: Record, problem: Problem) -> Problem:
+    """The problem with the priors of the scene's constants that vary in the draws."""
+    constants, priors = problem.parameters.items[len(result.study.parameters) :], problem.priors
+    first = len(result.study.parameters)
+    return replace(
+        problem,
+        priors=LogNormal(
+            (*priors.index, *range(first, first + len(constants))),
+            (*priors.centre, *(item.start for item in constants)),
+            (*priors.spread, *(result.study.noise.constants_spread for _ in constants)),
+        ),
+    )
 
 
 def _table(

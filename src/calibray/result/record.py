@@ -82,7 +82,9 @@ class Uncertainty:
 
     Attributes:
         intervals: 95 % interval and verdict by parameter.
-        draws: Draws from the posterior by parameter and nuisance coefficient; empty where none could be made.
+        draws: Draws from the posterior by parameter, constant and nuisance coefficient; empty where none could be made.
+        constants_db: Constants that the scene fixes and that vary in the draws, with the change of path loss by one
+            standard deviation of each [dB].
         noise: Posterior weights of the noise models and of an undeclared offset.
         undeclared_offset_db: The best-fitting offset where the study declares none [dB]; None where not estimated.
         undeclared_offset_error_db: Its standard error [dB].
@@ -91,6 +93,7 @@ class Uncertainty:
 
     intervals: dict[str, Interval] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
+    constants_db: dict[str, NonNegative] = field(default_factory=dict)
     noise: dict[str, Share] = field(default_factory=dict)
     undeclared_offset_db: float | None = None
     undeclared_offset_error_db: NonNegative | None = None

@@ -412,7 +412,7 @@ class NoiseSection(Section):
     kind: Literal["auto", "gaussian", "student-t"] = "auto"
     range_m: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
     heterogeneity: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = "auto"
-    constants_spread: Annotated[float, Field(ge=0, le=2)] = 0.3
+    constants_spread: Annotated[float, Field(ge=0, le=2)] = 0.15
 
     @model_validator(mode="after")
     def _one_departure(self) -> Self:

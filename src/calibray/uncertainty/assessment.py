@@ -19,7 +19,7 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
-from calibray.uncertainty.draws import Draws
+from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
 from calibray.uncertainty.linear_theory import local_intervals, with_reason
@@ -61,6 +61,7 @@ class Certainty:
         intervals: Interval and verdict by parameter.
         draws: Posterior draws of parameters and nuisance coefficients, by name.
         posterior: All draws; None if none were made.
+        constants_db: Change of path loss by one standard deviation of each constant that the scene fixes [dB].
         noise: Posterior weights of the kinds of noise, and of an undeclared offset.
         undeclared_offset_db: The best offset in addition to the study's model; None if the study declares one [dB].
         undeclared_offset_error_db: Its standard error [dB].
@@ -72,6 +73,7 @@ class Certainty:
     intervals: dict[str, Interval] = field(default_factory=dict)
     draws: dict[str, list[float]] = field(default_factory=dict)
     posterior: Posterior | None = None
+    constants_db: dict[str, float] = field(default_factory=dict)
     noise: dict[str, float] = field(default_factory=dict)
     undeclared_offset_db: float | None = None
     undeclared_offset_error_db: float | None = None
@@ -193,7 +195,8 @@ def _assess(
     return replace(
         assessment,
         intervals=intervals,
-        draws=_named_draws(problem, posterior.seen),
+        draws=_named_draws(problem, model, posterior),
+        constants_db=model.effects_db,
         posterior=posterior,
         noise=noise,
         remarks=tuple(remarks),
@@ -264,12 +267,16 @@ def _intervals(
     return intervals
 
 
-def _named_draws(problem: Problem, draws: Draws) -> dict[str, list[float]]:
-    """Draws of equal weight by name: parameters in the fields' units, and coefficients of the nuisance."""
-    parameters, columns = problem.parameters, problem.objective.nuisance.columns
-    points = draws.resampled(KEPT_DRAWS, problem.setup.study.method.seed)
-    by_name = dict(zip(parameters.names, parameters.from_search(points).T.tolist(), strict=True))
+def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> dict[str, list[float]]:
+    """Draws of equal weight by name: parameters, constants that the scene fixes, coefficients of the nuisance."""
+    parameters, columns, draws = model.parameters, problem.objective.nuisance.columns, posterior.seen
+    kept = systematic_resampling(
+        draws.weight, KEPT_DRAWS, np.random.default_rng(problem.setup.study.method.seed)
+    )
+    values = parameters.from_unit(posterior.joint[kept])
+    values[:, : len(model.study)] = model.study.from_search(draws.point[kept])
+    by_name = dict(zip(parameters.names, values.T.tolist(), strict=True))
     if len(columns) <= MAX_COLUMNS:
-        coefficients = problem.objective.coefficients(problem.modelled(points))
+        coefficients = problem.objective.coefficients(model.loss(values))
         by_name |= dict(zip(columns, coefficients.T.tolist(), strict=True))
     return by_name

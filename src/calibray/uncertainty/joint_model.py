@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
-from calibray.materials import BOUNDS
-from calibray.parameters import LogNormal, Parameter, Parameters
+from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
 from calibray.uncertainty.buildings import can_split, split_replay
 from calibray.uncertainty.noise_models import Marginal, noise_models
 from calibray.uncertainty.quadratic_forms import QuadraticForms
@@ -34,9 +33,6 @@ FEWEST: Final = 8
 
 FIXED_FIELDS: Final = ("thickness", "conductivity", "scattering_coefficient")
 """Constants that are taken from the scene where they are no parameters."""
-
-FIXED_RANGE: Final = 4.0
-"""Range of such a constant, in standard deviations to either side."""
 
 NO_EFFECT: Final = 0.02
 """Change of path loss by one standard deviation of a fixed constant, relative to the noise, below which it stays
@@ -69,6 +65,7 @@ class JointModel:
         parameters: These, then k constants that the scene fixes.
         priors: Log-normal priors, on top of flat ones over the unit cube.
         gaps: Computes measured minus modelled path loss.
+        loss: Path loss of all links for values of the parameters [n, d + k] and equal buildings [n, L], [dB].
         marginal: The density of the gaps under every noise model.
         parameter_of: Index of the parameter that each of the c constants of single buildings belongs to [c].
         building_of: Building of each of these constants, from 0 [c].
@@ -76,18 +73,21 @@ class JointModel:
             mean.
         spread: The between-building spread if the study declares it; else None.
         interactions: Interactions that one evaluation takes.
+        effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
     """
 
     study: Parameters
     parameters: Parameters
     priors: LogNormal
     gaps: Gaps
+    loss: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     marginal: Marginal
     parameter_of: NDArray[np.int64]
     building_of: NDArray[np.int64]
     only_buildings: NDArray[np.int64]
     spread: float | None = None
     interactions: int = 1
+    effects_db: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def forms(self) -> QuadraticForms:
@@ -177,9 +177,11 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     def gap(loss: NDArray[np.float64]) -> NDArray[np.float64]:
         return (measured - objective.capped(loss)[:, counted]) * scale
 
-    def of_study(points: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
-        candidates = problem.parameters.from_unit(points)
-        return gap(problem.observable.modelled(problem.engine, candidates))
+    def loss_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return problem.observable.modelled(problem.engine, values)
+
+    def gaps_of(points: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
+        return gap(loss_of(problem.parameters.from_unit(points)))
 
     none = np.zeros(0, dtype=np.int64)
     spread = 0.0 if few else None if section.heterogeneity == "auto" else float(section.heterogeneity)
@@ -187,7 +189,8 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         problem.parameters,
         problem.parameters,
         problem.priors,
-        of_study,
+        gaps_of,
+        loss_of,
         Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored),
         none,
         none,
@@ -206,7 +209,7 @@ def _with_constants(
 ) -> JointModel:
     """The model with the constants that the scene fixes and have an effect, and with buildings."""
     study, known_to = model.study, problem.setup.study.noise.constants_spread
-    fixed = _fixed_constants(problem, known_to) if known_to > 0 else []
+    fixed, effects = _fixed_constants(problem), {}
     if fixed:
         every = split_replay(problem, replace(study, items=(*study.items, *fixed)), by_building=False)
         values = np.append(study.from_search(best), [item.start for item in fixed])
@@ -217,8 +220,8 @@ def _with_constants(
         with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
             change = gaps[1:] - gaps[:1]
         effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
-        kept = effect_db > NO_EFFECT * model.marginal.noise_db
-        fixed = [item for item, has_effect in zip(fixed, kept, strict=True) if has_effect]
+        effects = dict(zip((item.name for item in fixed), effect_db.tolist(), strict=True))
+        fixed = [item for item in fixed if effects[item.name] > NO_EFFECT * model.marginal.noise_db]
     parameters = replace(study, items=(*study.items, *fixed))
     replay = split_replay(problem, parameters, by_building=model.spread != 0)
     of_building = np.flatnonzero((replay.building_of >= 0) & (replay.parameter_of < len(study)))
@@ -240,9 +243,11 @@ def _with_constants(
             (*model.priors.spread, *(known_to for _ in fixed)),
         ),
         gaps=gaps_of,
+        loss=lambda values: replay.path_loss(values, np.ones((len(values), len(replay.parameter_of)))),
         parameter_of=parameter_of,
         building_of=np.unique(replay.building_of[of_building], return_inverse=True)[1],
         only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
+        effects_db={item.name: effects[item.name] for item in fixed},
     )
 
 
@@ -254,16 +259,20 @@ def has_offset(problem: Problem) -> bool:
     return problem.setup.study.offset is not None or constant
 
 
-def _fixed_constants(problem: Problem, spread: float) -> list[Parameter]:
-    """Constants that the scene fixes, of the materials that have a parameter; `spread` of their logarithms."""
-    names, materials = problem.parameters.names, problem.engine.materials
-    factor, items = float(np.exp(FIXED_RANGE * spread)), []
-    for material in dict.fromkeys(parameter.material for parameter in problem.parameters):
-        for field in FIXED_FIELDS:
-            value, name = float(getattr(materials[material], field)), f"{material}.{field}"
-            lower, upper = value / factor, min(value * factor, BOUNDS[field].upper)
-            if name not in names and value > 0.0 and lower in BOUNDS[field] and upper in BOUNDS[field]:
-                items.append(Parameter(name, lower, upper, value, "log"))
+def _fixed_constants(problem: Problem) -> list[Parameter]:
+    """Constants that the scene fixes, of the materials that have a parameter."""
+    materials, spread = problem.engine.materials, problem.setup.study.noise.constants_spread
+    names = [
+        f"{material}.{field_name}"
+        for material in dict.fromkeys(parameter.material for parameter in problem.parameters)
+        for field_name in FIXED_FIELDS
+    ]
+    items = []
+    for name in names:
+        material, field_name = split_name(name)
+        constant = fixed_constant(name, float(getattr(materials[material], field_name)), spread)
+        if name not in problem.parameters.names and constant is not None:
+            items.append(constant)
     return items
 
 
