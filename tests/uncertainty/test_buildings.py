@@ -109,13 +109,13 @@ def _deviation(draws):
 
 def test_intervals_cover_the_mean_over_buildings(problem):
     """Marble is on one building, which may differ from others; the ground does not differ."""
-    equal = _assessed(problem, heterogeneity=0, constants_spread=0).posterior
-    differing = _assessed(problem, heterogeneity=0.15, constants_spread=0).posterior
+    equal = _assessed(problem, 0.1, heterogeneity=0, constants_spread=0).posterior
+    differing = _assessed(problem, 0.1, heterogeneity=0.15, constants_spread=0).posterior
     np.testing.assert_allclose(equal.means.point, equal.seen.point, rtol=1e-12)
     alone = np.hypot(_deviation(differing.seen)[1], 0.15)
     # If path loss were linear in the constants it would be this.
     assert 0.75 < _deviation(differing.means)[1] / alone < 1.4
-    assert _deviation(differing.seen)[1] < 0.75 * alone
+    assert _deviation(differing.seen)[1] < 0.85 * alone
     assert _deviation(equal.means)[1] < 0.75 * alone
 
 
