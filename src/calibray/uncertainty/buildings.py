@@ -103,7 +103,6 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
         Parameters(tuple(items), parameters.frequency),
         study.objective.combining,
         study.scene.bandwidth,
-        tabulate=False,
         batch=1 << (batch.bit_length() - 1),
     )
     return SplitReplay(engine, np.array(parameter_of), np.array(building_of))
