@@ -19,6 +19,7 @@ from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
+from calibray.uncertainty.buildings import can_split
 from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
@@ -103,7 +104,7 @@ def certainty(
             before = problem.engine.calls
             assessment = _assess(problem, [problem], trail, progress)
             draws = 0 if assessment.posterior is None else assessment.posterior.replays
-            calls = max(problem.engine.calls - before, draws)
+            calls = problem.engine.calls - before + (draws if can_split(problem) else 0)
         else:
             assessment, calls = _assess_emulated(problem, trail, progress, model)
     return replace(assessment, calls=calls, seconds=time.perf_counter() - started)
