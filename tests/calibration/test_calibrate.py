@@ -72,7 +72,7 @@ def test_every_method_keeps_the_contract(tmp_path, exact, method):
     # The initial materials and the diagnostics cost one replay each, which are not the method's RT calls.
     # Draws replay the paths with further constants, apart from the study's engine.
     calls = planted.engine().calls - calls - result.rt_calls - 2
-    assert 0 < calls < result.cost.uncertainty_replays
+    assert 0 < calls <= result.cost.uncertainty_replays
     assert result.rt_calls == len(result.history) == PAPER_CALLS.get(method, result.rt_calls)
     assert all(low <= value <= high for (low, high), value in zip(
         [planted.BOUNDS] * 3, result.parameters.values(), strict=True))  # fmt: skip
@@ -255,7 +255,7 @@ def test_the_interval_does_not_depend_on_the_scale_of_the_search(tmp_path):
     replay, noisy = planted.engine(), planted.campaign(noise_db=0.02)
     logarithmic = Parameters(tuple(replace(parameter, scale="log") for parameter in replay.parameters))
     sections = {name: {"bounds": planted.BOUNDS, "scale": "log"} for name in planted.TRUTH}
-    alike = {"heterogeneity": 0.0}  # Means over buildings that differ are drawn, some hundred of them.
+    alike = {"heterogeneity": 0, "constants_spread": 0}
     study = planted.study(tmp_path, noisy, parameters=sections, noise=alike)
     result = calibrate(study, engine=Replay(replay.paths, logarithmic))
     linear = run(tmp_path, noisy, noise=alike)

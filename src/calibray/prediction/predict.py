@@ -240,7 +240,7 @@ def with_constants(result: Record, setup: Setup) -> Setup:
     """
     spread, materials = result.study.noise.constants_spread, setup.scene.materials
     items = []
-    for name in result.uncertainty.constants_db:
+    for name in (name for name in result.uncertainty.constants_db if name in result.uncertainty.draws):
         material, constant = split_name(name)
         item = fixed_constant(name, float(getattr(materials[material], constant)), spread)
         items += [] if item is None else [item]

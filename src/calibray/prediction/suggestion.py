@@ -299,7 +299,8 @@ class _ReplayedDraws:
     def _correlation(self) -> Correlation | None:
         """Correlation of the residuals of neighbouring links; None where they show none."""
         problem, objective = self.problem, self.problem.objective
-        values = np.array([[self.result.parameters[name] for name in problem.parameters.names]])
+        known = dict(zip(problem.parameters.names, problem.parameters.start, strict=True))
+        values = np.array([list((known | self.result.parameters).values())])
         evaluation = problem.evaluate(problem.parameters.to_search(values))
         residuals = evaluation.residuals[0, : objective.num_counted]
         links = problem.setup.links

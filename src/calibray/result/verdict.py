@@ -33,11 +33,9 @@ class ReasonKind(StrEnum):
     NOISE = "noise"  # change_db over the range, noise_db
     OUTSIDE_INTERVAL = "outside interval"  # value of least RMSE
     TOO_FEW_LINKS = "too few links"  # links
-    TOO_FEW_DRAWS = "too few draws"  # share of the range that the draws cannot rule out
     TOO_FEW_CALLS = "too few calls"  # calls
     NO_NOISE = "no noise"
     TOO_MANY_LINKS = "too many links"  # limit; the interval follows from the curvature
-    TOO_EXPENSIVE = "too expensive"  # the interval follows from the curvature
 
 
 @dataclass(frozen=True)

@@ -100,9 +100,6 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.TOO_FEW_LINKS: lambda values, _: (
         f"{values['links']:.0f} links are too few for this number of unknowns"
     ),
-    ReasonKind.TOO_FEW_DRAWS: lambda values, _: (
-        f"too few draws fit the data to rule out more than {percent(1 - values['share'])} of the range"
-    ),
     ReasonKind.TOO_FEW_CALLS: lambda values, _: (
         f"{values['calls']:.0f} calls of the engine are too few to show how path loss depends on any parameter"
     ),
@@ -110,9 +107,6 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
     ReasonKind.TOO_MANY_LINKS: lambda values, _: (
         f"from the curvature at the optimum alone: for more than {values['limit']:,.0f} links, correlated noise is not "
         "considered"
-    ),
-    ReasonKind.TOO_EXPENSIVE: lambda values, _: (
-        "from the curvature at the optimum alone: draws would cost more than five calibrations"
     ),
 }
 
@@ -207,7 +201,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     ),
     RemarkKind.OUTSIDE_INTERVAL: _outside_interval,
     RemarkKind.FEW_DRAWS: lambda values: (
-        "Too few draws fit the data for this number of parameters. The intervals are rough, and a mode may be missing. "
+        "Independent populations of draws disagree. The intervals are rough, and a range that fits may be missing. "
         "Calibrate fewer parameters, or give them priors."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,

@@ -1,12 +1,11 @@
 """Linear theory: intervals and covariances from the curvature of the sum of squares at the optimum.
 
-Posterior sampling starts from these covariances. The intervals replace those of the posterior if it cannot be sampled.
+The intervals replace those of the posterior if it cannot be sampled.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,7 @@ from scipy.special import stdtrit
 
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.fitting.search import Trail
-from calibray.result.verdict import CONFIDENCE, Interval, Reason, Verdict
-
-WIDE_PRECISION: Final = 9.0
-"""Inverse variance, in the unit cube, of a prior as wide as a third of the range. It keeps undetermined parameters
-within their range."""
+from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Verdict
 
 
 def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict[str, Interval]:
@@ -54,8 +49,20 @@ def local_intervals(problem: Problem, trail: Trail, optimum: Evaluation) -> dict
 
 
 def with_reason(local: dict[str, Interval], reason: Reason) -> dict[str, Interval]:
-    """Add to intervals by linear theory the reason why the posterior was not sampled."""
-    return {name: replace(interval, reason=reason) for name, interval in local.items()}
+    """Add to intervals by linear theory the reason why the posterior was not sampled.
+
+    Curvature alone does not show other minima and correlated errors, so no parameter is more than weakly identified,
+    except where the data have no noise.
+    """
+    exact = reason.kind == ReasonKind.NO_NOISE
+
+    def capped(verdict: Verdict) -> Verdict:
+        return Verdict.WEAKLY_IDENTIFIED if verdict == Verdict.IDENTIFIED and not exact else verdict
+
+    return {
+        name: replace(interval, verdict=capped(interval.verdict), reason=reason)
+        for name, interval in local.items()
+    }
 
 
 def intervals(
@@ -100,22 +107,3 @@ def intervals(
             verdict = Verdict.AT_BOUND
         result.append(Interval(float(error), float(ends[0]), float(ends[1]), verdict))
     return result
-
-
-def covariances(problem: Problem, points: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
-    """Covariance of the parameters at minima, at most as wide as a third of the range.
-
-    Args:
-        problem: The problem.
-        points: The minima, in the search space [k, d].
-        freedom: Number of residuals minus unknowns.
-
-    Returns:
-        The covariance at every minimum [k, d, d].
-    """
-    evaluation = problem.squares(points, derivatives=True)
-    lower, upper = problem.parameters.search_bounds
-    curvature = evaluation.curvature * np.outer(upper - lower, upper - lower)
-    variance = evaluation.value**2 * evaluation.num_rows / freedom
-    precision = curvature / variance[:, None, None] + WIDE_PRECISION * np.eye(len(lower))
-    return np.linalg.inv(precision) * np.outer(upper - lower, upper - lower)

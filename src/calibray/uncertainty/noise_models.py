@@ -26,7 +26,7 @@ from scipy.special import gammaln
 
 from calibray.uncertainty.censoring import log_evidence
 from calibray.uncertainty.heavy_tails import evidence, gross, regular, student
-from calibray.uncertainty.whitening import Whitener, pairwise, whitener
+from calibray.uncertainty.whitening import EXACT, Whitener, nearest_earlier, pairwise, whitener
 
 OFFSET_DB: Final = 6.0
 """Prior standard deviation of an undeclared offset, as from a cable or an antenna gain [dB]."""
@@ -190,8 +190,9 @@ class Marginal:
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
         correlations = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
+        neighbours = nearest_earlier(position) if correlations and len(position) > EXACT else None
         whiteners = {
-            (range_m, share): whitener(position, scale, range_m, share)
+            (range_m, share): whitener(position, scale, range_m, share, neighbours=neighbours)
             for range_m, share in sorted(correlations)
         }
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)

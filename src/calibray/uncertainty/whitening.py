@@ -23,6 +23,10 @@ NEAREST: Final = 20
 """Neighbours in Vecchia's approximation."""
 
 
+Neighbours = tuple[NDArray[np.int64], list[NDArray[np.int64]]]
+"""An order of links, and the places of each one's nearest earlier links."""
+
+
 @dataclass(frozen=True, eq=False)
 class Whitener:
     """A factor of the inverse of a covariance.
@@ -56,6 +60,7 @@ def whitener(
     range_m: float,
     share: float,
     exact: int = EXACT,
+    neighbours: Neighbours | None = None,
 ) -> Whitener:
     """Make the whitener of correlated errors.
 
@@ -65,6 +70,7 @@ def whitener(
         range_m: Distance at which the correlated part has fallen to 1/e [m].
         share: Correlated share of the variance, from 0 to below 1.
         exact: Links up to which the covariance is factored exactly.
+        neighbours: The links' nearest earlier neighbours, if they are known.
 
     Returns:
         The whitener.
@@ -75,26 +81,39 @@ def whitener(
         factor = cholesky(share * common + (1 - share) * np.eye(count), lower=True)
         inverse = solve_triangular(factor, np.eye(count), lower=True)
         return Whitener(inverse, 2.0 * float(np.log(np.diag(factor)).sum()))
-    return _vecchia(position, scale, range_m, share)
+    return _vecchia(position, scale, range_m, share, neighbours or nearest_earlier(position))
+
+
+def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
+    """A random order of links, which gives near and far neighbours among the earlier ones, and the nearest of these.
+
+    Args:
+        position: Positions of the links' ends [m, k], [m].
+
+    Returns:
+        The order [m], and for each link in this order the places of its nearest earlier links.
+    """
+    order = np.random.default_rng(0).permutation(len(position))
+    shuffled, near = position[order], [np.zeros(0, dtype=np.int64)]
+    for index in range(1, len(order)):
+        distance = np.sum((shuffled[:index] - shuffled[index]) ** 2, axis=1)
+        nearest = np.argsort(distance) if index <= NEAREST else np.argpartition(distance, NEAREST)[:NEAREST]
+        near.append(nearest)
+    return order, near
 
 
 def _vecchia(
-    position: NDArray[np.float64], scale: NDArray[np.float64], range_m: float, share: float
+    position: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    range_m: float,
+    share: float,
+    neighbours: Neighbours,
 ) -> Whitener:
-    count = len(position)
-    order = np.random.default_rng(0).permutation(count)  # gives near and far neighbours among earlier links
-    shuffled, size = position[order], scale[order]
+    order, nearest = neighbours
+    shuffled, size, count = position[order], scale[order], len(position)
     rows, columns, entries, log_determinant = [], [], [], 0.0
     for index in range(count):
-        near = np.zeros(0, dtype=np.int64)
-        if index:
-            distance = np.linalg.norm(shuffled[:index] - shuffled[index], axis=1)
-            near = (
-                np.argsort(distance)[:NEAREST]
-                if index <= NEAREST
-                else np.argpartition(distance, NEAREST)[:NEAREST]
-            )
-        members = np.append(near, index)
+        members = np.append(nearest[index], index)
         common = np.exp(-cdist(shuffled[members], shuffled[members]) / range_m)
         common = common * np.outer(size[members], size[members])
         matrix = share * common + (1 - share) * np.eye(len(members))
