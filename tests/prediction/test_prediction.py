@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.special import stdtrit
 from typer.testing import CliRunner
 
 import planted
@@ -16,10 +18,10 @@ from calibray.cli.app import app
 from calibray.prediction.position_checks import locate
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.prediction.suggestion import suggest
-from calibray.result.prediction_model import ResidualField
+from calibray.result.prediction_model import BlockErrors, ResidualField
 from calibray.scenes import Triangles
 from calibray.uncertainty.residual_correlation import shared_errors
-from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width
+from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width, two_levels
 from changed import changed
 
 FIELD = ResidualField(range_m=20.0, shared_db=3.0, own_db=1.0)
@@ -184,3 +186,36 @@ def test_the_interval_of_many_errors_has_the_requested_coverage():
     few = np.abs(random.standard_normal(FEWEST_FOR_RANKS - 1))
     assert interval_half_width(np.sort(few), 0.9) == pytest.approx(1.685 * np.sqrt(np.mean(few**2)), rel=1e-2)
     assert interval_half_width(np.ones(50), 0.999) > 3.0
+
+
+def test_a_new_block_lies_in_the_interval_as_often_as_stated():
+    """Four blocks with errors of their own; by the size of single errors alone, too few links of a fifth one would."""
+    random = np.random.default_rng(3)
+    block, position = np.repeat(np.arange(4), 15), np.repeat(np.eye(4), 15, axis=0)
+    inside, by_single_errors = [], []
+    for _ in range(800):
+        errors = np.repeat(random.normal(0.0, 3.0, 4), 15) + random.normal(0.0, 2.0, 60)
+        levels = two_levels(errors, block, position)
+        half = stdtrit(levels.freedom, 0.95) * np.hypot(levels.within_db, levels.between_db)
+        new = abs(random.normal(0.0, 3.0) + random.normal(0.0, 2.0))
+        inside.append(new <= half)
+        by_single_errors.append(new <= interval_half_width(np.sort(np.abs(errors)), 0.9))
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
+    assert np.mean(by_single_errors) < 0.89 < np.mean(inside) + 0.01
+    assert two_levels(errors[:15], block[:15], position[:15]) is None
+    # Without errors between blocks, the interval is that of independent errors.
+    level = [two_levels(random.normal(0.0, 2.0, 60), block, position) for _ in range(200)]
+    width = [stdtrit(each.freedom, 0.95) * np.hypot(each.within_db, each.between_db) for each in level]
+    assert np.median(width) == pytest.approx(1.645 * 2.0, rel=0.08)
+
+
+def test_places_beyond_the_reach_of_held_out_links_get_wider_intervals(received):
+    table = planted.links().assign(sent_dbm=30.0, rx_x=planted.links().rx_x - 0.5)
+    model, variances = received.prediction.model, []
+    for reach_m in (50.0, 0.1):
+        levels = BlockErrors(within_db=1.0, between_db=2.0, freedom=30.0, reach_m=reach_m)
+        predictions = changed(received, model=replace(model, blocks=levels)).predict_interval(table)
+        half = (predictions.upper_db - predictions.path_loss_db).to_numpy()
+        variances.append((half / stdtrit(30.0, 0.95)) ** 2)
+    assert (variances[0] > 5.0 - 1e-9).all()
+    assert variances[1] - variances[0] == pytest.approx(np.full(len(table), 4.0), rel=1e-6)

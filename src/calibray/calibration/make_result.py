@@ -34,7 +34,8 @@ from calibray.uncertainty.residual_correlation import shared_errors
 from calibray.validation.baselines import log_distance
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.fallback import fit_fallback
-from calibray.validation.held_out_statistics import choose, compare
+from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
+from calibray.validation.validate import DEFAULT_BLOCKS
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
 
@@ -145,11 +146,11 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         accuracy, name, residuals = _on_held_out_links(problem, trail, models)
     else:
         accuracy, name, residuals = _on_blocks(
-            validation, _rmse(problem, models.initial, validation.judged), fitted
+            validation, links, _rmse(problem, models.initial, validation.judged), fitted
         )
     chosen = fit_prediction_model(problem, trail, name, residuals)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
-    prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table))
+    prediction = Prediction(chosen.model, chosen.materials, _residual_field(problem, table, validation))
     if chosen.model.parameters is not None:
         without_path = ~table["has_path"].to_numpy(bool)
         fallback = fit_fallback(problem, without_path, *_log_distance_errors(problem, models, validation))
@@ -269,7 +270,10 @@ def _choice_on_held_out_links(
         name = choose(errors, setup.links.rx[judged][finite])
         rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
         basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
-        return name, HeldOutResiduals(rms_db, basis, count, errors[name])
+        position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
+        block = spatial_blocks(position[:, 3:5], DEFAULT_BLOCKS)
+        levels = two_levels(errors[name], block, position)
+        return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db = None
     if problem.freedom >= 1:
         rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
@@ -293,7 +297,7 @@ def _log_distance_errors(
 
 
 def _on_blocks(
-    validation: Validation, initial_db: float | None, fitted: bool
+    validation: Validation, links: Measurements, initial_db: float | None, fitted: bool
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
     """Accuracy on blocks that were held out in turn, the model that they choose, and its residuals."""
     rmse = validation.table["rmse_db"]
@@ -303,6 +307,7 @@ def _on_blocks(
         f"{name}, errors on {len(validation.labels)} blocks held out in turn",
         int(np.count_nonzero(validation.judged)),
         validation.errors[name][validation.judged],
+        validation.levels(name, links),
     )
     accuracy = Accuracy(
         holdout_rmse_db=float(rmse[Model.CALIBRATED]),
@@ -328,8 +333,17 @@ def _faint_rows(problem: Problem) -> dict[str, int]:
     return {FAINT: count} if count else {}
 
 
-def _residual_field(problem: Problem, table: pd.DataFrame) -> ResidualField | None:
-    """The correlated part of the prediction model's residuals; None where they are uncorrelated."""
+def _residual_field(
+    problem: Problem, table: pd.DataFrame, validation: Validation | None
+) -> ResidualField | None:
+    """The correlated part of the prediction model's residuals.
+
+    None where they are uncorrelated, or where predictions of held-out blocks do not gain by it.
+    """
+    if validation is not None and Model.RESIDUAL_FIELD in validation.errors:
+        rmse_db = validation.table["rmse_db"]
+        if rmse_db[Model.RESIDUAL_FIELD] >= rmse_db[Model.CALIBRATED]:
+            return None
     links, noise = problem.setup.links, problem.setup.study.noise
     if links.frequency is not None or noise.range_m == 0 or noise.kind == HEAVY:
         return None

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calibray.engines.kinds.replay import replay
@@ -24,7 +25,6 @@ from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
-from calibray.validation.held_out_statistics import FEWEST_FOR_RANKS, interval_half_width
 
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance that measured links explain, above which a link is near measured links."""
@@ -200,17 +200,15 @@ def interval(
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     variance = shift.spread_db**2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
-    rms_db, absolute_errors = model.residual_db, np.array(model.sizes_db)
     basis = model.basis
     if result.held_out is None and model.parameters is not None and not draws:
         basis += ", without uncertainty of the parameters"
     # Near measured links the residual field is known, and only the uncorrelated part of the residual is left.
-    uncorrelated_db = rms_db if field is None else min(field.own_db, rms_db)
-    total_db = np.sqrt((1.0 - known_share) * rms_db**2 + known_share * uncorrelated_db**2 + variance)
-    if len(absolute_errors) < FEWEST_FOR_RANKS:
-        factor = float(stdtrit(model.links, (1 + level) / 2))
-    else:
-        factor = interval_half_width(absolute_errors, level) / max(rms_db, 1e-9)
+    far_db = _residual_db(result, links)
+    near_db = far_db if field is None else np.minimum(field.own_db, far_db)
+    total_db = np.sqrt((1.0 - known_share) * far_db**2 + known_share * near_db**2 + variance)
+    freedom = model.links if model.blocks is None else model.blocks.freedom
+    factor = float(stdtrit(freedom, (1 + level) / 2))
     link_basis = np.where(shift.spread_db > 0, f"{basis}, group without measurements", basis)
     link_basis = np.where(
         known_share > NEAR_SHARE, np.char.add(link_basis, ", near measured links"), link_basis
@@ -226,6 +224,22 @@ def interval(
         }
     )
     return fill_missing(result.prediction, result.study, links, table, level, half_width)
+
+
+def _residual_db(result: Record, links: Measurements) -> NDArray[np.float64]:
+    """Standard deviation of the prediction model's errors at new links [links], [dB].
+
+    Beyond the distance that held-out links kept from the others, the error between blocks counts up to twice: a place
+    that far away differs from the blocks as these differ from each other.
+    """
+    model = result.prediction.model
+    if model.blocks is None or not set(POSITION_COLUMNS) <= set(result.links):
+        return np.full(len(links), float(model.residual_db or 0.0))
+    rows, _ = calibration_residuals(result.links)
+    measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
+    distance = KDTree(measured).query(np.hstack([links.tx, links.rx]))[0]
+    beyond = np.clip(distance / max(model.blocks.reach_m, 1e-9) - 1.0, 0.0, 1.0)
+    return np.sqrt(model.blocks.within_db**2 + model.blocks.between_db**2 * (1.0 + beyond))
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:

@@ -29,6 +29,23 @@ class FittedTerm:
 
 
 @dataclass(frozen=True)
+class BlockErrors:
+    """Errors on new links in two levels: within blocks of neighbouring links, and common to a block.
+
+    Attributes:
+        within_db: Standard deviation of a link's own error [dB].
+        between_db: Standard deviation of the error that a new block's links have in common [dB].
+        freedom: Degrees of freedom of both together.
+        reach_m: Distance to the nearest calibration link that nine of ten held-out links kept [m].
+    """
+
+    within_db: float
+    between_db: float
+    freedom: float
+    reach_m: float
+
+
+@dataclass(frozen=True)
 class PredictionModel:
     """A model fitted to the calibration links, and its errors on new links.
 
@@ -40,6 +57,7 @@ class PredictionModel:
         basis: The links that these residuals were computed on.
         links: Number of these links, or degrees of freedom if they are calibration links.
         sizes_db: Absolute held-out residuals, ascending, at most 400 quantiles of them [dB].
+        blocks: These residuals in two levels; None if no links, or too few, were held out.
     """
 
     name: str
@@ -49,6 +67,7 @@ class PredictionModel:
     basis: str = ""
     links: int = 1
     sizes_db: tuple[float, ...] = ()
+    blocks: BlockErrors | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
 from calibray.result.held_out import Model
-from calibray.result.prediction_model import FittedTerm, PredictionModel
+from calibray.result.prediction_model import BlockErrors, FittedTerm, PredictionModel
 from calibray.study import Study
 from calibray.validation.baselines import log_distance_objective
 from calibray.validation.variants import (
@@ -44,12 +44,14 @@ class HeldOutResiduals:
         basis: The links that they are of.
         links: Number of these links, or degrees of freedom where they are calibration links.
         errors_db: The residuals on held-out links [n], [dB]; empty if they are of calibration links.
+        blocks: The same in two levels; None where no blocks were held out.
     """
 
     rms_db: float | None
     basis: str
     links: int
     errors_db: NDArray[np.float64]
+    blocks: BlockErrors | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,7 @@ def fit_prediction_model(
         residuals.basis,
         residuals.links,
         quantiles(np.sort(np.abs(residuals.errors_db))),
+        residuals.blocks,
     )
     materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)

@@ -15,9 +15,11 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calibray.result.held_out import FITTED, Judgement, Model
+from calibray.result.prediction_model import BlockErrors
 
 Errors = Mapping[Any, NDArray[np.float64]]
 """Residuals by model, a `Model` or its name [n], [dB]."""
@@ -29,6 +31,9 @@ MOST_CLUSTERS: Final = 1000
 """Most clusters; with more links, clusters are larger."""
 
 RESAMPLES: Final = 2000
+
+REACHED: Final = 0.9
+"""Share of the held-out links that lie within the reach of the others."""
 
 FEWEST_FOR_RANKS: Final = 40
 """Errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
@@ -134,6 +139,45 @@ def least(errors: Errors, names: tuple[str, ...]) -> str:
         Its name.
     """
     return min((name for name in names if name in errors), key=lambda name: float(np.mean(errors[name] ** 2)))
+
+
+def two_levels(
+    errors: NDArray[np.float64], block: NDArray[np.int64], position: NDArray[np.float64]
+) -> BlockErrors | None:
+    """Variance of held-out errors within and between blocks (analysis of variance of random effects).
+
+    A new street has an error of its own, so a few blocks say less than their many links. The degrees of freedom of both
+    variances together are those of F. E. Satterthwaite (Biometrics Bulletin 2, 1946).
+
+    Args:
+        errors: Residuals on held-out links [n], [dB].
+        block: Block of every link [n].
+        position: Positions of the links' ends [n, k], [m].
+
+    Returns:
+        The errors in two levels; None with fewer than two blocks, or if there are no more links than blocks.
+
+    Example:
+        >>> blocks = two_levels(np.array([3.0, 4, -4, -3, 1, 0]), np.array([0, 0, 1, 1, 2, 2]), np.eye(6))
+        >>> round(blocks.within_db, 2), round(blocks.between_db, 1), round(blocks.freedom, 1)
+        (0.71, 3.3, 3.3)
+    """
+    _, index, size = np.unique(block, return_inverse=True, return_counts=True)
+    count, links = len(size), len(errors)
+    if count < 2 or links <= count:
+        return None
+    mean = np.bincount(index, errors) / size
+    within = float(np.sum((errors - mean[index]) ** 2)) / (links - count)
+    # A block's mean error is not corrected in predictions, so it counts from zero.
+    between = max(float(np.mean(mean**2 - within / size)), 0.0) * (1.0 + 1.0 / count)
+    uncertainty = between**2 / count + within**2 / (links - count)
+    freedom = (within + between) ** 2 / uncertainty if uncertainty > 0 else float(links - count)
+    distance = np.empty(links)
+    for number in range(count):
+        here = index == number
+        distance[here] = KDTree(position[~here]).query(position[here])[0]
+    reach_m = float(np.quantile(distance, REACHED))
+    return BlockErrors(float(np.sqrt(within)), float(np.sqrt(between)), max(freedom, 1.0), reach_m)
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:

@@ -16,11 +16,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray.measurements import Measurements
 from calibray.result.held_out import BASELINES, FITTED, HeldOutErrors, Judgement, Model
+from calibray.result.prediction_model import BlockErrors
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, display, numbers
-from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least
+from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least, two_levels
 
 
 @final
@@ -109,6 +111,19 @@ class Validation(HeldOutErrors):
             Root mean square of its held-out residuals [dB].
         """
         return float(np.sqrt(np.nanmean(self.errors[name][self.judged] ** 2)))
+
+    def levels(self, name: str, links: Measurements) -> BlockErrors | None:
+        """Held-out residuals of a model within and between blocks.
+
+        Args:
+            name: The model.
+            links: The links.
+
+        Returns:
+            The errors in two levels; None if there are too few links.
+        """
+        position = np.hstack([links.tx, links.rx])[self.judged]
+        return two_levels(self.errors[name][self.judged], self.block[self.judged], position)
 
     def sizes(self, name: str) -> NDArray[np.float64]:
         """Absolute held-out residuals of a model.
