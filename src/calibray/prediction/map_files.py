@@ -186,7 +186,7 @@ def figure(coverage: CoverageMap) -> Figure:
     if ends:
         lower, upper = ends
         half = (upper - lower) / 2
-        panels.append((f"Half of the {100 * coverage.level:g} % interval [dB]", half, WIDTH_COLORS))
+        panels.append((f"Half of the {100 * (coverage.level or 0.0):g} % interval [dB]", half, WIDTH_COLORS))
     rows, columns = coverage.z.shape
     side_by_side = len(panels) == 1 or columns < 2 * rows
     size = np.array([7.0, float(np.clip(5.6 * rows / columns, 2.5, 9.0)) + 0.9])

@@ -217,8 +217,11 @@ def _moved(result: Record) -> pd.DataFrame:
 def _power_text(tables: dict[str, pd.DataFrame]) -> str:
     if "power" not in tables:
         return ""
-    rows = tables["power"].head(5).itertuples()
-    shares = (f"{row.material} {row.interaction} {percent(row.share)}".replace("  ", " ") for row in rows)
+    rows = tables["power"].head(5).to_dict("records")
+    shares = (
+        f"{row['material']} {row['interaction']} {percent(float(row['share']))}".replace("  ", " ")
+        for row in rows
+    )
     return f"mean share of a link's power: {', '.join(shares)}"
 
 
