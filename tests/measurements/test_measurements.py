@@ -179,15 +179,18 @@ def test_a_row_group_that_decompresses_to_gigabytes_is_refused(tmp_path, monkeyp
         PiecedTable.open(path)
 
 
-@pytest.mark.parametrize("read", [read_table, PiecedTable.open])
-def test_a_parquet_file_whose_rows_share_a_large_text_is_refused(tmp_path, monkeypatch, read):
-    """8 MB in the file as declared, 100 GB in memory; no part of it is decoded in this process."""
-    index = pa.array(np.zeros(12_000, dtype=np.int32))
-    column = pa.DictionaryArray.from_arrays(index, pa.array(["x" * 2**23]))
+@pytest.mark.parametrize(
+    ("read", "size", "rows"), [(read_table, 2**23, 12_000), (PiecedTable.open, 2**16, 10_000)]
+)
+def test_a_parquet_file_whose_rows_share_a_large_text_is_refused(tmp_path, monkeypatch, read, size, rows):
+    """Kilobytes in the file, gigabytes in a piece, also of small row groups; nothing is decoded in this process."""
+    index = pa.array(np.zeros(20_000, dtype=np.int32))
+    column = pa.DictionaryArray.from_arrays(index, pa.array(["x" * size]))
     path = tmp_path / "links.parquet"
     pq.write_table(
-        pa.table({"x": column}), path, store_schema=False, dictionary_pagesize_limit=2**30, compression="zstd"
-    )
+        pa.table({"x": column}), path, store_schema=False, dictionary_pagesize_limit=2**30, compression="zstd",
+        row_group_size=rows,
+    )  # fmt: skip
     monkeypatch.setattr("calibray.measurements.table_files.DECODING_MEMORY", 2**30)
     before = pa.total_allocated_bytes()
     with pytest.raises(InputError, match=r"links\.parquet: takes more memory than it declares"):

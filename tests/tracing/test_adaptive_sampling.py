@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from calibray.tracing import convergence
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
 from calibray.tracing.sionna.image_method import Edges, Surfaces, unfold
+from small_scenes import write_scene
 
 FREQUENCY = 3.5e9
 RECEIVERS = np.array(
@@ -153,3 +155,20 @@ def test_a_path_in_a_corner_of_two_mirrors_unfolds_to_a_line() -> None:
                    surfaces, edge)  # fmt: skip
     np.testing.assert_allclose(unfolded.aim[0], [[0, 0, 4], [10, 0, 4]])
     np.testing.assert_allclose(unfolded.slide[0], [[0, 0.6, 0.8], [0, 0.6, 0.8]])
+
+
+def test_a_rectangle_is_traced_as_the_mesh_of_its_corners(tmp_path: Path) -> None:
+    """Mitsuba's rectangles have no triangles, which rays in rounds need."""
+    square = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
+    scene = write_scene(tmp_path, {"ground": square})
+    of_mesh = Tracer(read_scene(scene, FREQUENCY), FREQUENCY, AUTO, Antenna("iso"), Antenna("iso")).trace(
+        LINKS
+    )
+    text = scene.read_text().replace('type="ply"', 'type="rectangle"')
+    scale = '<transform name="to_world"><scale value="40"/></transform>'
+    scene.write_text(re.sub(r'<string name="filename".*?/>', scale, text))
+    of_rectangle = Tracer(
+        read_scene(scene, FREQUENCY), FREQUENCY, AUTO, Antenna("iso"), Antenna("iso")
+    ).trace(LINKS)
+    assert of_rectangle.num_paths == of_mesh.num_paths == 2 * len(RECEIVERS)
+    np.testing.assert_allclose(path_loss(of_rectangle), path_loss(of_mesh), atol=1e-4)

@@ -27,22 +27,23 @@ LARGEST_TABLE: Final = 2 * 2**30
 """Decompressed size of a Parquet file that is read at once [bytes]; pandas takes up to twice as much."""
 
 LARGEST_ROW_GROUP: Final = 2**30
-"""Decompressed size of a row group of a Parquet file that is read in pieces [bytes]."""
+"""Decompressed size of a row group, or of a piece, of a Parquet file that is read in pieces [bytes]."""
 
 DECODING_MEMORY: Final = 4 * 2**30
 """Limit of the address space in which a Parquet file is decoded once [bytes]."""
+
+PIECE_ROWS: Final = 100_000
+"""Most rows of a Parquet file that are read together."""
 
 _DECODE: Final = """
 from pyarrow import parquet
 try:
     size = 0
     with parquet.ParquetFile({path!r}, pre_buffer=False) as file:
-        for number in range(file.num_row_groups):
-            size = size if {whole} else 0
-            for batch in file.iter_batches(2**14, [number], use_threads=False):
-                size += batch.nbytes
-                if size > {limit}:
-                    raise MemoryError
+        for batch in file.iter_batches({rows}, use_threads=False):
+            size = batch.nbytes + (size if {whole} else 0)
+            if size > {limit}:
+                raise MemoryError
 except MemoryError:
     refuse("takes more memory than it declares; export it again")
 except Exception as error:
@@ -132,7 +133,7 @@ class PiecedTable:
         path = Path(self.source)
         with _open_parquet(path) as file:
             integers_with_gaps, start = _integer_columns_with_gaps(file), 0
-            batches = file.iter_batches(batch_size=size)
+            batches = file.iter_batches(batch_size=min(size, PIECE_ROWS))
             while (frame := _next_frame(path, batches)) is not None:
                 # NumPy has no missing integer, so pandas makes such a column float. A piece without a gap must agree.
                 numpy_columns = [
@@ -250,7 +251,9 @@ def _decode_elsewhere(path: Path, size: int, limit: int, whole: bool) -> None:
     if key in _decoded:
         return
     try:
-        is_read = run_limited(_DECODE.format(path=key[0], limit=limit, whole=whole), DECODING_MEMORY, size)
+        is_read = run_limited(
+            _DECODE.format(path=key[0], limit=limit, whole=whole, rows=PIECE_ROWS), DECODING_MEMORY, size
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except TimeoutError as error:

@@ -45,7 +45,8 @@ class Mesh:
         vertices: Positions [V, 3], [m].
         faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
         step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
-        misread: Whether Mitsuba would misread it, because its file stores coordinates as integers.
+        misread: Whether the tracer gets a copy as PLY: a file stores coordinates as integers, or it is a rectangle,
+            which is no mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]

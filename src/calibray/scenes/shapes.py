@@ -88,7 +88,7 @@ def read_surface(shape: ElementTree.Element, path: Path) -> Mesh:
     """
     mesh = shape_mesh(shape, path)
     if mesh is None:
-        mesh = _SQUARE if shape.get("type") == "rectangle" else _cube()
+        mesh = replace(_SQUARE, misread=True) if shape.get("type") == "rectangle" else _cube()
     if mesh.step > TOO_COARSE:
         raise InputError(
             f"{path}: the mesh of shape {shape.get('id')!r} lies so far from the origin that its file stores "
