@@ -143,7 +143,9 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
         trail = search(asked, optimizer)
         before = time.process_time()
         told = certainty(asked, trail, model=model)
-        draws = told.posterior
+        if told.posterior is None:
+            raise RuntimeError(f"{name}, {way}: no draws; {told.remarks}")
+        draws = told.posterior.means
         sets = [
             {
                 str(level): credible(draws.point[:, k], draws.weight, bounds[0][k], bounds[1][k], level)

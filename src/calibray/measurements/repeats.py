@@ -52,7 +52,7 @@ def merge_repeats(table: SourceTable, steps: Preparation, columns: LinkColumns) 
     keys = pd.DataFrame({name: table.column(name) for name in _separating_columns(table, steps, columns)})
     floor = -np.inf if steps.noise_floor_dbm is None else steps.noise_floor_dbm
     keys["censored"] = value <= floor
-    group = keys.groupby(list(keys), sort=False, dropna=False).ngroup().to_numpy(np.int64)
+    group = np.asarray(keys.groupby(list(keys), sort=False, dropna=False).ngroup(), dtype=np.int64)
     link = join_positions(positions, group)
     first = ~pd.Series(link).duplicated().to_numpy()
     if first.all():
