@@ -147,18 +147,17 @@ def main() -> None:
 
 def summary(lines: list[dict[str, Any]]) -> Table:
     """Coverage and distance from the reference by parameter."""
-    names = [name.partition(".")[2] if "concrete" in name else name for name in lines[0]["names"]]
     columns = (
         Column("parameter"), numbers("runs"), numbers("in 90 % set"), numbers("mean rank"),
         numbers("distance from reference, mean"), numbers("largest"),
     )  # fmt: skip
     rows = []
-    for k, name in enumerate(names):
-        mine = [line for line in lines if len(line["inside"]) > k]
-        distance = [line["distance"][k] for line in mine if line.get("effective", 0.0) > 300]
+    for name in dict.fromkeys(name for line in lines for name in line["names"]):
+        mine = [(line, line["names"].index(name)) for line in lines if name in line["names"]]
+        distance = [line["distance"][k] for line, k in mine if line.get("effective", 0.0) > 300]
         rows.append((
-            name, str(len(mine)), f"{np.mean([line['inside'][k] for line in mine]):.2f}",
-            f"{np.mean([line['rank'][k] for line in mine]):.2f}",
+            name, str(len(mine)), f"{np.mean([line['inside'][k] for line, k in mine]):.2f}",
+            f"{np.mean([line['rank'][k] for line, k in mine]):.2f}",
             f"{np.mean(distance):.3f}" if distance else "-", f"{np.max(distance):.3f}" if distance else "-",
         ))  # fmt: skip
     seconds = np.mean([line["seconds"] for line in lines])
