@@ -21,10 +21,10 @@ from calibray.uncertainty.draws import Draws, pooled, systematic_resampling
 from calibray.uncertainty.joint_model import JointModel
 from calibray.uncertainty.population_moves import TINY, Lengths, Moves, Population, evaluated
 
-SIZE: Final = (128, 256)
+SIZE: Final = (64, 256)
 """Fewest and most members of a population."""
 
-BUDGET: Final = 3_000_000_000
+BUDGET: Final = 1_000_000_000
 """Interactions that all populations may evaluate together."""
 
 EVALUATIONS: Final = 100
@@ -46,6 +46,10 @@ MAX_STEPS: Final = 60
 APART: Final = 0.2
 """Largest distance between the distribution functions of a parameter in independent populations that agree. Two sets of
 256 independent draws differ by up to 0.12 in 19 of 20 cases; members of one population are not quite independent."""
+
+APART_BY_CHANCE: Final = 2.0
+"""The same distance for small populations, times the square root of half their size; 1.36 would be the 95 % point of
+independent draws (Kolmogorov and Smirnov)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +89,8 @@ def population_size(interactions: int, budget: int = BUDGET) -> int:
     """Members of each of two populations within a budget, from the interactions of one evaluation.
 
     Example:
-        >>> population_size(1_000), population_size(75_000)
-        (256, 200)
+        >>> population_size(1_000), population_size(50_000)
+        (256, 100)
     """
     return int(np.clip(budget // (2 * EVALUATIONS * interactions), *SIZE))
 
@@ -118,7 +122,7 @@ def draw_posterior(
     for number in range(4):
         if number == 2:
             spent = 2 * EVALUATIONS * model.interactions * size
-            if 2 * spent > budget or _distance(model, populations) < APART:
+            if 2 * spent > budget or _distance(model, populations) < _apart(size):
                 break
         random = np.random.default_rng([seed, number])
 
@@ -130,11 +134,18 @@ def draw_posterior(
         populations.append(population)
         evidences.append(evidence)
     half = len(populations) // 2
-    agree = _distance(model, [_together(populations[:half]), _together(populations[half:])]) < APART
+    agree = _distance(model, [_together(populations[:half]), _together(populations[half:])]) < _apart(
+        size * half
+    )
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
     posterior = _posterior(model, _together(populations), np.repeat(share, size) / size, agree)
     return replace(posterior, replays=replays)
+
+
+def _apart(size: int) -> float:
+    """Largest distance between the distribution functions of two sets of members that agree."""
+    return max(APART, APART_BY_CHANCE * float(np.sqrt(2.0 / size)))
 
 
 def _together(populations: Sequence[Population]) -> Population:
