@@ -32,9 +32,6 @@ from calibray.uncertainty.verdicts import Axes, consistent, verdicts
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
 
-MINIMA: Final = 200
-"""Largest number of least-squares minima evaluated as starts."""
-
 MOST_PROBABLE: Final = 64
 """Draws of highest density of which the most probable one is chosen."""
 

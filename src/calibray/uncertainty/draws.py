@@ -25,11 +25,6 @@ class Draws:
     weight: NDArray[np.float64]
     agree: bool = True
 
-    @property
-    def effective(self) -> float:
-        """Number of independent draws that would be as informative."""
-        return float(1.0 / np.sum(self.weight**2))
-
     def resampled(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """Points of equal weight.
 

@@ -49,9 +49,6 @@ FREEDOMS: Final = (2.0, 4.0)
 DEPARTURE: Final = 2.0
 """Prior weight of each departure from independent Gaussian errors, relative to these: measured errors rarely are."""
 
-NEGLIGIBLE: Final = 1e-3
-"""Relative weight below which a model is dropped."""
-
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
 GAUSSIAN, CORRELATED, HEAVY = "gaussian", "correlated", "student-t"
 
@@ -269,16 +266,6 @@ class Marginal:
             by_gap[~offset, -1] = NO_OFFSET
         freedom = np.array([model.freedom for model in models])
         return evidence(gap, design, by_gap, gross() if models[0].gross else student(freedom))
-
-    def reduced(self, log_densities: NDArray[np.float64]) -> Marginal:
-        """Drop the models that are negligible at all points.
-
-        Args:
-            log_densities: The results of `densities` for points of high density [n, models].
-        """
-        best = log_densities.max(axis=0)
-        kept = np.flatnonzero(best - best.max() > np.log(NEGLIGIBLE))
-        return replace(self, models=tuple(self.models[k] for k in kept))
 
     def _censored_density(self, gap: NDArray[np.float64], model: NoiseModel) -> NDArray[np.float64]:
         """Log density with censored links [n]."""

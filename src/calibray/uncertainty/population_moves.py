@@ -14,7 +14,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -79,15 +79,7 @@ class Population:
 
     def parts(self) -> tuple[NDArray, ...]:
         """The members' arrays, in the order of the attributes."""
-        return (
-            self.point,
-            self.deviation,
-            self.spread,
-            self.model,
-            self.gap,
-            self.log_likelihood,
-            self.log_prior,
-        )
+        return tuple(getattr(self, attribute.name) for attribute in fields(self))
 
 
 @dataclass(frozen=True)
@@ -196,13 +188,14 @@ class Moves:
         length = np.where(all_buildings[:, None], adapted, length)
         normal = random.standard_normal((count, width))
         deviation = np.sqrt(1.0 - length**2) * population.deviation + length * normal
-        proposal = self._differing(population, replace(population, deviation=deviation))
+        moved = replace(population, deviation=deviation)
+        proposal = self._evaluated_where(population.spread > 0, population, moved)
         accepted = self._accepts(population, proposal)
         buildings = _adapted(lengths.buildings, accepted[all_buildings & (population.spread > 0)], 1.0)
         return population.updated(accepted, proposal), replace(lengths, buildings=buildings)
 
     def _redraw_all_buildings(self, population: Population) -> Population:
-        """Propose spread and deviations from their prior: buildings become alike, differ, or differ by more or less."""
+        """Propose spread and deviations from their prior: buildings become equal, or differ by more or less."""
         count = len(population.spread)
         proposal = replace(
             population,
@@ -255,10 +248,6 @@ class Moves:
         # The largest of log weights plus Gumbel numbers is a draw by these weights.
         model = np.argmax(self.power * by_model + self.random.gumbel(size=by_model.shape), axis=1)
         return replace(population, model=model, log_likelihood=by_model[np.arange(len(model)), model])
-
-    def _differing(self, population: Population, proposal: Population) -> Population:
-        """The proposal, evaluated where buildings differ."""
-        return self._evaluated_where(population.spread > 0, population, proposal)
 
     def _evaluated_where(
         self, changed: NDArray[np.bool_], population: Population, proposal: Population
