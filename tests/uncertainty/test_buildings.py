@@ -18,6 +18,7 @@ from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.buildings import split_replay
+from calibray.uncertainty.joint_model import joint_model
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
 CORNERS = np.array([[0, 1, 2], [0, 2, 3]])
@@ -126,3 +127,20 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
     assert ratio.max() > 1.3
     assert ratio.min() > 0.8
     assert uncertain.posterior.joint.shape[1] > exact.posterior.joint.shape[1] == 3
+
+
+def test_logarithms_of_factors_act_on_the_gaps(problem):
+    """A factor on all buildings of a material is a factor on its mean; without factors the gaps are the study's."""
+    best = problem.parameters.to_search(np.array(list(planted.TRUTH.values())))
+    measured = problem.modelled(best[None])[0]
+    known = replace(problem, objective=replace(problem.objective, measured=measured))
+    model = joint_model(known, best, 0.3**2, problem.freedom)
+    value = np.append(list(planted.TRUTH.values()), [item.start for item in model.parameters.items[3:]])
+    none = np.zeros((1, len(model.parameter_of)))
+    assert set(model.only_buildings.tolist()) == set(model.parameter_of.tolist()) == {1, 2}
+    for index in (1, 2):
+        scaled = value * np.where(np.arange(len(value)) == index, 1.1, 1.0)
+        logarithms = np.log(1.1) * (model.parameter_of == index)[None]
+        by_factor = model.gaps(model.parameters.to_unit(value)[None], logarithms)
+        assert by_factor == pytest.approx(model.gaps(model.parameters.to_unit(scaled)[None], none), abs=1e-9)
+        assert np.abs(by_factor - model.gaps(model.parameters.to_unit(value)[None], none)).max() > 0.1
