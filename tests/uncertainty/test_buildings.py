@@ -14,6 +14,7 @@ from calibray.fitting.search import search
 from calibray.measurements import links_from_frame
 from calibray.optimizers import LeastSquares
 from calibray.parameters import Parameter
+from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
 from calibray.uncertainty.assessment import certainty
@@ -127,6 +128,11 @@ def test_a_thickness_that_is_not_known_exactly_widens_the_interval(problem):
     assert ratio.max() > 1.3
     assert ratio.min() > 0.8
     assert uncertain.posterior.joint.shape[1] > exact.posterior.joint.shape[1] == 3
+    # The result states an upper bound of the width that exact constants would leave.
+    widest = int(np.argmax(ratio))
+    without = list(uncertain.intervals.values())[widest].without
+    assert 1.0 / ratio[widest] < without[Cause.CONSTANTS] < 0.85
+    assert all(Cause.CONSTANTS not in interval.without for interval in exact.intervals.values())
 
 
 def test_logarithms_of_factors_act_on_the_gaps(problem):

@@ -7,10 +7,12 @@ import pytest
 from scipy.stats import norm
 
 from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
+from calibray.result.verdict import Cause
 from calibray.uncertainty import sequential_monte_carlo as module
 from calibray.uncertainty.joint_model import ALIKE, MEAN_SPREAD, SPREAD_BOUNDS, JointModel
 from calibray.uncertainty.noise_models import Marginal, NoiseModel
 from calibray.uncertainty.sequential_monte_carlo import EFFECTIVE, SIZE, draw_posterior
+from calibray.uncertainty.width_causes import remaining_widths
 
 GAUSSIAN = NoiseModel("gaussian", 1.0)
 LOWER, UPPER = 1.5, 12.0
@@ -133,6 +135,41 @@ def test_means_agree_with_the_closed_form(known, planted):
             assert by_spread[0] < 0.05
             seen = posterior.seen.point[:, 0]
             assert np.std(seen) < 0.6 * deviation
+
+
+def test_the_width_without_differing_buildings_is_that_of_equal_ones():
+    parameters, measured = _parameters("log"), _planted(0.03, seed=8)
+    model = _model(parameters, _linear(parameters, measured), len(measured), BUILDINGS)
+    posterior = draw_posterior(model, seed=5)
+    (without,) = remaining_widths(model, posterior)
+    _, equal = _moments(*_closed_form(measured, [0.0], [1.0])[:2])
+    weight, draws = posterior.means.weight, posterior.means.point[:, 0]
+    total = np.sqrt(weight @ (draws - weight @ draws) ** 2)
+    assert without == {Cause.BUILDINGS: pytest.approx(equal / total, rel=0.25)}
+    stated = replace(model, spread=0.0)
+    assert remaining_widths(stated, draw_posterior(stated, seed=5)) == [{}]
+
+
+def test_the_width_without_constants_is_that_of_exact_ones():
+    """Path loss that is linear in the logarithms of a parameter and of a constant known to 10 %."""
+    known_to, links = 0.1, 40
+    names = ("walls.relative_permittivity", "walls.thickness")
+    items = (
+        Parameter(names[0], LOWER, UPPER, 5.0, "log"),
+        Parameter(names[1], 0.2 * np.exp(-0.4), 0.2 * np.exp(0.4), 0.2, "log"),
+    )
+    study, parameters = Parameters(items[:1]), Parameters(items)
+    noise = np.random.default_rng(2).standard_normal(links)
+
+    def gaps(point, _):
+        first, second = np.log(parameters.from_unit(point)).T
+        return noise - SLOPE * (first - np.log(4.0) + second - np.log(0.2))[:, None]
+
+    prior = LogNormal((1,), (0.2,), (known_to,))
+    model = replace(_model(parameters, gaps, links, buildings=0, priors=prior), study=study)
+    (without,) = remaining_widths(model, draw_posterior(model, seed=3))
+    exact = noise.std() / SLOPE / np.sqrt(links)
+    assert without == {Cause.CONSTANTS: pytest.approx(exact / np.hypot(exact, known_to), rel=0.3)}
 
 
 def test_links_on_one_building_determine_the_mean_only_to_the_spread():

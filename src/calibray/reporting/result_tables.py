@@ -13,7 +13,7 @@ from calibray.reporting.diagnostics import diagnostics_table
 from calibray.result import wording
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
-from calibray.result.wording import interval_text, reason_text
+from calibray.result.wording import explanation_text, interval_text
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
 from calibray.tracing.positions import EnclosedAntennas
@@ -164,7 +164,7 @@ def reasons(result: Record) -> Table:
         The table.
     """
     rows = [
-        (name, reason_text(interval.reason)) for name, interval in result.intervals.items() if interval.reason
+        (name, explanation_text(interval)) for name, interval in result.intervals.items() if interval.reason
     ]
     return Table("Reasons", (Column(), Column()), tuple(rows))
 
@@ -315,7 +315,7 @@ def values(result: Record) -> list[Value]:
                 section.scale,
                 {"before": position(before), "after": position(after)},
                 tuple((position(low), position(high)) for low, high in pieces),
-                "" if interval is None else reason_text(interval.reason),
+                "" if interval is None else explanation_text(interval),
                 interval is not None and interval.approximate,
                 "" if predicted is None or predicted[name] == after else f"{predicted[name]:.4g}",
             )

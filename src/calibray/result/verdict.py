@@ -38,6 +38,16 @@ class ReasonKind(StrEnum):
     TOO_MANY_LINKS = "too many links"  # limit; the interval follows from the curvature
 
 
+class Cause(StrEnum):
+    """What can make an interval wide, besides the noise itself."""
+
+    BUILDINGS = "buildings that differ"
+    CORRELATION = "correlated errors"
+    HEAVY_TAILS = "heavy-tailed errors"
+    OFFSET = "undeclared offset"
+    CONSTANTS = "constants that the scene fixes"
+
+
 @dataclass(frozen=True)
 class Reason:
     """The reason for a verdict.
@@ -65,6 +75,9 @@ class Interval:
         pieces: Lower and upper end of every piece, ascending, where the interval was computed from draws.
         reason: The reason for the verdict.
         approximate: Whether an emulator replaced an engine that gives no derivatives.
+        seen: Pieces of the 95 % interval for the buildings that the links meet, which predictions use; empty where it
+            does not differ from that of the mean over all such buildings.
+        without: Share of the width that is left if a cause is ruled out, for the causes that matter.
     """
 
     standard_error: float
@@ -74,6 +87,8 @@ class Interval:
     pieces: tuple[tuple[float, float], ...] = ()
     reason: Reason | None = None
     approximate: bool = False
+    seen: tuple[tuple[float, float], ...] = ()
+    without: dict[Cause, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from calibray.result.held_out import HeldOutErrors, Judgement, Model
 from calibray.result.record import Record
 from calibray.result.remark import Remark, RemarkKind
-from calibray.result.verdict import Interval, Reason, ReasonKind
+from calibray.result.verdict import Cause, Interval, Reason, ReasonKind
 from calibray.support.messages import percent
 
 MOST_ODDS: Final = 1000.0
@@ -52,6 +52,36 @@ def reason_text(reason: Reason | None) -> str:
         A clause without a full stop; empty without a reason.
     """
     return "" if reason is None else _REASONS[reason.kind](reason.values, reason.ranges)
+
+
+def explanation_text(interval: Interval) -> str:
+    """Why a verdict is what it is, and what would narrow the interval.
+
+    Args:
+        interval: The interval.
+
+    Returns:
+        Clauses separated by semicolons, without a full stop; empty if nothing is known.
+    """
+    clauses = [reason_text(interval.reason)]
+    if interval.seen:
+        ends = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in interval.seen[:SHOWN_PIECES])
+        clauses.append(f"for the measured buildings alone, the interval is {ends}")
+    clauses += [
+        f"{statement} {percent(interval.without[cause])} of the width would remain"
+        for cause, statement in _STATEMENTS.items()
+        if cause in interval.without
+    ]
+    return "; ".join(clause for clause in clauses if clause)
+
+
+_STATEMENTS: Final = {
+    Cause.BUILDINGS: "if all buildings were known to be alike (noise.heterogeneity = 0),",
+    Cause.CORRELATION: "if errors of neighbouring links were known to be independent (noise.range_m = 0),",
+    Cause.HEAVY_TAILS: "if errors were known to be Gaussian (noise.kind = 'gaussian'),",
+    Cause.OFFSET: "if there were known to be no offset ([offset] with narrow bounds),",
+    Cause.CONSTANTS: "if the scene's other constants were exact (noise.constants_spread = 0), at most",
+}
 
 
 def _width(values: dict[str, Any], ranges: tuple[tuple[float, ...], ...]) -> str:

@@ -28,6 +28,8 @@ from calibray.uncertainty.noise_models import DIFFERING
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
 from calibray.uncertainty.sequential_monte_carlo import BUDGET, Posterior, draw_posterior, joined
 from calibray.uncertainty.verdicts import Axes, consistent, verdicts
+from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
+from calibray.uncertainty.width_causes import remaining_widths
 
 EQUAL: Final = 0.1
 """Difference between emulators, relative to the errors of the links, below which only their mean is used."""
@@ -46,6 +48,9 @@ MAX_LINKS: Final = 100_000
 
 MAX_COLUMNS: Final = 100
 """Columns of the nuisance up to which the draws include its coefficients."""
+
+SHOWN_DIFFERENCE: Final = 0.1
+"""Difference between the intervals of measured and of all buildings that is reported, as a share of the width."""
 
 EXACT_DB: Final = 1e-6
 """RMSE below which the data have no noise, so that linear theory is exact [dB]."""
@@ -178,7 +183,7 @@ def _assess(
     models = [joint_model(engine, relevant[0], least, freedom) for engine in engines]
     model, posterior = models[0], _draw(models, problem.setup.study.method.seed, progress)
     noise = _noise_weights(model, posterior, offset=not has_offset(problem))
-    intervals = _intervals(problem, posterior, local, model.marginal.noise_db)
+    intervals = _intervals(problem, model, posterior, local)
     best, most_probable = problem.parameters.named(trail.best), _most_probable(model, posterior)
     at_both = model.at_scene_constants(np.stack([relevant[0], most_probable]))
     log_odds = float(at_both[1] - at_both[0])
@@ -237,7 +242,7 @@ def _most_probable(model: JointModel, posterior: Posterior) -> NDArray[np.float6
 
 
 def _intervals(
-    problem: Problem, posterior: Posterior, local: dict[str, Interval], noise_db: float
+    problem: Problem, model: JointModel, posterior: Posterior, local: dict[str, Interval]
 ) -> dict[str, Interval]:
     """Interval and verdict by parameter."""
     parameters, counted = problem.parameters, problem.objective.weight > 0
@@ -252,17 +257,35 @@ def _intervals(
         posterior.means,
         lambda points: problem.objective.capped(problem.modelled(points))[:, counted],
         Axes(parameters.names, lower, upper, value_at),
-        noise_db,
+        model.marginal.noise_db,
         level=CONFIDENCE,
         seen=posterior.seen,
     )
-    intervals = {}
+    intervals, without = {}, remaining_widths(model, posterior)
     for index, (name, verdict) in enumerate(zip(parameters.names, judged, strict=True)):
-        pieces = tuple((value_at(index, low), value_at(index, high)) for low, high in verdict.pieces)
+        pieces, seen = (
+            tuple((value_at(index, low), value_at(index, high)) for low, high in ranges)
+            for ranges in (verdict.pieces, verdict.seen)
+        )
         intervals[name] = Interval(
-            local[name].standard_error, pieces[0][0], pieces[-1][1], verdict.name, pieces, verdict.reason
+            local[name].standard_error,
+            pieces[0][0],
+            pieces[-1][1],
+            verdict.name,
+            pieces,
+            verdict.reason,
+            seen=seen if _differ(verdict) else (),
+            without=without[index],
         )
     return intervals
+
+
+def _differ(verdict: VerdictOnDraws) -> bool:
+    """Whether the interval for the measured buildings differs from that of the mean by a tenth of its width."""
+    one, other = np.array(verdict.pieces), np.array(verdict.seen)
+    return one.shape != other.shape or np.abs(one - other).max() > SHOWN_DIFFERENCE * (
+        verdict.upper - verdict.lower
+    )
 
 
 def _named_draws(problem: Problem, model: JointModel, posterior: Posterior) -> dict[str, list[float]]:

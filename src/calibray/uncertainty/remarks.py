@@ -20,8 +20,9 @@ from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset
 from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
 
-LIKELY: Final = 0.5
-"""Posterior weight above which a departure from independent Gaussian noise is reported."""
+LIKELY: Final = 0.75
+"""Posterior weight above which a departure is reported: odds of three to one. Beforehand, buildings differ with a
+probability of one half."""
 
 SLACK: Final = 0.02
 """Distance of a value from its interval, as a share of the range, above which it is reported."""

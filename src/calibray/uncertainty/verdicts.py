@@ -70,11 +70,13 @@ class Verdict:
         pieces: Lower and upper end of every piece of the credible set, ascending, within the bounds.
         name: The verdict.
         reason: Its reason.
+        seen: The pieces for the measured buildings; the same where these are not distinguished.
     """
 
     pieces: tuple[tuple[float, float], ...]
     name: VerdictName
     reason: Reason
+    seen: tuple[tuple[float, float], ...] = ()
 
     @property
     def lower(self) -> float:
@@ -115,9 +117,11 @@ def verdicts(
     for index in range(len(axes.names)):
         lower, upper = float(axes.lower[index]), float(axes.upper[index])
         pieces, reported = credible_sets(draws.point[:, index], draws.weight, lower, upper, (JUDGED, level))
-        seen_pieces = pieces
+        seen_pieces, seen_reported = pieces, reported
         if seen is not draws:
-            (seen_pieces,) = credible_sets(seen.point[:, index], seen.weight, lower, upper, (JUDGED,))
+            seen_pieces, seen_reported = credible_sets(
+                seen.point[:, index], seen.weight, lower, upper, (JUDGED, level)
+            )
         share = _width(pieces) / (upper - lower)
         seen_share = _width(seen_pieces) / (upper - lower)
         ends = _bounds_reached(pieces, lower, upper)
@@ -144,7 +148,7 @@ def verdicts(
             name = VerdictName.IDENTIFIED if share <= IDENTIFIED else VerdictName.WEAKLY_IDENTIFIED
             others = _outlying_pieces(index, pieces, reported, draws, axes)
             reason = Reason(ReasonKind.WIDTH, {"share": float(share)}, others)
-        result.append(Verdict(reported, name, reason))
+        result.append(Verdict(reported, name, reason, seen_reported))
     return result
 
 
