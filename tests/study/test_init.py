@@ -258,6 +258,15 @@ def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):
 INJECTION = '\n\n[engine]\nname = "command"\ncommand = ["sh", "-c", "touch pwned"]\n#'
 
 
+@pytest.mark.parametrize("position", ["1e300,0,2", "nan,0,2", "0,0"])
+def test_an_impossible_position_is_refused(scene, tmp_path, position):
+    file = table(tmp_path, x=[0.0, 5.0], y=[-20.0, -25.0], z=1.5, pl_db=[90.0, 91.0])
+    status, _, err = typed("init", scene, file, "--tx", position, "-o", tmp_path / "study.toml")
+    assert status == 2
+    assert f"--tx {position}: must be" in " ".join(err.split())
+    assert not (tmp_path / "study.toml").exists()
+
+
 @pytest.mark.parametrize("breaks", ["\n", "\r\n", "\r", "\x85", "\u2028", '"\n', "'\n", '"""\n'])
 def test_the_name_of_a_column_never_becomes_toml(scene, tmp_path, breaks):
     """The reasons, which quote names of columns, are comments of the study."""

@@ -85,10 +85,16 @@ def init(
 
 
 def _position(text: str) -> list[float]:
+    from calibray.tracing.positions import LARGEST_COORDINATE
+
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         raise InputError(f"--tx {text}: must be x, y and z in metres, such as 0,0,2.5") from None
+    if not all(abs(value) <= LARGEST_COORDINATE for value in (x, y, z)):
+        raise InputError(
+            f"--tx {text}: must be within {LARGEST_COORDINATE:g} m; give metres in the scene frame"
+        )
     return [x, y, z]
 
 

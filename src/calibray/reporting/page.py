@@ -193,7 +193,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
     script = _asset("viewer.js")
     layout = None if data.links is None else plan(data.links, data.triangles)
     return environment.get_template("report.html.jinja").render(
-        name=result.study.path.stem,
+        name=_title(result.study.path),
         heading=tables.heading(result),
         date=date.today().isoformat(),
         quantity=measured_quantity(result).name,
@@ -227,6 +227,11 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         versions=_versions(),
         data=_script_data(result, data, layout),
     )
+
+
+def _title(study: Path) -> str:
+    """A study's name: that of its folder where the file has the usual name."""
+    return (study.resolve().parent.name if study.stem == "study" else "") or study.stem
 
 
 def _breakable(name: str) -> Markup:
