@@ -6,7 +6,8 @@
 K-means from several seeds divides the receivers into four clusters. Each is kept apart in turn: the other links are
 validated on blocks, choose the model and give its errors. Three intervals of 90 % are compared at the links kept apart:
 by the ranks of all errors, in two levels (within and between blocks), and in two levels with the error between blocks
-counted twice. Clusters that hold all links of an offset's group are left out.
+counted twice. Clusters that hold all links of an offset's group are left out. A second table has the RMSE of every
+model on the links kept apart, and of the model that was chosen without them.
 """
 
 from __future__ import annotations
@@ -36,8 +37,11 @@ NOISE_DB = 3.0
 WAYS = ("by ranks", "two levels", "two levels, between twice")
 
 
-def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[float]]:
-    """Share of the links kept apart [L] in each kind of interval, and half the widths [dB]."""
+CHOSEN = "chosen without them"
+
+
+def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[float], dict[str, np.ndarray]]:
+    """Share of the links kept apart [L] in each kind of interval, half the widths, errors of every model [dB]."""
     objective, links = problem.objective, problem.setup.links
     part = replace(problem, objective=replace(objective, weight=np.where(apart, 0.0, objective.weight)))
     inner = validate_problem(part)
@@ -52,15 +56,19 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
         factor * float(np.hypot(levels.within_db, levels.between_db)),
         factor * float(np.sqrt(levels.within_db**2 + 2 * levels.between_db**2)),
     ]
-    error = (fit_models(part)[name] - objective.measured)[apart]
-    error = np.abs(error[np.isfinite(error)])
-    return [float(np.mean(error <= half)) for half in halves], halves
+    part = replace(part, setup=part.setup.with_obstruction())
+    errors = {str(model): (loss - objective.measured)[apart] for model, loss in fit_models(part).items()}
+    errors[CHOSEN] = errors[name]
+    error = np.abs(errors[name][np.isfinite(errors[name])])
+    return [float(np.mean(error <= half)) for half in halves], halves, errors
 
 
-def judged(problem: Problem, seeds: int) -> tuple[list[list[float]], list[list[float]]]:
-    """Coverage and half widths of all clusters."""
+def judged(
+    problem: Problem, seeds: int
+) -> tuple[list[list[float]], list[list[float]], list[dict[str, np.ndarray]]]:
+    """Coverage, half widths and errors of all clusters."""
     links, counted = problem.setup.links, np.flatnonzero(problem.objective.weight > 0)
-    inside, halves, seen = [], [], set()
+    inside, halves, errors, seen = [], [], [], set()
     for seed in range(seeds):
         cluster = np.full(len(links), -1)
         cluster[counted] = kmeans2(links.rx[counted, :2], CLUSTERS, rng=seed, minit="++")[1]
@@ -73,11 +81,23 @@ def judged(problem: Problem, seeds: int) -> tuple[list[list[float]], list[list[f
             if key in seen or not known or len(rest) < problem.unknowns + 8 or not apart.any():
                 continue
             seen.add(key)
-            share, half = coverage(problem, apart)
+            share, half, error = coverage(problem, apart)
             inside.append(share)
+            errors.append(error)
             halves.append(half)
             print(f"{links.source}, seed {seed}, cluster {number}: {share}", file=sys.stderr)
-    return inside, halves
+    return inside, halves, errors
+
+
+def rmse_rows(name: str, errors: list[dict[str, np.ndarray]]) -> list[tuple[str, ...]]:
+    """Median and largest RMSE of every model over the clusters, and that over all links."""
+    rows = []
+    for model in errors[0]:
+        by_cluster = [np.sqrt(np.nanmean(error[model] ** 2)) for error in errors if model in error]
+        every = np.concatenate([error[model] for error in errors if model in error])
+        figures = (np.sqrt(np.nanmean(every**2)), np.median(by_cluster), np.max(by_cluster))
+        rows.append((name, model, *(f"{figure:.2f}" for figure in figures)))
+    return rows
 
 
 def planted(name: str, folder: Path, seed: int) -> Problem:
@@ -100,14 +120,15 @@ def main() -> None:
     given = parser.parse_args()
     groups = {"development": districts.DEVELOPMENT, "judging": districts.JUDGING, "": ()}
     names = groups.get(given.districts, tuple(given.districts.split(",")))
-    rows = []
+    rows, accuracy = [], []
     with tempfile.TemporaryDirectory() as folder:
         problems = [(Path(study).stem, opened(study)) for study in given.studies]
         problems += [(name, planted(name, Path(folder), 0)) for name in names]
         for name, problem in problems:
-            inside, halves = judged(problem, given.seeds)
+            inside, halves, errors = judged(problem, given.seeds)
             if not inside:
                 continue
+            accuracy += rmse_rows(name, errors)
             for way, share, half in zip(WAYS, np.transpose(inside), np.transpose(halves), strict=True):
                 rows.append((
                     name, way, str(len(share)), f"{share.mean():.2f}", f"{share.min():.2f}",
@@ -118,6 +139,11 @@ def main() -> None:
         numbers("worst"), numbers("below 0.75"), numbers("half width", "dB"),
     )  # fmt: skip
     print(render(Table(f"Clusters kept apart, k-means from {given.seeds} seeds", columns, tuple(rows))))
+    columns = (
+        Column("links"), Column("model"), numbers("RMSE of all links", "dB"), numbers("median of clusters", "dB"),
+        numbers("worst cluster", "dB"),
+    )  # fmt: skip
+    print(render(Table("Accuracy on the links kept apart", columns, tuple(accuracy))))
 
 
 if __name__ == "__main__":

@@ -237,6 +237,22 @@ def test_predictions_use_the_model_that_validation_chooses(tmp_path, noisy):
     assert loaded.predict_interval(planted.links()).equals(told)
 
 
+def test_the_log_distance_model_with_obstruction_predicts_where_it_is_best(tmp_path, noisy):
+    """Columns of the table take the place of those that the scene gives."""
+    distance = np.linalg.norm(noisy[["rx_x", "rx_y"]].assign(z=-1.5), axis=1)
+    walls = np.arange(12) % 3
+    loss = 30 + 25 * np.log10(distance) + 12.0 * (walls > 0) + 0.5 * walls
+    table = noisy.assign(path_loss_db=loss, out_of_sight=1.0 * (walls > 0), walls_crossed=1.0 * walls)
+    law = run(tmp_path, table, holdout={"blocks": 3})
+    assert law.prediction.model.name == Model.OBSTRUCTION
+    assert law.prediction.model.parameters is None
+    assert law.predict(table) == pytest.approx(loss, abs=1.5)
+    assert law.links.predicted_db.to_numpy() == pytest.approx(law.predict(table))
+    # Without these columns the scene gives them: all links are in sight.
+    in_sight = law.predict(planted.links())
+    assert in_sight[walls > 0] == pytest.approx(loss[walls > 0] - 12.0 - 0.5 * walls[walls > 0], abs=1.5)
+
+
 def test_predictions_have_standard_errors(tmp_path, noisy, result):
     table = result.predict_interval(planted.links(), 0.9)
     truth = planted.path_loss()

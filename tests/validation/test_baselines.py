@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
-from calibray.measurements import Measurements
-from calibray.validation.baselines import log_distance
+from calibray.measurements import Measurements, SourceTable
+from calibray.validation.baselines import OUT_OF_SIGHT_DB, has_obstruction, log_distance, obstructed
 
 DISTANCE = np.geomspace(5, 500, 20)
 LOSS = 38.5 + 27.0 * np.log10(DISTANCE)
@@ -76,3 +77,25 @@ def test_the_law_has_the_nuisances_of_the_study():
     # A group without calibration links gets the mean of the others.
     only_a = objective(links, bounded, calibrated=labels == "a")
     assert log_distance(links, only_a, 3.5e9) == pytest.approx(loss + 15.0 * (labels == "b"))
+
+
+def test_losses_out_of_sight_and_per_wall_are_recovered():
+    walls = np.arange(20) % 4
+    links = measured(LOSS + 12.0 * (walls > 0) + 3.0 * walls, table=blocked(walls))
+    assert obstructed(links, objective(links), 3.5e9) == pytest.approx(links.path_loss_db, abs=0.6)
+    assert abs(log_distance(links, objective(links), 3.5e9) - links.path_loss_db).max() > 6.0
+
+
+def test_links_in_sight_say_nothing_of_those_out_of_sight():
+    """Where none was measured, the loss out of sight is that of the prior."""
+    walls = np.where(np.arange(20) < 15, 0, 1)
+    links = measured(LOSS, table=blocked(walls))
+    law = obstructed(links, objective(links, calibrated=walls == 0), 3.5e9)
+    assert law == pytest.approx(LOSS + OUT_OF_SIGHT_DB[0] * walls, abs=1e-6)
+    assert has_obstruction(links)
+    assert not has_obstruction(links.select(walls == 0))
+
+
+def blocked(walls):
+    """Columns of links whose direct lines cross some walls."""
+    return SourceTable(pd.DataFrame({"out_of_sight": 1.0 * (walls > 0), "walls_crossed": 1.0 * walls}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -110,6 +111,8 @@ def calibrate(
     problem, trail, gap_db = retrace(problem, trail, progress)
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
+    if plan.holdout is not None:
+        problem = replace(problem, setup=problem.setup.with_obstruction())
     validation = None
     if by_blocks:
         many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART

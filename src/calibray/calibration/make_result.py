@@ -31,7 +31,7 @@ from calibray.uncertainty.assessment import Certainty
 from calibray.uncertainty.link_diagnostics import diagnose_links
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
-from calibray.validation.baselines import log_distance
+from calibray.validation.baselines import has_obstruction, log_distance, obstructed
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.fallback import fit_fallback
 from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
@@ -261,6 +261,8 @@ def _choice_on_held_out_links(
         Model.CALIBRATED: models.calibrated,
         Model.LOG_DISTANCE: models.log_distance,
     }
+    if has_obstruction(setup.links):
+        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, setup.study.scene.frequency)
     errors: dict[str, NDArray[np.float64]] = {
         name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
     }

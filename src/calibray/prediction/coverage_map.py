@@ -27,6 +27,7 @@ from calibray.prediction.predict import as_links, open_for_links
 from calibray.result.prediction_model import NO_PATH
 from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total
@@ -162,7 +163,7 @@ def _column_values(
     needed = [*([per] if isinstance(per, str) else per or ())]
     for section in study.nuisance.values():
         needed += [section.per] if section.per is not None else []
-        needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE) else []
+        needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
     for name in needed:
         if name not in values:
             raise InputError(

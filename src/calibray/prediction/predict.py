@@ -23,6 +23,7 @@ from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model
 from calibray.result.record import Record
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
 
@@ -158,7 +159,15 @@ def check_groups(result: Record, links: Measurements) -> None:
     Raises:
         InputError: A group has no calibrated coefficient, or a column is missing.
     """
-    nuisance_shift(model_terms(result.prediction.model, links), links)
+    model = result.prediction.model
+    own = tuple(term for term in model.terms if term.by not in OBSTRUCTION)
+    nuisance_shift(model_terms(replace(model, terms=own), links), links)
+
+
+def _with_columns(result: Record, setup: Setup) -> Setup:
+    """The study with the columns that follow from the scene, if the prediction model has terms by them."""
+    used = any(term.by in OBSTRUCTION for term in result.prediction.model.terms)
+    return setup.with_obstruction() if used else setup
 
 
 def interval(
@@ -180,12 +189,14 @@ def interval(
             residuals.
     """
     if level is None:
+        setup = _with_columns(result, setup)
         path_loss_db = _path_loss(result, setup, progress)
         basis = np.full(len(path_loss_db), str(result.prediction.model.name), dtype=object)
         table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
         return fill_missing(result.prediction, result.study, setup.links, table)
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
+    setup = _with_columns(result, setup)
     links, field, model = setup.links, result.prediction.residual_field, result.prediction.model
     if model.residual_db is None:
         raise InputError(

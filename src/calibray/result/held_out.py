@@ -22,12 +22,18 @@ class Model(StrEnum):
     SLOPE = "calibrated with slope"
     PER_TRANSMITTER = "calibrated, offset per transmitter"
     PRIOR_PER_TRANSMITTER = "calibrated with prior, offset per transmitter"
+    OUT_OF_SIGHT = "calibrated, offset out of sight"
+    PRIOR_OUT_OF_SIGHT = "calibrated with prior, offset out of sight"
     RESIDUAL_FIELD = "calibrated with residual field"
     LOG_DISTANCE = "log-distance"
+    OBSTRUCTION = "log-distance with obstruction"
     KRIGING = "kriging"
 
 
-BASELINES: Final = (Model.INITIAL, Model.LOG_DISTANCE, Model.KRIGING)
+WITHOUT_MATERIALS: Final = (Model.LOG_DISTANCE, Model.OBSTRUCTION)
+"""Models that use no paths; the second uses the scene's walls and roofs."""
+
+BASELINES: Final = (Model.INITIAL, *WITHOUT_MATERIALS, Model.KRIGING)
 """Models that calibrate no material."""
 
 FITTED: Final = (
@@ -36,6 +42,8 @@ FITTED: Final = (
     Model.SLOPE,
     Model.PER_TRANSMITTER,
     Model.PRIOR_PER_TRANSMITTER,
+    Model.OUT_OF_SIGHT,
+    Model.PRIOR_OUT_OF_SIGHT,
 )
 """Models that calibrate materials and can make predictions anywhere."""
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calibray.result.held_out import HeldOutErrors, Judgement, Model
+from calibray.result.held_out import WITHOUT_MATERIALS, HeldOutErrors, Judgement, Model
 from calibray.result.record import Record
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import Cause, Interval, Reason, ReasonKind
@@ -273,7 +273,7 @@ def choice_text(chosen: str, best: str) -> str:
     """
     if chosen == best:
         return f"Predictions use the model {str(chosen)!r}, the best on held-out blocks."
-    reason = "uses the scene" if best == Model.LOG_DISTANCE else "keeps the initial materials"
+    reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
     return (
         f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
         "bootstrap error."
@@ -309,7 +309,7 @@ def prediction_text(record: Record) -> str:
     """
     model = record.prediction.model
     if model.parameters is None:
-        source = "no scene"
+        source = "no materials" if model.name == Model.OBSTRUCTION else "no scene"
     elif model.parameters == record.parameters:
         source = "the calibrated materials"
     else:

@@ -17,6 +17,7 @@ from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
 from calibray.parameters.laws import frequency_independent_law
+from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -173,6 +174,11 @@ class StudyModel(Section, ABC):
         """All nuisance terms by name, the offset first."""
         offset = {} if self.offset is None else {OFFSET: self.offset.term()}
         return offset | {name: section.term() for name, section in self.nuisance.items()}
+
+    @property
+    def uses_obstruction(self) -> bool:
+        """Whether a nuisance is by a column that follows from the scene."""
+        return any(section.by in OBSTRUCTION for section in self.nuisance.values())
 
     @property
     def offset_groups(self) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.scene_file import read_content as scene_content
+from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
 from calibray.study.summary import summary
@@ -256,6 +257,8 @@ class Setup:
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
         if held_out is None:
             held_out = np.zeros(len(links), dtype=bool)
+        if study.uses_obstruction:
+            links = with_obstruction(links, scene, study.scene.frequency)
         return cls(study, links, scene, parameters, held_out, tracer)
 
     def opened(self) -> Setup:
@@ -272,7 +275,14 @@ class Setup:
 
     def at(self, links: Measurements) -> Setup:
         """The same with other links, none of them held out; no file is read again."""
+        if self.study.uses_obstruction:
+            links = with_obstruction(links, self.scene, self.study.scene.frequency)
         return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
+
+    def with_obstruction(self) -> Setup:
+        """The same with the columns that the scene gives in the links' table (`scenes.obstruction.COLUMNS`)."""
+        links = with_obstruction(self.links, self.scene, self.study.scene.frequency)
+        return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     @property
     def radio(self) -> RadioSettings:

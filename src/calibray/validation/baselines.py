@@ -1,4 +1,4 @@
-"""Baselines that use no scene: the log-distance model and kriging between measured points."""
+"""Baselines without paths: the log-distance model, also with what blocks the direct line, and kriging."""
 
 from __future__ import annotations
 
@@ -13,7 +13,18 @@ from calibray.errors import EngineError, InputError
 from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisance, make_term
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements
+from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
 from calibray.uncertainty.residual_correlation import fit_correlation
+
+OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
+"""Mean and standard deviation of the prior of the loss out of sight [dB]: 3GPP TR 38.901 (UMi) gives 10 dB at 20 m and
+20 dB at 100 m. Without a prior, links in sight alone would say nothing of those out of sight."""
+
+WALL_DB: Final = 5.0
+"""Standard deviation of the prior of the loss per wall crossed, around zero [dB]; COST 231 gives 3.4 to 6.9 dB."""
+
+LEAST_NOISE_DB: Final = 1.0
+"""Smallest error of the log-distance model that priors are weighed against [dB]."""
 
 MOST_KRIGED: Final = 1000
 """Most links to krige from: fitting the correlation factors their covariance some hundred times."""
@@ -74,6 +85,62 @@ def log_distance_objective(
             terms.append(make_term(links, name, by))
     nuisance = Nuisance(len(links), tuple(terms))
     return replace(objective, nuisance=nuisance, ceiling_db=None), frequency_term
+
+
+def has_obstruction(links: Measurements) -> bool:
+    """Whether the links have the columns that a scene gives, and the lines of some are blocked."""
+    return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
+
+
+def obstructed(links: Measurements, objective: Objective, frequency: float) -> NDArray[np.float64]:
+    """Path loss of the log-distance model with a loss out of sight and a loss per wall, fitted likewise.
+
+    Args:
+        links: All links, with the columns that the scene gives.
+        objective: The study's objective; its weights say which links are fitted.
+        frequency: Carrier of the study [Hz].
+
+    Returns:
+        Path loss at all links [links], [dB].
+
+    Raises:
+        EngineError: Fewer than two links have a weight.
+    """
+    model, known_db = obstructed_objective(links, objective, frequency)
+    filled, _ = model.nuisance.filled(model.coefficients(known_db[None]), objective.weight > 0)
+    return model.nuisance.contribution(filled)[0] + known_db
+
+
+def obstructed_objective(
+    links: Measurements, objective: Objective, frequency: float
+) -> tuple[Objective, NDArray[np.float64]]:
+    """The log-distance model with obstruction as an objective, like `log_distance_objective`.
+
+    The loss out of sight has a prior around a mean. The mean is part of the known path loss, the rest a coefficient.
+
+    Args:
+        links: All links, with the columns that the scene gives.
+        objective: The study's objective.
+        frequency: Carrier of the study [Hz].
+
+    Returns:
+        The objective, and the known part of its path loss [links], [dB].
+
+    Raises:
+        EngineError: Fewer than two links have a weight.
+    """
+    model, known_db = log_distance_objective(links, objective, frequency)
+    noise_db = max(float(model.value(known_db[None])[0]), LEAST_NOISE_DB)
+    present = {term.by for term in model.nuisance.terms}
+    terms = [
+        make_term(links, by.replace("_", " "), by, prior=prior_db)
+        for by, prior_db in ((OUT_OF_SIGHT, OUT_OF_SIGHT_DB[1]), (WALLS, WALL_DB))
+        if by not in present
+    ]
+    if OUT_OF_SIGHT not in present:
+        known_db = known_db + OUT_OF_SIGHT_DB[0] * links.table.numbers(OUT_OF_SIGHT)
+    nuisance = Nuisance(len(links), (*model.nuisance.terms, *terms))
+    return replace(model, nuisance=nuisance, noise_db=noise_db), known_db
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:

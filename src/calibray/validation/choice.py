@@ -5,7 +5,7 @@ Predictions, maps, exports and the report all use this model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,10 +16,11 @@ from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.materials import Material
-from calibray.result.held_out import Model
+from calibray.result.held_out import WITHOUT_MATERIALS, Model
 from calibray.result.prediction_model import BlockErrors, FittedTerm, PredictionModel
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Study
-from calibray.validation.baselines import log_distance_objective
+from calibray.validation.baselines import OUT_OF_SIGHT_DB, log_distance_objective, obstructed_objective
 from calibray.validation.variants import (
     TX_OFFSET,
     add_nuisance,
@@ -88,10 +89,9 @@ def fit_prediction_model(
     setup, parameters = problem.setup, problem.parameters
     candidate, scene_db = trail.best, trail.best_modelled
     objective, modelled = problem.objective, scene_db
-    if name == Model.LOG_DISTANCE:
-        objective, modelled = log_distance_objective(
-            setup.links, problem.objective, setup.study.scene.frequency
-        )
+    known = log_distance_objective if name == Model.LOG_DISTANCE else obstructed_objective
+    if name in WITHOUT_MATERIALS:
+        objective, modelled = known(setup.links, problem.objective, setup.study.scene.frequency)
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before
         objective, modelled = initial_objective(problem.objective, setup), scene_db
@@ -101,11 +101,12 @@ def fit_prediction_model(
         point = find_minima(variant, best[None], SEARCHES)[0]
         candidate, scene_db = parameters.from_search(point), variant.evaluate(point[None]).modelled[0]
         objective, modelled = variant.objective, scene_db
-    uses_scene = name != Model.LOG_DISTANCE
+    uses_scene = name not in WITHOUT_MATERIALS
+    terms = fitted_terms(objective, modelled, setup.study)
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
-        fitted_terms(objective, modelled, setup.study),
+        with_prior_mean(terms) if name == Model.OBSTRUCTION else terms,
         residuals.rms_db,
         residuals.basis,
         residuals.links,
@@ -114,6 +115,18 @@ def fit_prediction_model(
     )
     materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
+
+
+def with_prior_mean(terms: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
+    """The terms with the mean of the prior in the loss out of sight, which the fit takes as known."""
+    return tuple(
+        replace(
+            term, coefficients={key: OUT_OF_SIGHT_DB[0] + value for key, value in term.coefficients.items()}
+        )
+        if term.name == OUT_OF_SIGHT.replace("_", " ")
+        else term
+        for term in terms
+    )
 
 
 def quantiles(absolute_errors: NDArray[np.float64]) -> tuple[float, ...]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
-from calibray.result.held_out import FITTED, Judgement, Model
+from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Judgement, Model
 from calibray.result.prediction_model import BlockErrors
 
 Errors = Mapping[Any, NDArray[np.float64]]
@@ -120,7 +120,7 @@ def choose(errors: Errors, position: NDArray[np.float64]) -> str:
         The model's name.
     """
     chosen: str = Model.INITIAL
-    for name in (least(errors, FITTED), Model.LOG_DISTANCE):
+    for name in (least(errors, FITTED), *WITHOUT_MATERIALS):
         if name in errors:
             comparison = compare(errors[name], {chosen: errors[chosen]}, position)
             error_db = np.inf if comparison.error_db is None else comparison.error_db

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
-from calibray.result.held_out import BASELINES, FITTED, HeldOutErrors, Judgement, Model
+from calibray.result.held_out import BASELINES, FITTED, WITHOUT_MATERIALS, HeldOutErrors, Judgement, Model
 from calibray.result.prediction_model import BlockErrors
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
@@ -98,7 +98,7 @@ class Validation(HeldOutErrors):
     def choice(self) -> str:
         """Which model predictions use, and why."""
         return choice_text(
-            self.chosen, least(self._on(self.judged), (Model.INITIAL, *FITTED, Model.LOG_DISTANCE))
+            self.chosen, least(self._on(self.judged), (Model.INITIAL, *FITTED, *WITHOUT_MATERIALS))
         )
 
     def scale(self, name: str) -> float:

@@ -24,10 +24,16 @@ from calibray.optimizers import LeastSquares
 from calibray.optimizers.least_squares import CATCH_UP, NEARER
 from calibray.parameters import LogNormal
 from calibray.result.held_out import Model
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup
+from calibray.validation.baselines import has_obstruction
 
 PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
+
+OUT_OF_SIGHT_DB: Final = 10.0
+"""Standard deviation of the prior of an offset of links out of sight, around zero [dB]; in downtown Boulder such links
+lack 11.7 dB."""
 
 MOST_STARTS: Final = 4
 """Known minima that a search starts from."""
@@ -99,6 +105,10 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
         Model.PRIOR: with_prior,
         Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
     }
+    if has_obstruction(setup.links):
+        out_of_sight = replace(_with_term(objective, OUT_OF_SIGHT, setup, OUT_OF_SIGHT_DB), noise_db=noise_db)
+        problems[Model.OUT_OF_SIGHT] = replace(part, objective=out_of_sight)
+        problems[Model.PRIOR_OUT_OF_SIGHT] = replace(with_prior, objective=out_of_sight)
     per_transmitter = _with_offset_per_transmitter(objective, setup)
     if per_transmitter is not None:
         problems[Model.PER_TRANSMITTER] = replace(part, objective=per_transmitter)
@@ -178,11 +188,11 @@ def _with_offset_per_transmitter(objective: Objective, setup: Setup) -> Objectiv
     return replace(objective, nuisance=Nuisance(len(setup.links), (*kept, offset)))
 
 
-def _with_term(objective: Objective, by: str, setup: Setup) -> Objective:
+def _with_term(objective: Objective, by: str, setup: Setup, prior_db: float | None = None) -> Objective:
     """The objective with one coefficient of a kind for all links, unless it has a term of that kind."""
     if any(term.by == by for term in objective.nuisance.terms):
         return objective
-    term = make_term(setup.links, f"{by} of all links", by)
+    term = make_term(setup.links, f"{by} of all links", by, prior=prior_db)
     terms = (*objective.nuisance.terms, term)
     return replace(objective, nuisance=Nuisance(len(setup.links), terms))
 

@@ -1,0 +1,248 @@
+"""What stands between the ends of links: the straight line through buildings, over roofs and across walls.
+
+Buildings reach from the ground to their roofs. A line is inside a building where a roof is above it. All lengths follow
+from the crossings of the line with the scene's triangles, in plan for roofs and in space for walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.scenes.triangles import LEVEL, Triangles
+
+OUT_OF_SIGHT: Final = "out_of_sight"
+WALLS: Final = "walls_crossed"
+
+COLUMNS: Final = (OUT_OF_SIGHT, WALLS, "obstruction_m", "knife_edge_db")
+"""Columns of links that a scene gives: whether the straight line between the ends is blocked, how many walls it
+crosses, its length inside buildings [m], and the knife-edge loss of the highest roof [dB]."""
+
+SAME_CROSSING: Final = 1e-3
+"""Crossings closer than this are one, on an edge that two triangles share [m]."""
+
+BATCH: Final = 2_000_000
+"""Pairs of a line and a triangle in memory at once."""
+
+CLEAR: Final = -0.78
+"""Fresnel parameter below which an edge causes no loss (ITU-R P.526-15, section 4.1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Obstruction:
+    """What the straight lines between the ends of links meet.
+
+    Attributes:
+        length_m: Length inside buildings [n], [m].
+        walls: Number of walls crossed [n].
+        clearance: Largest Fresnel parameter of a roof's edge for a wavelength of 1 m [n]; -inf over no building.
+    """
+
+    length_m: NDArray[np.float64]
+    walls: NDArray[np.int64]
+    clearance: NDArray[np.float64]
+
+    def columns(self, wavelength: NDArray[np.float64] | float) -> dict[str, NDArray[np.float64]]:
+        """The values of `COLUMNS` [n] by name, for a wavelength [m] of all links or of each [n]."""
+        values = (self.out_of_sight, self.walls, self.length_m, self.knife_edge_db(wavelength))
+        return {name: value.astype(np.float64) for name, value in zip(COLUMNS, values, strict=True)}
+
+    @property
+    def out_of_sight(self) -> NDArray[np.bool_]:
+        """Whether a wall or a roof is between the ends [n]."""
+        return (self.length_m > 0) | (self.walls > 0)
+
+    def knife_edge_db(self, wavelength: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Diffraction loss of the highest roof edge as a knife edge, ITU-R P.526-15 equation 31 [n], [dB].
+
+        Args:
+            wavelength: The wavelength [m], of all links or of each [n].
+        """
+        parameter = self.clearance / np.sqrt(wavelength)
+        above = np.maximum(parameter, CLEAR) - 0.1
+        loss_db = 6.9 + 20 * np.log10(np.sqrt(above**2 + 1) + above)
+        return np.where(parameter > CLEAR, loss_db, 0.0)
+
+
+def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[np.float64]) -> Obstruction:
+    """What stands between the ends of links.
+
+    Args:
+        triangles: The scene's triangles; those of the ground are no obstacles.
+        start: One end of each link [n, 3], [m].
+        end: The other end [n, 3], [m].
+
+    Returns:
+        The obstruction of every link.
+
+    Example:
+        A roof 10 m high over the square from (0, 0) to (10, 10) m, and one wall at x = 0:
+
+        >>> vertex = np.array([[0, 0, 10], [10, 0, 10], [10, 10, 10], [0, 10, 10], [0, 0, 0], [0, 10, 0.0]])
+        >>> face = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [3, 5, 4]])
+        >>> box = Triangles(vertex, face, np.zeros(4, int), np.zeros(4, bool))
+        >>> found = obstruction(box, np.array([[-5, 3, 2.0]]), np.array([[15, 3, 2.0]]))
+        >>> found.length_m.tolist(), found.walls.tolist()
+        ([10.0], [1])
+    """
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    obstacles, normal = triangles.corners[~triangles.ground], triangles.normal[~triangles.ground]
+    area = np.linalg.norm(normal, axis=1)
+    level = np.abs(normal[:, 2]) > LEVEL * area
+    length, clearance = np.zeros(len(start)), np.full(len(start), -np.inf)
+    walls = np.zeros(len(start), dtype=np.int64)
+    # Lines from a common end are sorted by azimuth; the end with fewer positions serves.
+    swap = len(np.unique(end[:, :2], axis=0)) < len(np.unique(start[:, :2], axis=0))
+    first, last = (end, start) if swap else (start, end)
+    roofs, sides = obstacles[level & (area > 0)], obstacles[~level & (area > 0)]
+    spans: list[NDArray[np.float64]] = []
+    for line, face in _pairs(first, last, roofs):
+        below, parameter = _under(first[line], last[line], roofs[face])
+        np.maximum.at(clearance, line, parameter)
+        inside = below[:, 1] > below[:, 0]
+        spans.append(np.column_stack([line.astype(np.float64), below])[inside])
+    for line, lower, upper in _united(np.concatenate([np.zeros((0, 3)), *spans])):
+        np.add.at(length, line, upper - lower)
+    length *= np.linalg.norm(end - start, axis=1)
+    crossings = [
+        np.column_stack([line, distance])[np.isfinite(distance)]
+        for line, face in _pairs(first, last, sides)
+        for distance in (_crossing(first[line], last[line], sides[face]),)
+    ]
+    crossed = np.concatenate([np.zeros((0, 2)), *crossings])
+    crossed = crossed[np.lexsort(crossed.T[::-1])]
+    separate = np.ones(len(crossed), dtype=bool)
+    separate[1:] = (np.diff(crossed[:, 0]) > 0) | (np.diff(crossed[:, 1]) > SAME_CROSSING)
+    np.add.at(walls, crossed[separate, 0].astype(np.int64), 1)
+    return Obstruction(length, walls, clearance)
+
+
+def _pairs(
+    first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Lines and triangles that may cross in plan: the line's azimuth lies between those of the triangle's corners.
+
+    Yields:
+        Index of the line and of the triangle of each pair, in batches.
+    """
+    if not len(corners):
+        return
+    origins, of = np.unique(first[:, :2], axis=0, return_inverse=True)
+    step = last[:, :2] - first[:, :2]
+    azimuth = np.arctan2(step[:, 1], step[:, 0])
+    for number, origin in enumerate(origins):
+        lines = np.flatnonzero(of.reshape(-1) == number)
+        lines = lines[np.argsort(azimuth[lines], kind="stable")]
+        sorted_azimuth = azimuth[lines]
+        # Once more a turn on, so that a range across 180 degrees is one piece.
+        twice = np.concatenate([sorted_azimuth, sorted_azimuth + 2 * np.pi])
+        relative = corners[:, :, :2] - origin
+        direction = np.arctan2(relative[..., 1], relative[..., 0])
+        turn = np.angle(np.exp(1j * (direction - direction[:, :1])))
+        low, high = direction[:, 0] + turn.min(axis=1), direction[:, 0] + turn.max(axis=1)
+        around = high - low > np.pi * (1 - 1e-9)  # the origin is inside the triangle or on its side
+        low, high = np.where(around, -np.pi, low) - 1e-12, np.where(around, np.pi, high) + 1e-12
+        shift = np.where(low < -np.pi, 2 * np.pi, 0.0)
+        begin = np.searchsorted(twice, low + shift, "left")
+        count = np.searchsorted(twice, high + shift, "right") - begin
+        count = np.where(around, len(lines), count)
+        begin = np.where(around, 0, begin)
+        total = np.cumsum(count)
+        face = 0
+        while face < len(corners):
+            done = total[face - 1] if face else 0
+            until = max(face + 1, int(np.searchsorted(total, done + BATCH, "right")))
+            number_of = count[face:until]
+            index = np.repeat(np.arange(face, until), number_of)
+            within = np.arange(len(index)) - np.repeat(np.cumsum(number_of) - number_of, number_of)
+            yield lines[(begin[index] + within) % len(lines)], index
+            face = until
+
+
+def _under(
+    first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where lines pass below level triangles [n, 2], as shares of the line, and the Fresnel parameter of their edges.
+
+    The part of the line over the triangle in plan follows from clipping at its three sides.
+    """
+    step = last - first
+    low, high = np.zeros(len(first)), np.ones(len(first))
+    orientation = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(3):
+            side = corners[:, (k + 1) % 3] - corners[:, k]
+            sign = np.sign(orientation)
+            distance = sign * _cross(side, first - corners[:, k])  # inside where positive
+            slope = sign * _cross(side, step)
+            share = -distance / slope
+            low = np.where(slope > 0, np.maximum(low, share), low)
+            high = np.where(slope < 0, np.minimum(high, share), high)
+            high = np.where((slope == 0) & (distance < 0), -1.0, high)
+        over = high > low
+        # Height of the triangle's plane above the line, linear along it.
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        ends = np.stack([low, high])
+        point = first + ends[..., None] * step
+        offset = point[..., :2] - corners[:, 0, :2]
+        roof = corners[:, 0, 2] - (normal[:, :2] * offset).sum(axis=-1) / normal[:, 2]
+        above = np.where(over, roof - point[..., 2], -1.0)
+        zero = low + (high - low) * above[0] / (above[0] - above[1])
+        lower = np.where(above[0] > 0, low, zero)
+        upper = np.where(above[1] > 0, high, zero)
+        # Fresnel parameter h sqrt(2 / lambda (1 / d1 + 1 / d2)), ITU-R P.526-15 equation 26, for a wavelength of 1 m
+        length = np.linalg.norm(step, axis=1)
+        away = np.clip(ends, 1e-6, 1 - 1e-6)
+        parameter = above * np.sqrt(2 / length * (1 / away + 1 / (1 - away)))
+    below = over & ((above[0] > 0) | (above[1] > 0))
+    spans = np.where(below[:, None], np.column_stack([lower, upper]), 0.0)
+    return spans, np.where(over, parameter.max(axis=0), -np.inf)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _united(
+    spans: NDArray[np.float64],
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+    """The union of spans (line, lower, upper) that may overlap, line by line.
+
+    Yields:
+        Line, lower and upper end of each piece.
+    """
+    count = len(spans)
+    if not count:
+        return
+    event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
+    change = np.repeat([1, -1], count)
+    order = np.lexsort((-change, event[:, 1], event[:, 0]))
+    depth = np.cumsum(change[order])
+    begins = (depth == 1) & (change[order] == 1)
+    ends = depth == 0
+    line = event[order][begins, 0].astype(np.int64)
+    yield line, event[order][begins, 1], event[order][ends, 1]
+
+
+def _crossing(
+    first: NDArray[np.float64], last: NDArray[np.float64], corners: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance from the first end at which each line crosses its triangle [n], [m]; NaN where it does not.
+
+    Moeller and Trumbore, J. Graphics Tools 2(1), 1997.
+    """
+    step = last - first
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(step, other)
+    offset = first - corners[:, 0]
+    normal = np.cross(offset, one)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / (across * one).sum(axis=1)
+        u, v = (offset * across).sum(axis=1) * inverse, (step * normal).sum(axis=1) * inverse
+        share = (other * normal).sum(axis=1) * inverse
+        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (share > 0) & (share < 1)
+    return np.where(hit, share * np.linalg.norm(step, axis=1), np.nan)
