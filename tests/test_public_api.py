@@ -15,6 +15,8 @@ SIGNATURES = {
     "itu_material": "name, frequency, thickness, revision, scattering",
     "read_measurements": "path, tx, rx, value, quantity, where, group, weight, std, tx_power_dbm, frequency",
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
+    "read_rays": "rays, scene, frequency, antennas, axes",
+    "write_rays": "paths, file, overwrite",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
     "calibrate": "study, method, seed, out, engine, workers, progress, tracer, overwrite, cheap_model",

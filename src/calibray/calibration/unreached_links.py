@@ -40,7 +40,8 @@ def unreached_remark(problem: Problem, progress: Progress | None = None) -> tupl
             usable &= ~excluded
     unreached = np.flatnonzero(usable & ~np.isfinite(problem.before))
     few = len(unreached) < max(FEWEST, SHARE * usable.sum())
-    if few or setup.links.frequency is not None or not isinstance(problem.engine, Replay):
+    traced = setup.study.rays_path is None and isinstance(problem.engine, Replay)
+    if few or setup.links.frequency is not None or not traced:
         return ()
     sample = np.sort(np.random.default_rng(0).permutation(unreached)[:SAMPLE])
     trace = setup.study.trace

@@ -352,6 +352,8 @@ def _group(paths: Paths, group: PathGroup, table_row: NDArray[np.int64], dtype: 
         )
     # (lambda / 4 pi) A of the gain of a path
     scale = paths.spreading[group.paths] * speed_of_light / paths.frequency / (4 * np.pi)
+    if paths.correction is not None:
+        scale = scale * np.sqrt(paths.correction[group.paths])
     tx, rx = paths.tx_field[group.paths], paths.rx_field[group.paths] * scale[:, None, None]
     return Group(
         tx=_parts(np.moveaxis(tx, 0, -1), dtype, _num_parts(paths.tx_field)),

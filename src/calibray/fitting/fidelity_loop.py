@@ -37,7 +37,7 @@ def retrace(
     setup, section = problem.setup, problem.setup.study.engine
     study, parameters = setup.study, problem.parameters
     sampled = study.trace.refraction or study.trace.diffuse_reflection
-    if not sampled or not study.fidelity.rounds or not isinstance(section, ReplaySection):
+    if not sampled or not study.fidelity.rounds or not isinstance(section, ReplaySection) or section.rays:
         return problem, trail, None
     gap = None
     for turn in range(study.fidelity.rounds):

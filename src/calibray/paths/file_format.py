@@ -115,12 +115,20 @@ DATASETS: Final[Mapping[str, Dataset]] = MappingProxyType(
     }
 )
 
+# Zero would remove a path; the largest value is far beyond any antenna and power.
+OPTIONAL: Final[Mapping[str, Dataset]] = MappingProxyType(
+    {"paths/correction": Dataset(("P",), "f", 1e-30, 1e30)}
+)
+"""Datasets that a file need not have."""
+
 
 def write(file: h5py.File, content: Content) -> None:
-    """Write the content of a path file, with every dataset of `DATASETS`, to an open, empty file."""
+    """Write the content of a path file, with every dataset of `DATASETS`, and those of `OPTIONAL` that it has."""
     file.attrs.update({"format": FORMAT, "version": FORMAT_VERSION, "frequency_hz": content.frequency})
     file.attrs.update({f"{_SETTING}{key}": value for key, value in content.settings.items()})
-    for name, dataset in DATASETS.items():
+    for name, dataset in (DATASETS | OPTIONAL).items():
+        if name in OPTIONAL and name not in content.arrays:
+            continue
         values = content.arrays[name]
         file[name] = np.array(values, dtype=h5py.string_dtype()) if dataset.kind == "O" else values
 
@@ -141,7 +149,8 @@ def read(file: h5py.File) -> Content:
     if isinstance(frequency, str | bool | np.bool_) or not lower <= float(frequency) <= upper:
         fault = _damaged(f"frequency_hz = {frequency!r}, must lie in {lower:g} to {upper:g} Hz")
         raise fault
-    arrays = {name: _array(file, name, dataset) for name, dataset in DATASETS.items()}
+    present = {name: dataset for name, dataset in OPTIONAL.items() if name in file}
+    arrays = {name: _array(file, name, dataset) for name, dataset in (DATASETS | present).items()}
     _check_shapes(arrays)
     _check_values(arrays)
     _check_indices(arrays)
@@ -187,6 +196,11 @@ def _array(file: h5py.File, name: str, dataset: Dataset) -> NDArray[Any]:
     return item[()]
 
 
+def _datasets(arrays: Mapping[str, NDArray[Any]]) -> list[tuple[str, Dataset]]:
+    """The datasets that a file has."""
+    return [(name, dataset) for name, dataset in (DATASETS | OPTIONAL).items() if name in arrays]
+
+
 def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     kinds = arrays["interactions/kind"]
     sizes = {
@@ -205,14 +219,14 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
             raise _damaged(f"{sizes[port]} ports, must be 1 or 2")
     if not sizes["L"]:
         raise _damaged("no links")
-    for name, dataset in DATASETS.items():
+    for name, dataset in _datasets(arrays):
         expected = tuple(sizes[size] if isinstance(size, str) else size for size in dataset.shape)
         if arrays[name].shape != expected:
             raise _damaged(f"dataset {name} has the shape {arrays[name].shape}, must be {expected}")
 
 
 def _check_values(arrays: Mapping[str, NDArray[Any]]) -> None:
-    for name, dataset in DATASETS.items():
+    for name, dataset in _datasets(arrays):
         values = arrays[name]
         if dataset.kind == "O":
             continue

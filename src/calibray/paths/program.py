@@ -64,6 +64,8 @@ class Paths:
         diffuse: Further constants of the diffuse interactions.
         diffraction: Further constants of the diffractions.
         settings: How the paths were traced, for the record.
+        correction: Power of the path in the engine that found it over the power of its replay there [P]; the power of
+            the path is multiplied by it. None if the replay needs no correction.
     """
 
     frequency: float
@@ -86,6 +88,7 @@ class Paths:
     diffuse: Diffuse = field(default_factory=Diffuse.empty)
     diffraction: Diffraction = field(default_factory=Diffraction.empty)
     settings: Mapping[str, object] = field(default_factory=dict)
+    correction: NDArray[np.float64] | None = None
 
     def __repr__(self) -> str:
         rows = (f"  {name:<13}{shorten(text, _WIDTH - 15)}" for name, text in _summary(self).items())
@@ -245,6 +248,8 @@ def _content(paths: Paths) -> Content:
             arrays[name] = np.imag(getattr(paths, attribute.removesuffix("_imag")))
         elif group != "materials":
             arrays[name] = getattr(paths, attribute)
+    if paths.correction is not None:
+        arrays["paths/correction"] = paths.correction
     return Content(paths.frequency, paths.settings, arrays)
 
 

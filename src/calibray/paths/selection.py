@@ -29,6 +29,7 @@ def take(paths: Paths, index: NDArray[np.int64]) -> Paths:
         **{name: getattr(paths, name)[index] for name in _PATH_ARRAYS},
         **{name: getattr(paths, name)[interaction] for name in _INTERACTION_ARRAYS},
         first=first,
+        correction=None if paths.correction is None else paths.correction[index],
         diffuse=_rows(paths.diffuse, paths.kind == Kind.DIFFUSE, interaction),
         diffraction=_rows(paths.diffraction, paths.kind == Kind.DIFFRACTION, interaction),
     )
@@ -63,6 +64,7 @@ def concatenate(parts: Sequence[Paths]) -> Paths:
             for name in _PATH_ARRAYS + _INTERACTION_ARRAYS
         },
         first=np.concatenate([*first, offsets[-1:]]),
+        correction=_joined_corrections(parts),
         diffuse=_joined([part.diffuse for part in parts]),
         diffraction=_joined([part.diffraction for part in parts]),
     )
@@ -90,6 +92,15 @@ def _rows(table: Table, has_row: NDArray[np.bool_], interaction: NDArray[np.int6
     """The rows of some interactions in the table of their kind; `has_row` marks the interactions of that kind [I]."""
     row = (np.cumsum(has_row) - 1)[interaction[has_row[interaction]]]
     return type(table)(*(getattr(table, field.name)[row] for field in fields(table)))
+
+
+def _joined_corrections(parts: Sequence[Paths]) -> NDArray[np.float64] | None:
+    """Corrections of all paths; None if no part has any."""
+    if all(part.correction is None for part in parts):
+        return None
+    return np.concatenate(
+        [np.ones(part.num_paths) if part.correction is None else part.correction for part in parts]
+    )
 
 
 def _joined(tables: Sequence[Table]) -> Table:

@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from calibray.engines.kinds import AnyEngine, default
+from calibray.engines.kinds.replay import ReplaySection
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
@@ -154,6 +155,12 @@ class StudyModel(Section, ABC):
         return None if track is None else self._resolve("links.track.file", track.file)
 
     @property
+    def rays_path(self) -> Path | None:
+        """The ray table that is replayed, if there is one."""
+        file = self.engine.rays if isinstance(self.engine, ReplaySection) else None
+        return None if file is None else self._resolve("engine.rays", file)
+
+    @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
         """The transmit and the receive antenna, with resolved paths of gain tables."""
         return self._antenna("tx", self.antennas.tx), self._antenna("rx", self.antennas.rx)
@@ -266,6 +273,7 @@ class StudyModel(Section, ABC):
             ("links.file", links.file, self.links_path),
             ("links.transmitters", links.transmitters, self.transmitters_path),
             ("links.track.file", links.track and links.track.file, self.track_path),
+            ("engine.rays", getattr(self.engine, "rays", None), self.rays_path),
         ]
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))

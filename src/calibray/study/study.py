@@ -38,6 +38,7 @@ from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
+from calibray.study.sections import AntennasSection
 from calibray.study.summary import summary
 from calibray.study.toml_file import read_content, refuse_unquoted_names, split_engine_keys
 from calibray.study.validation_errors import explain
@@ -353,7 +354,8 @@ class Setup:
             Path(antenna.gain_file) for antenna in self.study.antenna_pair if antenna.gain_file is not None
         ]
         digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
-        for file in (*cache.mesh_files(self.scene), *gains):
+        rays = [] if self.study.rays_path is None else [self.study.rays_path]
+        for file in (*cache.mesh_files(self.scene), *gains, *rays):
             digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
         return digests
 
@@ -364,7 +366,7 @@ class Setup:
     def trace(
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
-        """The paths of the links, from the cache if they were traced before.
+        """The paths of the links, from the cache if they were traced before; or from the ray table of the study.
 
         Links that differ only in their carrier are traced once.
 
@@ -381,6 +383,8 @@ class Setup:
         """
         for name in materials or {}:
             check_material_name(name, self.scene.materials, "materials")
+        if self.study.rays_path is not None:
+            return self._paths_of_table(self.study.rays_path, materials or {})
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._trace(self.links, scene, progress)
@@ -410,6 +414,18 @@ class Setup:
             paths = self.tracer.trace(links, progress, scene.materials)
             cache.store_trace(digest, paths)
         return paths
+
+    def _paths_of_table(self, file: Path, materials: Mapping[str, Material]) -> Paths:
+        """The paths of the study's ray table, whose powers are those at the start values."""
+        from calibray.engines.rays.compile import RaySetting, compile_rays
+        from calibray.engines.rays.files import read_ray_file
+        from calibray.engines.rays.table import RayTable
+
+        # Antennas that the study does not state are those of the engine, which are unknown.
+        stated = self.radio.antennas if self.study.antennas != AntennasSection() else None
+        setting = RaySetting(self.scene, self.study.scene.frequency, stated, self.links)
+        paths = compile_rays(RayTable.of(read_ray_file(file)), setting)
+        return replace(paths, materials={**paths.materials, **materials})
 
     def _with_tracer(self, changed: Setup) -> Setup:
         """A changed setup with the same tracer, which depends neither on links nor on methods."""

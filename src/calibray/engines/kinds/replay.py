@@ -14,6 +14,7 @@ from calibray.engines.section import EngineSection, OpenedStudy
 from calibray.errors import InputError
 from calibray.support.messages import duration
 from calibray.support.progress import Progress
+from calibray.support.strict_models import Text
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.chunked_replay import ChunkedReplay
@@ -34,6 +35,7 @@ class ReplaySection(EngineSection):
         compress_db: Replay few weighted paths in place of all, with this largest error of path loss [dB]; all if None.
         chunk_links: Largest number of links that are traced and replayed together. If None, all links at once, or with
             workers `chunks.CHUNK_LINKS` links in at most `chunks.MOST_CHUNKS` chunks.
+        rays: Ray table with the paths of another engine, in place of tracing.
     """
 
     expensive: ClassVar[bool] = False
@@ -44,6 +46,7 @@ class ReplaySection(EngineSection):
     name: Literal["replay"] = "replay"  # pyright: ignore[reportIncompatibleVariableOverride]
     compress_db: Annotated[float, Field(gt=0)] | None = None
     chunk_links: Annotated[int, Field(ge=1)] | None = None
+    rays: Text | None = None
 
     def answers_by(self, study: OpenedStudy) -> None:
         """Nothing: replay keeps no answers."""

@@ -1,0 +1,287 @@
+"""From a ray table to a path program and back, with checks and the correction of every path's power.
+
+The correction is the power that the engine states over the power of the replay. It contains what the engine knows and
+the study does not, such as antennas: replay at other constants multiplies it by the ratio of the replayed powers.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import speed_of_light
+from scipy.spatial import KDTree
+
+from calibray.engines.rays.surfaces import TOLERANCE, Hits, Surfaces, find_edge, match
+from calibray.engines.rays.table import RayTable
+from calibray.errors import InputError
+from calibray.fields import path_gains
+from calibray.paths import Kind, Paths, take_links
+from calibray.paths.chains import Chains
+from calibray.scenes import Scene, check_material_name
+from calibray.tracing.antennas import AntennaPattern
+from calibray.tracing.protocol import Links, compile_paths
+from calibray.tracing.settings import Antenna
+
+_LOG: Final = logging.getLogger(__name__)
+
+UNKNOWN: Final = Antenna("iso", "VH")
+"""Antenna at an end whose antenna is unknown: no polarization is lost, and the correction contains the rest."""
+
+FREE_SPACE_DB: Final = 1.0
+"""Largest difference of a direct path from its free-space power where antennas are known [dB]: engines' tables of a
+pattern differ by tenths, while transmitted power or watts in place of decibels makes tens."""
+
+DIRECT_GAIN_DB: Final = 60.0
+"""Gain of both antennas together that no direct path exceeds [dB]: two dishes of 30 dBi."""
+
+
+@dataclass(frozen=True, eq=False)
+class RaySetting:
+    """What the paths of a table are read for.
+
+    Attributes:
+        scene: The scene, with the constants that the engine used.
+        frequency: Carrier frequency [Hz].
+        antennas: Transmit and receive antenna; None if they are unknown.
+        links: The links of the program; those of the table if None.
+    """
+
+    scene: Scene
+    frequency: float
+    antennas: tuple[Antenna, Antenna] | None = None
+    links: Links | None = None
+
+
+def compile_rays(table: RayTable, setting: RaySetting) -> Paths:
+    """Compile the paths of a table.
+
+    Raises:
+        InputError: The table does not agree with the scene, the links or itself.
+    """
+    scene = setting.scene
+    tx, rx, link, chosen = _assign_links(table, setting.links)
+    order = np.argsort(link, kind="stable")[(link < 0).sum() :]
+    table, link = table.take(order), link[order]
+    chains, distance = _chains(table, scene)
+    _check_delays(table, chains)
+    antennas = setting.antennas or (UNKNOWN, UNKNOWN)
+    paths = compile_paths(
+        chains, link, tx, rx, frequency=setting.frequency, materials=scene.materials,
+        antennas=(AntennaPattern.of(antennas[0]), AntennaPattern.of(antennas[1])),
+        settings={"rays": table.source, "scene": scene.source, "largest_distance_m": distance},
+    )  # fmt: skip
+    if scene.local_origin.any():
+        # In double precision, because single precision would round vertices far from the origin.
+        paths = replace(paths, vertex=table.vertex[table.kind != 0])
+    if table.power is not None:
+        _check_direct(table, paths, table.power, setting.antennas is not None)
+        paths = replace(paths, correction=_correction(table, paths, table.power))
+    elif (table.kind == Kind.DIFFUSE).any():
+        raise InputError(
+            f"{table.source}: diffuse reflections need the power of the path, because the solid angle of their rays is "
+            "unknown; add power_db"
+        )
+    return paths if chosen is None else take_links(paths, chosen)
+
+
+def rays_of(paths: Paths) -> RayTable:
+    """The ray table of a path program, with the power of every path for the program's materials.
+
+    Raises:
+        InputError: A path has no power.
+    """
+    count, depth = paths.num_paths, np.diff(paths.first)
+    shape = count, int(depth.max(initial=0))
+    present = np.arange(shape[1]) < depth[:, None]
+    kind, vertex = np.zeros(shape, dtype=np.int64), np.zeros((*shape, 3))
+    material = np.full(shape, "", dtype=object)
+    kind[present], vertex[present] = paths.kind, paths.vertex
+    material[present] = np.array(list(paths.materials), dtype=object)[paths.material]
+    power = _powers(paths)
+    if not (power > 0).all():
+        raise InputError(
+            f"path {int(np.argmin(power))} has no power, which a ray table cannot state; leave it out with "
+            "calibray.paths.take"
+        )
+    return RayTable(
+        "paths", np.arange(count), paths.link, paths.tx_position[paths.link],
+        paths.rx_position[paths.link], vertex, kind, material.astype(np.str_), np.full(shape, ""), power, paths.delay,
+    )  # fmt: skip
+
+
+def _powers(paths: Paths) -> NDArray[np.float64]:
+    """Power gain of every path, summed over receive ports and averaged over transmit ports [P]."""
+    gain = path_gains(paths).reshape(paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1])
+    return (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
+
+
+def _chains(table: RayTable, scene: Scene) -> tuple[Chains, float]:
+    """The paths with the normals and materials of their surfaces; and the largest distance from one [m]."""
+    present = table.kind != 0
+    stops = np.concatenate([table.tx[:, None], table.vertex, table.rx[:, None]], axis=1)
+    stops[np.arange(len(stops)), present.sum(axis=1) + 1] = table.rx
+    ahead = np.diff(stops, axis=1)
+    length = np.linalg.norm(ahead, axis=2)
+    used = np.hstack([np.ones((len(stops), 1), bool), present])
+    if (used & (length == 0)).any():
+        number = int(np.argmax((used & (length == 0)).any(axis=1)))
+        raise InputError(f"{table.source}: path {table.path[number]} has the same point twice; correct it")
+    row, step = np.nonzero(present)
+    direction = ahead / np.where(length > 0, length, 1)[..., None]
+    names = list(scene.materials)
+    hits = Hits(
+        point=table.vertex[present],
+        incident=direction[row, step],
+        leaving=direction[row, step + 1],
+        length=np.minimum(length[row, step], length[row, step + 1]),
+        reflects=table.kind[present] == Kind.SPECULAR,
+        material=_stated_materials(table, scene)[present],
+        label=np.array(
+            [f"{table.source}: path {table.path[p]}, point {s + 1}" for p, s in zip(row, step, strict=True)]
+        ),
+    )
+    _check_straight(hits, table.kind[present] == Kind.REFRACTION)
+    surfaces = Surfaces.of(scene)
+    wedge = table.kind[present] == Kind.DIFFRACTION
+    face, distance = match(surfaces, replace(hits, material=np.where(wedge, -1, hits.material)), names)
+    normal = np.zeros((*table.kind.shape, 3))
+    normal[present] = surfaces.normal[face]
+    edge, normal_n, lengths = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2))
+    if wedge.any():
+        edge, normal_n, lengths = (np.zeros((len(stops), width)) for width in (3, 3, 2))
+    for number in np.flatnonzero(wedge).tolist():
+        path, at = row[number], step[number]
+        found = find_edge(surfaces, hits, number)
+        face[number], normal[path, at] = found.face, found.normal_0
+        edge[path], normal_n[path] = found.direction, found.normal_n
+        lengths[path] = length[path, : at + 1].sum(), (length * used)[path, at + 1 :].sum()
+    material = np.zeros(table.kind.shape, dtype=np.int64)
+    material[present] = surfaces.material[face]
+    return Chains(
+        table.tx, table.rx, table.vertex, normal, table.kind, material, np.ones(table.kind.shape),
+        edge=edge, normal_n=normal_n, edge_lengths=lengths,
+    ), distance  # fmt: skip
+
+
+def _stated_materials(table: RayTable, scene: Scene) -> NDArray[np.int64]:
+    """Index of the stated material, or of that of the stated object; -1 if neither is stated [P, D]."""
+    names = {name: index for index, name in enumerate(scene.materials)}
+    by_object = {item.name: names[item.material] for item in scene.objects}
+    index = np.full(table.kind.shape, -1)
+    for name in np.unique(table.object[table.object != ""]).tolist():
+        if name not in by_object:
+            raise InputError(
+                f"{table.source}: the scene has no object {name!r}; correct it, or leave it empty"
+            )
+        index[table.object == name] = by_object[name]
+    for name in np.unique(table.material[table.material != ""]).tolist():
+        check_material_name(name, names, f"{table.source}: material")
+        stated = table.material == name
+        if (stated & (index >= 0) & (index != names[name])).any():
+            raise InputError(
+                f"{table.source}: states the material {name!r} for an object of another material of the scene"
+            )
+        index[stated] = names[name]
+    return index
+
+
+def _check_straight(hits: Hits, transmits: NDArray[np.bool_]) -> None:
+    bend = np.linalg.norm(hits.leaving - hits.incident, axis=1) * hits.length
+    if (transmits & (bend > 4 * TOLERANCE)).any():
+        number = int(np.argmax(np.where(transmits, bend, 0)))
+        raise InputError(
+            f"{hits.label[number]}: the path bends by {bend[number]:.3g} m at a transmission; a transmitted ray is "
+            "straight, so correct its type or its vertices"
+        )
+
+
+def _check_delays(table: RayTable, chains: Chains) -> None:
+    if table.delay is None:
+        return
+    present = chains.kind != 0
+    stops = np.concatenate([chains.source[:, None], chains.vertex, chains.target[:, None]], axis=1)
+    stops[np.arange(len(stops)), present.sum(axis=1) + 1] = chains.target
+    used = np.hstack([np.ones((len(stops), 1), bool), present])
+    length = (np.linalg.norm(np.diff(stops, axis=1), axis=2) * used).sum(axis=1)
+    off = np.abs(table.delay * speed_of_light - length)
+    if (wrong := off > 2 * TOLERANCE * used.sum(axis=1) + 1e-4 * length).any():
+        worst = int(np.argmax(np.where(wrong, off / length, 0)))
+        raise InputError(
+            f"{table.source}: path {table.path[worst]} has the delay {table.delay[worst]:.6g} s, but a length of "
+            f"{length[worst]:.6g} m, which takes {length[worst] / speed_of_light:.6g} s ({wrong.sum()} of {len(off)} "
+            "paths); give the total delay in seconds, not relative to the first path"
+        )
+
+
+def _assign_links(
+    table: RayTable, links: Links | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64] | None]:
+    """Ends of distinct links, the link of every path among them, and the links of the program among them or None.
+
+    Paths between other positions than those of `links` have the link -1.
+
+    Raises:
+        InputError: No path belongs to a link, or the paths of a link have different ends.
+    """
+    own = np.hstack([table.tx, table.rx])
+    if links is not None:
+        ends, chosen = np.unique(np.hstack([links.tx, links.rx]), axis=0, return_inverse=True)
+        off, link = KDTree(ends).query(own)
+        if (lost := off > TOLERANCE).any():
+            worst = int(np.argmin(np.where(lost, off, np.inf)))
+            fault = (
+                f"{table.source}: {lost.sum()} of {len(lost)} paths connect other positions than the links, as path "
+                f"{table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
+            )
+            if lost.all():
+                raise InputError(
+                    f"{fault}; export the rays of the study's links, or correct the argument axes"
+                )
+            _LOG.warning("%s; they are left out", fault)
+        return ends[:, :3], ends[:, 3:], np.where(lost, -1, link), chosen.reshape(-1)
+    if table.link is None:
+        # Positions that differ by less than a millimetre are the same.
+        _, first, link = np.unique(np.round(own, 3), axis=0, return_index=True, return_inverse=True)
+    else:
+        _, first, link = np.unique(table.link, return_index=True, return_inverse=True)
+    link = link.reshape(-1)
+    if (np.abs(own - own[first][link]).max(axis=1) > TOLERANCE).any():
+        worst = int(np.argmax(np.abs(own - own[first][link]).max(axis=1)))
+        raise InputError(
+            f"{table.source}: path {table.path[worst]} has other ends than the other paths of its link; correct them"
+        )
+    return own[first, :3], own[first, 3:], link, None
+
+
+def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:
+    """Refuse a direct path whose power no antenna explains."""
+    direct = np.diff(paths.first) == 0
+    replayed = (
+        _powers(paths) if known else (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
+    )
+    with np.errstate(divide="ignore"):
+        off = 10 * np.log10(power / replayed)
+    wrong = np.abs(off) > FREE_SPACE_DB if known else off > DIRECT_GAIN_DB
+    if (wrong & direct).any():
+        worst = int(np.argmax(np.where(direct, np.abs(off), 0)))
+        what = "with the antennas stated" if known else "between isotropic antennas"
+        raise InputError(
+            f"{table.source}: a direct path of link {paths.link[worst]} is {off[worst]:.1f} dB above free space "
+            f"{what}; power_db must be the path gain, received minus transmitted power, with antenna gains"
+            + ("; leave the antennas out if they are not those of the engine" if known else "")
+        )
+
+
+def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> NDArray[np.float64]:
+    replayed = _powers(paths)
+    if not (replayed > 0).all():
+        material = list(paths.materials)[paths.material[paths.first[int(np.argmin(replayed))]]]
+        raise InputError(
+            f"{table.source}: a path of the table has no power in replay; check the constants of {material!r} (a "
+            "diffuse reflection needs a scattering_coefficient), or leave the antennas out"
+        )
+    return power / replayed

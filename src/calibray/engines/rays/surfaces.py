@@ -1,0 +1,238 @@
+"""The surface that every interaction of a ray table lies on: its normal, its material, and the edge that diffracts."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from trimesh.triangles import closest_point
+
+from calibray.errors import InputError
+from calibray.scenes import Scene
+from calibray.scenes.shapes import read_surface
+
+TOLERANCE: Final = 0.02
+"""Largest distance of an interaction from its surface [m]; coordinates rounded to centimetres lie within 0.009 m."""
+
+SAME: Final = 1e-3
+"""Faces whose distances from a point differ by less coincide there [m]."""
+
+PAIRS: Final = 20_000_000
+"""Points times faces whose bounding boxes are compared at once, which takes 0.5 GB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The triangles of a scene.
+
+    Attributes:
+        corners: [F, 3, 3], [m].
+        normal: Unit normals, on either side [F, 3].
+        material: Index in `Scene.materials` [F].
+    """
+
+    corners: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    material: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Surfaces:
+        """Read the triangles of a scene.
+
+        Raises:
+            InputError: A mesh cannot be read.
+        """
+        names, corners, material = list(scene.materials), [], []
+        shapes = ElementTree.fromstring(scene.xml).findall("shape")
+        for shape, item in zip(shapes, scene.objects, strict=True):
+            mesh = read_surface(shape, scene.path)
+            corners.append(mesh.vertices[mesh.faces])
+            material += [names.index(item.material)] * len(mesh.faces)
+        triangle = np.concatenate(corners)
+        normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+        size = np.linalg.norm(normal, axis=1)
+        kept = size > 0
+        return cls(triangle[kept], normal[kept] / size[kept, None], np.array(material)[kept])
+
+    def near(
+        self, point: NDArray[np.float64], within: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Pairs of points [n, 3] and faces that lie within a distance [m]: point, face, distance, each [k]."""
+        pairs = list(self._box_pairs(point, within))
+        index, face = (
+            (np.concatenate(part) for part in zip(*pairs, strict=True)) if pairs else np.zeros((2, 0), int)
+        )
+        if not len(index):
+            return index, face, np.zeros(0)
+        distance = np.linalg.norm(closest_point(self.corners[face], point[index]) - point[index], axis=1)
+        close = distance <= within
+        return index[close], face[close], distance[close]
+
+    def distance(self, point: NDArray[np.float64], faces: NDArray[np.bool_]) -> float:
+        """Distance of one point [3] from the nearest of some faces [F], [m]."""
+        corners = self.corners[faces]
+        nearest = closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
+        return float(np.linalg.norm(nearest - point, axis=1).min(initial=np.inf))
+
+    def _box_pairs(self, point: NDArray[np.float64], within: float) -> Iterator[tuple[NDArray, NDArray]]:
+        low, high = self.corners.min(axis=1) - within, self.corners.max(axis=1) + within
+        size = max(PAIRS // max(len(low), 1), 1)
+        for start in range(0, len(point), size):
+            part = point[start : start + size, None]
+            inside = np.ones((len(part), len(low)), dtype=bool)
+            for axis in range(3):
+                inside &= (part[..., axis] >= low[:, axis]) & (part[..., axis] <= high[:, axis])
+            index, face = np.nonzero(inside)
+            yield index + start, face
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Interactions with their directions and, where the table states it, their material.
+
+    Attributes:
+        point: [n, 3], [m].
+        incident: Unit vectors of travel before [n, 3].
+        leaving: Unit vectors of travel after [n, 3].
+        length: The shorter one of the two segments [n], [m].
+        reflects: Whether the mirror law must hold [n].
+        material: Index of the stated material, -1 if none is [n].
+        label: What messages call them [n].
+    """
+
+    point: NDArray[np.float64]
+    incident: NDArray[np.float64]
+    leaving: NDArray[np.float64]
+    length: NDArray[np.float64]
+    reflects: NDArray[np.bool_]
+    material: NDArray[np.int64]
+    label: NDArray[np.str_]
+
+    def mirror_error(self, index: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance between where a reflection leads and where the path goes, of hits with normals [k, 3], [m]."""
+        incident = self.incident[index]
+        mirrored = incident - 2 * np.sum(incident * normal, axis=1)[:, None] * normal
+        return np.linalg.norm(mirrored - self.leaving[index], axis=1) * self.length[index]
+
+
+def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.int64], float]:
+    """Face of every interaction [n], and the largest distance from it [m]; `names` are those of the materials.
+
+    Of the faces at hand, reflections take the nearest one whose mirror law holds, others the nearest.
+
+    Raises:
+        InputError: A point lies on no surface (of its material), faces of different materials coincide there, or no
+            surface reflects the wave into the direction of the path.
+    """
+    index, face, distance = surfaces.near(hits.point, TOLERANCE)
+    right = (hits.material[index] < 0) | (hits.material[index] == surfaces.material[face])
+    index, face, distance = index[right], face[right], distance[right]
+    error = hits.mirror_error(index, surfaces.normal[face])
+    # A point that is off by the tolerance turns both segments.
+    bent = hits.reflects[index] & (error > 4 * TOLERANCE)
+    order = np.lexsort((distance, bent, index))
+    index, face, distance, bent, error = (part[order] for part in (index, face, distance, bent, error))
+    matched, first = np.unique(index, return_index=True)
+    if len(matched) < len(hits.point):
+        lost = np.setdiff1d(np.arange(len(hits.point)), matched)
+        refusal = _off_surface(surfaces, hits, lost, names)
+        raise refusal
+    if bent[first].any():
+        worst = int(np.argmax(np.where(bent[first], error[first], 0)))
+        raise InputError(
+            f"{hits.label[worst]}: is no reflection on the surface of {names[surfaces.material[face[first[worst]]]]!r} "
+            f"there: it misses the mirror law by {error[first[worst]]:.3g} m; export the vertices with more digits, or "
+            "correct its type"
+        )
+    _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
+    return face[first], float(distance[first].max(initial=0.0))
+
+
+def _off_surface(surfaces: Surfaces, hits: Hits, lost: NDArray[np.int64], names: list[str]) -> InputError:
+    """The error of points that lie on no surface."""
+    number = lost[0]
+    stated = hits.material[number]
+    faces = np.ones(len(surfaces.material), bool) if stated < 0 else surfaces.material == stated
+    surface = "surface of the scene" if stated < 0 else f"surface of {names[stated]!r}"
+    return InputError(
+        f"{hits.label[number]}: lies {surfaces.distance(hits.point[number], faces):.3g} m from the nearest {surface}, "
+        f"must lie within {TOLERANCE} m (so do {len(lost)} of {len(hits.point)} interactions); check units [m], axes "
+        "(argument axes), scene and material"
+    )
+
+
+def _refuse_ambiguous(
+    surfaces: Surfaces, hits: Hits, pairs: tuple[NDArray, ...], first: NDArray[np.int64], names: list[str]
+) -> None:
+    index, face, distance, bent = pairs
+    best = first[np.searchsorted(index[first], index)]
+    material = surfaces.material[face]
+    parallel = np.abs(np.sum(surfaces.normal[face] * surfaces.normal[face[best]], axis=1)) > 0.999
+    rival = (material != material[best]) & (distance - distance[best] < SAME) & parallel & ~bent
+    if rival.any():
+        pair = int(np.argmax(rival))
+        raise InputError(
+            f"{hits.label[index[pair]]}: surfaces of {names[material[best[pair]]]!r} and {names[material[pair]]!r} "
+            "coincide there; state the material in the column material"
+        )
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The wedge of a diffraction.
+
+    Attributes:
+        face: The 0-face, which the wave illuminates.
+        normal_0: Its outward normal [3].
+        normal_n: Outward normal of the other face [3].
+        direction: Unit vector along the edge [3]; with the normal of the 0-face it makes the vector into that face.
+        error: How far the path misses Keller's law [m].
+    """
+
+    face: int
+    normal_0: NDArray[np.float64]
+    normal_n: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    error: float
+
+
+def find_edge(surfaces: Surfaces, hits: Hits, number: int) -> Edge:
+    """The edge of a diffraction: of all pairs of faces there, the one that obeys Keller's law best.
+
+    Raises:
+        InputError: No two faces form an edge there that diffracts into the direction of the path.
+    """
+    point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
+    _, faces, _ = surfaces.near(point[None], TOLERANCE)
+    edges = [_edge(surfaces, hits, number, (a, b)) for a in faces.tolist() for b in faces.tolist() if a != b]
+    usable = [edge for edge in edges if edge is not None and edge.error <= 4 * TOLERANCE]
+    if not usable:
+        raise InputError(
+            f"{hits.label[number]}: no edge of the scene diffracts the wave into the direction of the path there; "
+            "check the vertex, or leave the path out"
+        )
+    return min(usable, key=lambda edge: (round(edge.error, 6), np.dot(incident, edge.normal_0), leaving[0]))
+
+
+def _edge(surfaces: Surfaces, hits: Hits, number: int, faces: tuple[int, int]) -> Edge | None:
+    """The wedge of a 0-face and an n-face; None if they form none that the path goes around."""
+    point, incident, leaving = hits.point[number], hits.incident[number], hits.leaving[number]
+    normal_0, normal_n = surfaces.normal[list(faces)]
+    direction = np.cross(normal_0, normal_n)
+    if hits.material[number] not in (-1, surfaces.material[faces[0]]) or np.linalg.norm(direction) < 0.05:
+        return None
+    into_0, into_n = surfaces.corners[list(faces)].mean(axis=1) - point
+    # Outward normals point away from the other face.
+    normal_0 = -normal_0 * np.sign(np.dot(into_n, normal_0))
+    normal_n = -normal_n * np.sign(np.dot(into_0, normal_n))
+    direction /= np.linalg.norm(direction)
+    direction *= np.sign(np.dot(np.cross(normal_0, direction), into_0))
+    inside = [np.dot(end, normal_0) < 0 and np.dot(end, normal_n) < 0 for end in (-incident, leaving)]
+    if any(inside) or np.dot(incident, normal_0) > 0 or not direction.any():
+        return None
+    error = abs(np.dot(incident - leaving, direction)) * hits.length[number]
+    return Edge(faces[0], normal_0, normal_n, direction, float(error))

@@ -1,0 +1,242 @@
+"""A ray table: one row for each point of a path, from the transmitter over its interactions to the receiver.
+
+`docs/reference/ray-table.md` documents the columns. Rows may come in any order, because every row names its path and
+its place on it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.measurements import SourceTable
+from calibray.paths import Kind
+from calibray.support.messages import did_you_mean
+
+TYPES: Final = {
+    "reflection": Kind.SPECULAR,
+    "diffuse": Kind.DIFFUSE,
+    "transmission": Kind.REFRACTION,
+    "diffraction": Kind.DIFFRACTION,
+}
+"""Kinds of interaction by their names in the column `type`."""
+
+ENDS: Final = ("transmitter", "receiver")
+"""Values of `type` of the first and the last point of a path."""
+
+MOST_POINTS: Final = 102
+"""Most points of a path: `trace.max_depth` allows 100 interactions."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayTable:
+    """Paths of an engine: P paths, padded to the largest depth D, in the order of their labels.
+
+    Attributes:
+        source: Name of the table, for messages.
+        path: Number or label of every path [P].
+        link: Number or label of its link [P]; None if links are told apart by their ends.
+        tx: Transmitter of every path [P, 3], [m].
+        rx: Receiver of every path [P, 3], [m].
+        vertex: Interaction points [P, D, 3], [m].
+        kind: Kinds of interaction, 0 beyond the last one [P, D].
+        material: Names of materials, empty where not stated [P, D].
+        object: Names of objects, empty where not stated [P, D].
+        power: Path gain [P]; None if not stated.
+        delay: [P], [s]; None if not stated.
+    """
+
+    source: str
+    path: NDArray
+    link: NDArray | None
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    vertex: NDArray[np.float64]
+    kind: NDArray[np.int64]
+    material: NDArray[np.str_]
+    object: NDArray[np.str_]
+    power: NDArray[np.float64] | None
+    delay: NDArray[np.float64] | None
+
+    @classmethod
+    def of(cls, table: SourceTable, axes: str = "x y z") -> RayTable:
+        """Read rows into paths; `axes` names the table's axes that are the scene's x, y and z, as "x -z y".
+
+        Raises:
+            InputError: A column is missing or malformed, a path is incomplete, or a value is impossible.
+        """
+        path, point = _names(table, "path"), table.numbers("point")
+        order = np.lexsort((point, path))
+        table = SourceTable(
+            table.frame.iloc[order].reset_index(drop=True), table.row[order], table.source, table.changes
+        )
+        label, first, row_path = np.unique(path[order], return_index=True, return_inverse=True)
+        row_path, step = row_path.reshape(-1), np.arange(len(table)) - first[row_path.reshape(-1)]
+        count = np.bincount(row_path)
+        kind = _kinds(table, row_path, step, count)
+        if wrong := np.flatnonzero((point[order] - point[order][first][row_path]) != step).tolist():
+            raise InputError(
+                f"{table.cell(wrong[0], 'point')}: the points of path {label[row_path[wrong[0]]]} must count up by 1 "
+                "without gap or repetition; complete the path"
+            )
+        position = _positions(table, axes)
+        inner = kind != 0
+        shape = len(label), max(int(count.max()) - 2, 0)
+        index = row_path[inner], step[inner] - 1
+
+        def padded(values: NDArray, fill: NDArray) -> NDArray:
+            fill[index] = values[inner]
+            return fill
+
+        names = {
+            name: padded(_optional_labels(table, name), np.full(shape, "", dtype=object)).astype(np.str_)
+            for name in ("material", "object")
+        }
+        return cls(
+            source=table.source,
+            path=label,
+            link=_link(table, row_path),
+            tx=position[first],
+            rx=position[first + count - 1],
+            vertex=padded(position, np.zeros((*shape, 3))),
+            kind=padded(kind, np.zeros(shape, dtype=np.int64)),
+            power=_power(table, row_path),
+            delay=_per_path(table, "delay", row_path) if "delay" in table.frame else None,
+            **names,
+        )
+
+    def take(self, index: NDArray[np.int64]) -> RayTable:
+        """The table of some of its paths [n], in a given order."""
+        taken = {
+            item.name: value[index]
+            for item in fields(self)
+            if isinstance(value := getattr(self, item.name), np.ndarray)
+        }
+        return replace(self, **taken)
+
+    def frame(self) -> pd.DataFrame:
+        """The table with one row for each point."""
+        number = np.arange(len(self.path))
+        inner = self.kind != 0
+        depth = inner.sum(axis=1)
+        path = np.concatenate([number, np.nonzero(inner)[0], number])
+        step = np.concatenate([0 * number, np.nonzero(inner)[1] + 1, depth + 1])
+        position = np.concatenate([self.tx, self.vertex[inner], self.rx])
+        names = {kind: name for name, kind in TYPES.items()}
+        kinds = [names[Kind(kind)] for kind in self.kind[inner]]
+        blank = np.full(len(number), "")
+        columns: dict[str, NDArray] = {
+            "path": self.path[path],
+            "point": step,
+            "type": np.array([ENDS[0]] * len(number) + kinds + [ENDS[1]] * len(number)),
+            **dict(zip("xyz", position.T, strict=True)),
+            "material": np.concatenate([blank, self.material[inner], blank]),
+            "object": np.concatenate([blank, self.object[inner], blank]),
+        }
+        if self.link is not None:
+            columns["link"] = self.link[path]
+        if self.power is not None:
+            columns["power_db"] = 10 * np.log10(self.power)[path]
+        if self.delay is not None:
+            columns["delay"] = self.delay[path]
+        columns = {name: values for name, values in columns.items() if not (values == "").all()}
+        return pd.DataFrame(columns).iloc[np.lexsort((step, path))].reset_index(drop=True)
+
+
+def _kinds(
+    table: SourceTable, row_path: NDArray[np.int64], step: NDArray[np.int64], count: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Kind of every row, 0 at the ends [rows]; refuses unknown types, and paths without their ends."""
+    kinds = table.labels("type")
+    known = [*ENDS, *TYPES]
+    if unknown := sorted(set(kinds.tolist()) - set(known)):
+        row = int(np.flatnonzero(kinds == unknown[0])[0])
+        raise InputError(f"{table.cell(row, 'type')}: {unknown[0]!r}; {did_you_mean(unknown[0], known)}")
+    last = step == count[row_path] - 1
+    wrong = (
+        ((kinds == ENDS[0]) != (step == 0)) | ((kinds == ENDS[1]) != last) | (count[row_path] > MOST_POINTS)
+    )
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(
+            f"{table.cell(row, 'type')}: {str(kinds[row])!r} at point {step[row]} of {count[row_path[row]]} of its "
+            f"path; the first point of a path is its transmitter, the last its receiver, with at most "
+            f"{MOST_POINTS - 2} interactions between them"
+        )
+    codes = {**dict.fromkeys(ENDS, 0), **TYPES}
+    return np.array([codes[name] for name in kinds.tolist()], dtype=np.int64)
+
+
+def _positions(table: SourceTable, axes: str) -> NDArray[np.float64]:
+    words = axes.split()
+    if sorted(word.lstrip("-") for word in words) != ["x", "y", "z"] or not re.fullmatch("[-xyz ]*", axes):
+        raise InputError(
+            f"axes = {axes!r}: must name the table's axes that are x, y and z of the scene, as 'x y z' or 'x -z y'"
+        )
+    sign = [-1.0 if word.startswith("-") else 1.0 for word in words]
+    return np.stack([table.numbers(word.lstrip("-")) for word in words], axis=1) * sign
+
+
+def _optional_labels(table: SourceTable, name: str) -> NDArray:
+    """Labels of a column, empty where missing or where there is no such column [rows]."""
+    if name not in table.frame:
+        return np.full(len(table), "", dtype=object)
+    return table.frame[name].astype(object).where(table.frame[name].notna(), "").astype(str).to_numpy(object)
+
+
+def _link(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray | None:
+    """Number or label of the link of every path [P]."""
+    if "link" not in table.frame:
+        return None
+    return _names(SourceTable(_stated(table, "link", row_path).to_frame("link"), source=table.source), "link")
+
+
+def _names(table: SourceTable, name: str) -> NDArray:
+    """Numbers, which sort as numbers, or else labels [rows]."""
+    if pd.api.types.is_integer_dtype(table.column(name)):
+        return table.numbers(name).astype(np.int64)
+    return table.labels(name)
+
+
+def _per_path(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> NDArray[np.float64]:
+    """A number of the whole path [P]."""
+    numbers = table.assign(**{name: table.numbers(name, gaps=True)})
+    return _stated(numbers, name, row_path).to_numpy(np.float64)
+
+
+def _stated(table: SourceTable, name: str, row_path: NDArray[np.int64]) -> pd.Series:
+    """A value of the whole path, which all its rows that state it must share [P]."""
+    groups = table.column(name).groupby(row_path)
+    if (differing := groups.nunique() != 1).any():
+        row = int(np.argmax(row_path == int(np.argmax(differing.to_numpy()))))
+        raise InputError(
+            f"{table.cell(row, name)}: the rows of a path must state one and the same {name}; correct them"
+        )
+    return groups.first()
+
+
+def _power(table: SourceTable, row_path: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Path gain of every path [P], from `power_db` or from `gain_real` and `gain_imag`."""
+    gains = [name for name in ("gain_real", "gain_imag") if name in table.frame]
+    if "power_db" in table.frame:
+        if gains:
+            raise InputError(f"{table.source}: has both power_db and {gains[0]}; remove one")
+        level = _per_path(table, "power_db", row_path)
+        if (level > 0).any():
+            raise InputError(
+                f"{table.source}: power_db = {level.max():g} dB; path gain is negative: give received minus "
+                "transmitted power, not path loss or watts"
+            )
+        return 10 ** (level / 10)
+    if not gains:
+        return None
+    real, imaginary = (_per_path(table, name, row_path) for name in ("gain_real", "gain_imag"))
+    if not ((power := real**2 + imaginary**2) > 0).all():
+        raise InputError(f"{table.source}: a path has the gain 0; leave it out")
+    return power

@@ -1,0 +1,214 @@
+"""Ray tables: the paths of any engine, read with the surfaces of the scene, checked and corrected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calibray as cb
+import two_ray
+from calibray.errors import InputError
+from calibray.fields import path_gains, path_loss
+from calibray.paths import Kind, Paths, concatenate, take, take_links
+from calibray.scenes import read_scene
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
+from small_scenes import CONCRETE, block, write_scene
+
+FREQUENCY = 3.5e9
+ANTENNAS = (Antenna("dipole"), Antenna("iso", "VH"))
+LINKS = SimpleNamespace(
+    tx=np.tile([-20.0, 2, 12], (4, 1)),
+    rx=np.array([[-15.0, 4, 1.5], [12, 1, 2], [14, 9, 1.5], [0, 0, 2]]),
+)
+STONE = CONCRETE.replace("</bsdf>", '<float name="scattering_coefficient" value="0.3"/></bsdf>')
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Tracer:
+    """A ground with two houses, traced with every kind of interaction."""
+    ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
+    houses = {"house": block((-5, -5, 0), (5, 5, 8)), "other": block((-5, 15, 0), (25, 20, 9))}
+    file = write_scene(tmp_path_factory.mktemp("yard"), {"ground": ground, **houses}, STONE)
+    settings = TraceSettings(max_depth=2, samples=50_000, refraction=True, diffraction=True)
+    return Tracer(read_scene(file, FREQUENCY), FREQUENCY, settings, *ANTENNAS)
+
+
+@pytest.fixture(scope="module")
+def traced(yard: Tracer) -> Paths:
+    return yard.trace(LINKS)
+
+
+@pytest.fixture
+def rows(traced: Paths, tmp_path: Path) -> pd.DataFrame:
+    cb.write_rays(traced, tmp_path / "rays.csv")
+    return pd.read_csv(tmp_path / "rays.csv")
+
+
+def powers(paths: Paths) -> np.ndarray:
+    """Power of every path, summed over receive ports."""
+    return (np.abs(path_gains(paths)) ** 2).sum(axis=(1, 2))
+
+
+@pytest.mark.parametrize("ending", ["csv", "json", "h5", "parquet"])
+def test_every_format_gives_the_paths_back(yard: Tracer, traced: Paths, tmp_path: Path, ending: str) -> None:
+    """With the antennas known nothing is left to correct: surfaces, angles and edges are those of the tracer."""
+    file = tmp_path / f"rays.{ending}"
+    cb.write_rays(traced, file)
+    read = cb.read_rays(file, yard.scene, frequency=FREQUENCY, antennas=ANTENNAS)
+    assert {Kind.SPECULAR, Kind.REFRACTION, Kind.DIFFRACTION} == set(read.kind.tolist())
+    np.testing.assert_array_equal(read.kind, traced.kind)
+    np.testing.assert_allclose(powers(read), powers(traced), rtol=1e-6)
+    # Vertices are in single precision, and Sionna's lengths of diffracted paths are off.
+    smooth = np.array(
+        [(traced.kind[a:b] != 8).all() for a, b in zip(traced.first, traced.first[1:], strict=False)]
+    )
+    np.testing.assert_allclose(read.correction[smooth], 1, atol=1e-4)
+    np.testing.assert_allclose(read.correction, 1, atol=0.05)
+    gains = [path_gains(replace(paths, correction=None))[smooth] for paths in (read, traced)]
+    assert np.abs(gains[0] - gains[1]).max() < 1e-5 * np.abs(gains[1]).max()
+
+
+def read(rows: pd.DataFrame, yard: Tracer, **arguments: object) -> Paths:
+    return cb.read_rays(rows, yard.scene, frequency=FREQUENCY, **{"antennas": ANTENNAS, **arguments})
+
+
+def test_the_order_of_rows_and_the_axes_do_not_matter(
+    yard: Tracer, traced: Paths, rows: pd.DataFrame
+) -> None:
+    shuffled = rows.sample(frac=1, random_state=3)
+    np.testing.assert_array_equal(path_loss(read(shuffled, yard)), path_loss(read(rows, yard)))
+    upright = rows.assign(y=rows.z, z=-rows.y)
+    np.testing.assert_allclose(path_loss(read(upright, yard, axes="x -z y")), path_loss(traced), atol=1e-5)
+    with pytest.raises(InputError, match=r"lies .* m from the nearest surface.*argument axes"):
+        read(upright, yard)
+
+
+def test_materials_are_those_of_the_faces_unless_stated(yard: Tracer, rows: pd.DataFrame) -> None:
+    bare = rows.drop(columns="material")
+    np.testing.assert_array_equal(read(bare, yard).material, read(rows, yard).material)
+    ground = [[(-40.0, -40.0, 0.0), (40.0, -40.0, 0.0), (40.0, 40.0, 0.0), (-40.0, 40.0, 0.0)]]
+    twice = write_scene(yard.scene.path.parent / "twice", {"a": ground, "b": ground})
+    scene = read_scene(twice, FREQUENCY, split={"paved": "b"})
+    reflected = pd.DataFrame(
+        {
+            "path": 1, "point": [0, 1, 2], "type": ["transmitter", "reflection", "receiver"], "x": [0.0, 5, 10],
+            "y": 0.0, "z": [10.0, 0, 10],
+        }
+    )  # fmt: skip
+    with pytest.raises(InputError, match="'stone' and 'paved' coincide there; state the material"):
+        cb.read_rays(reflected, scene, frequency=FREQUENCY)
+    for column, value in (("material", "paved"), ("object", "b")):
+        stated = cb.read_rays(reflected.assign(**{column: value}), scene, frequency=FREQUENCY)
+        assert stated.material.tolist() == [1]
+    with pytest.raises(InputError, match="no object 'c'"):
+        cb.read_rays(reflected.assign(object="c"), scene, frequency=FREQUENCY)
+
+
+WRONG = {
+    "points of the path missing": (lambda t: t.drop(t.index[t.point == 3][0] - 1), "count up by 1"),
+    "a receiver missing": (lambda t: t[t.type != "receiver"], "the last its receiver"),
+    "an unknown type": (lambda t: t.replace({"type": {"reflection": "R"}}), "'R'"),
+    "an unknown material": (lambda t: t.assign(material="wood"), "no material 'wood'"),
+    "two powers of a path": (lambda t: t.assign(power_db=t.power_db - t.point), "one and the same power_db"),
+    "path loss in place of gain": (lambda t: t.assign(power_db=-t.power_db), "path gain is negative"),
+    "received power in dBm": (lambda t: t.assign(power_db=t.power_db + 30), "30.0 dB above free space"),
+    "delays in nanoseconds": (lambda t: t.assign(delay=t.delay * 1e9), "give the total delay in seconds"),
+    "relative delays": (lambda t: t.assign(delay=t.delay - t.delay.min()), "not relative to the first path"),
+    "positions in degrees": (lambda t: t.assign(x=t.x / 111e3, y=t.y / 111e3), "check units"),
+    "a bent transmission": (lambda t: t.replace({"type": {"reflection": "transmission"}}), "bends by"),
+    "a straight reflection": (lambda t: t.replace({"type": {"transmission": "reflection"}}), "mirror law"),
+    "no diffracting edge": (
+        lambda t: t.replace({"type": {"reflection": "diffraction"}}),
+        "no edge of the scene",
+    ),
+    "a vertex off the surface": (lambda t: t.assign(z=t.z + 0.05 * (t.type == "reflection")), "lies 0.05 m"),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG)
+def test_a_wrong_table_is_refused(yard: Tracer, rows: pd.DataFrame, fault: str) -> None:
+    change, message = WRONG[fault]
+    with pytest.raises(InputError, match=message):
+        read(change(rows), yard)
+
+
+def test_the_correction_takes_the_power_of_the_engine(
+    yard: Tracer, traced: Paths, rows: pd.DataFrame
+) -> None:
+    """The engine's antennas are unknown to the reader; at its materials every path has its power."""
+    paths = read(rows, yard, antennas=None)
+    np.testing.assert_allclose(powers(paths).sum() / paths.tx_field.shape[1], powers(traced).sum(), rtol=1e-6)
+    np.testing.assert_allclose(path_loss(paths), path_loss(traced), atol=1e-6)
+    loud = read(rows.assign(power_db=rows.power_db + 7), yard, antennas=None)
+    np.testing.assert_allclose(path_loss(loud), path_loss(traced) - 7, atol=1e-6)
+    ratio = loud.correction / paths.correction
+    np.testing.assert_allclose(ratio, 10**0.7)
+
+
+def test_a_correction_is_stored_and_follows_its_path(
+    yard: Tracer, rows: pd.DataFrame, tmp_path: Path
+) -> None:
+    paths = read(rows, yard, antennas=None)
+    paths.save(tmp_path / "paths.h5")
+    np.testing.assert_array_equal(Paths.load(tmp_path / "paths.h5").correction, paths.correction)
+    index = np.arange(paths.num_paths)[::-2]
+    np.testing.assert_array_equal(take(paths, index).correction, paths.correction[index])
+    assert take_links(paths, np.array([1, 1])).correction.shape == (2 * (paths.link == 1).sum(),)
+    joined = concatenate([paths, replace(paths, correction=None)])
+    assert sorted(joined.correction) == sorted([*paths.correction, *np.ones(paths.num_paths)])
+    assert concatenate([replace(paths, correction=None)]).correction is None
+
+
+def test_diffuse_paths_need_their_power(yard: Tracer) -> None:
+    settings = TraceSettings(max_depth=1, samples=2000, diffuse_reflection=True)
+    scattered = yard.with_settings(settings).trace(LINKS)
+    cb.write_rays(scattered, yard.scene.path.parent / "diffuse.csv")
+    table = pd.read_csv(yard.scene.path.parent / "diffuse.csv")
+    assert (table.type == "diffuse").sum() > 20
+    stone = yard.scene.materials["stone"]
+    changed = {"stone": replace(stone, relative_permittivity=9.0, scattering_coefficient=0.6)}
+    np.testing.assert_allclose(
+        path_loss(read(table, yard), changed), path_loss(scattered, changed)[:3], atol=1e-4
+    )
+    with pytest.raises(InputError, match="need the power of the path"):
+        read(table.drop(columns="power_db"), yard)
+
+
+def test_paths_of_a_study_belong_to_its_links(tmp_path: Path) -> None:
+    study = two_ray.study(tmp_path, links=8)
+    setup = cb.Setup.open(study, tracer=two_ray.TwoRay)
+    traced = setup.trace()
+    cb.write_rays(traced, tmp_path / "rays.csv")
+    rows = pd.read_csv(tmp_path / "rays.csv").drop(columns="link")
+    paths = cb.read_rays(rows[rows.path != 3], study)
+    assert paths.num_links == 8
+    assert np.bincount(paths.link).tolist() == [2, 1, 2, 2, 2, 2, 2, 2]
+    np.testing.assert_allclose(path_loss(paths)[2:], path_loss(traced)[2:], atol=1e-5)
+    moved = rows.assign(z=rows.z + 0.5 * (rows.type == "receiver"))
+    with pytest.raises(InputError, match=r"connect other positions than the links.* 0\.5 m away"):
+        cb.read_rays(moved[moved.path % 2 == 0].assign(delay=np.nan).drop(columns="delay"), study)
+
+
+def test_a_study_is_calibrated_and_predicts_on_the_rays_of_another_engine(tmp_path: Path) -> None:
+    """Nothing is traced: the table has the paths of all links, and of those that are predicted."""
+    traced = cb.Setup.open(two_ray.study(tmp_path), tracer=two_ray.TwoRay).trace()
+    cb.write_rays(traced, tmp_path / "rays.parquet")
+    (tmp_path / two_ray.TRACED).unlink()
+    study = two_ray.study(tmp_path, engine={"name": "replay", "rays": "rays.parquet"})
+    assert tmp_path / "rays.parquet" in study.files()
+    setup = cb.Setup.open(study, tracer=two_ray.TwoRay)
+    result = cb.calibrate(setup)
+    assert result.parameters["ground.relative_permittivity"] == pytest.approx(two_ray.TRUTH, rel=1e-3)
+    np.testing.assert_allclose(result.predict(setup.links), setup.links.path_loss_db, atol=1e-3)
+    assert not (tmp_path / two_ray.TRACED).exists()
+    result.save(tmp_path / "result")
+    assert cb.Result.load(tmp_path / "result").parameters == result.parameters
+    (tmp_path / "rays.parquet").unlink()
+    with pytest.raises(InputError, match=r"engine\.rays = 'rays\.parquet': no such file"):
+        cb.Study.from_content(study.content(), study.path).check_files()
