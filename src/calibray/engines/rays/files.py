@@ -69,7 +69,7 @@ def _read_hdf5(path: Path) -> pd.DataFrame:
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(
             {
-                name: (item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]).reshape(-1)
+                name: np.ravel(item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()])
                 for name, item in columns.items()
             }
         )

@@ -135,18 +135,18 @@ def match(surfaces: Surfaces, hits: Hits, names: list[str]) -> tuple[NDArray[np.
     # A point that is off by the tolerance turns both segments.
     bent = hits.reflects[index] & (error > 4 * TOLERANCE)
     order = np.lexsort((distance, bent, index))
-    index, face, distance, bent, error = (part[order] for part in (index, face, distance, bent, error))
+    index, face, distance, bent = index[order], face[order], distance[order], bent[order]
     matched, first = np.unique(index, return_index=True)
     if len(matched) < len(hits.point):
         lost = np.setdiff1d(np.arange(len(hits.point)), matched)
         refusal = _off_surface(surfaces, hits, lost, names)
         raise refusal
     if bent[first].any():
-        worst = int(np.argmax(np.where(bent[first], error[first], 0)))
+        worst = int(np.argmax(np.where(bent[first], error[order][first], 0)))
         raise InputError(
             f"{hits.label[worst]}: is no reflection on the surface of {names[surfaces.material[face[first[worst]]]]!r} "
-            f"there: it misses the mirror law by {error[first[worst]]:.3g} m; export the vertices with more digits, or "
-            "correct its type"
+            f"there: it misses the mirror law by {error[order][first[worst]]:.3g} m; export the vertices with more "
+            "digits, or correct its type"
         )
     _refuse_ambiguous(surfaces, hits, (index, face, distance, bent), first, names)
     return face[first], float(distance[first].max(initial=0.0))
