@@ -22,6 +22,9 @@ Ground = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64
 MoveOutside = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """From positions [n, 3] to positions outside buildings (NaN if too deep inside) and the moved distances [n], [m]."""
 
+Compute = Callable[[SourceTable], NDArray[np.float64] | None]
+"""Values of a new column [rows] from the rows of a table."""
+
 
 @dataclass(frozen=True)
 class LinkColumns:
@@ -124,6 +127,8 @@ class Preparation:
         ground: Height of the ground, if heights are above it.
         averaging: How samples are averaged.
         keep: Columns that averages do not cross, in addition to the transmitter's.
+        computed: Further columns by name, computed from the rows with the columns of their transmitters; a function
+            gives None if a column that it needs is missing and need not be there.
         inside: What to do with receivers inside buildings; nothing if None.
         outside: Moves positions out of buildings; needed with `inside`.
     """
@@ -141,6 +146,7 @@ class Preparation:
     ground: Ground | None = None
     averaging: Averaging | None = None
     keep: Sequence[str] = ()
+    computed: Mapping[str, Compute] = field(default_factory=dict)
     inside: Literal["drop", "move"] | None = None
     outside: MoveOutside | None = None
 

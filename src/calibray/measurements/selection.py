@@ -24,10 +24,10 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
     """Select the rows that become links.
 
     The steps run in the order of the code, so that a filter sees the columns of the track but not those of the
-    transmitters. Used here are `wide`, `track`, `where`, `missing`, `transmitters`, `noise_floor_dbm` and `censored`.
-    `value` is the column of the measured values; with `wide`, the name of the new one. The rows that remain have no
-    numbers that mean a missing value (`missing_codes`). Values at or below the noise floor, and missing ones, are set
-    to the floor.
+    transmitters. Used here are `wide`, `track`, `where`, `missing`, `transmitters`, `computed`, `noise_floor_dbm` and
+    `censored`. `value` is the column of the measured values; with `wide`, the name of the new one. The rows that remain
+    have no numbers that mean a missing value (`missing_codes`). Values at or below the noise floor, and missing ones,
+    are set to the floor.
 
     Raises:
         InputError: A column is missing or malformed, a transmitter is unknown, or no row remains.
@@ -64,6 +64,9 @@ def select_rows(table: SourceTable, steps: Preparation, value: str = "") -> Sour
             table = table.select(~coded)
     if steps.transmitters is not None:
         table = _join_transmitters(table, steps.transmitters, steps.transmitter)
+    for name, compute in steps.computed.items():
+        values = compute(table)
+        table = table if values is None else table.assign(**{name: values})
     if steps.noise_floor_dbm is not None:
         table = _apply_noise_floor(table, steps, steps.noise_floor_dbm, value)
     return table

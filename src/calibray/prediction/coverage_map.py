@@ -29,6 +29,7 @@ from calibray.result.record import Record
 from calibray.scenes import Triangles, ground_heights, read_triangles
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Study
+from calibray.study.mounting import mounting_columns
 from calibray.study.row_steps import known_frame
 from calibray.support.progress import Progress, with_total
 
@@ -164,6 +165,8 @@ def _column_values(
     for section in study.nuisance.values():
         needed += [section.per] if section.per is not None else []
         needed += [section.by] if section.by not in (CONSTANT, LOG_DISTANCE, *OBSTRUCTION) else []
+    values |= _mounting_values(study, tx, values)
+    needed += mounting_columns(study)
     for name in needed:
         if name not in values:
             raise InputError(
@@ -171,6 +174,25 @@ def _column_values(
                 f"--column {name}=VALUE (columns={{{name!r}: value}})"
             )
     return values
+
+
+def _mounting_values(
+    study: Study, tx: NDArray[np.float64], stated: Mapping[str, object]
+) -> dict[str, object]:
+    """Values of the columns of antennas and their directions that all links measured at this transmitter share."""
+    columns = mounting_columns(study)
+    if not set(columns) - set(stated):
+        return {}
+    links = study.measurements()
+    here = np.linalg.norm(links.tx - tx, axis=1) < MIN_DISTANCE
+    for name in set(stated) & set(links.frame):
+        here &= (links.frame[name].astype(str) == str(stated[name])).to_numpy()
+    measured = links.frame[here]
+    return {
+        name: measured[name].iloc[0]
+        for name in columns
+        if name not in stated and name in measured and measured[name].nunique() == 1
+    }
 
 
 def _grid(

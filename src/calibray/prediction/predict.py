@@ -25,6 +25,7 @@ from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup, Study
+from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
 
 NEAR_SHARE: Final = 0.1
@@ -308,7 +309,7 @@ def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] |
     if section.quantity != "received_power":
         # Path gain is 0 dB minus path loss. The transmitted power of RSRP is part of the offset.
         return np.zeros(len(links))
-    power = section.tx_power_dbm
+    power = PORT_POWER if states_port_power(study) else section.tx_power_dbm
     if isinstance(power, str):
         return links.table.numbers(power) if power in links.frame else None
     return None if power is None else np.full(len(links), float(power))

@@ -201,6 +201,7 @@ def _calibration(result: Record) -> dict[str, Any]:
         "bandwidth_hz": study.scene.bandwidth,
         "combining": study.objective.combining,
         "antennas": {"tx": asdict(tx), "rx": asdict(rx)},
+        **({"mounted": list(study.links.mountings)} if study.links.mountings else {}),
         "solver": {SOLVER.get(name, name): value for name, value in _with_samples(study.trace).items()},
         "scattering_patterns": patterns,
         "prediction_model": str(result.prediction.model.name),

@@ -17,6 +17,7 @@ from calibray.measurements import Measurements
 from calibray.measurements.column_names import words
 from calibray.scenes.checks import Finding, SceneSurfaces
 from calibray.study.model import StudyModel
+from calibray.study.mounting import link_antennas
 from calibray.tracing.gain_table import read_gain_table
 from calibray.tracing.settings import Antenna
 
@@ -176,7 +177,13 @@ def _levels(study: StudyModel, links: Measurements) -> Iterator[tuple[str, str]]
         return
     frequency = study.scene.frequency if links.frequency is None else links.frequency
     free_space = 20 * np.log10(4 * np.pi * links.distance * frequency / speed_of_light)
-    gain = sum(PATTERN_GAIN_DB.get(antenna.pattern, 20.0) for antenna in study.antenna_pair)
+    gain = sum(
+        max(
+            PATTERN_GAIN_DB.get(antenna.pattern, 20.0)
+            for antenna in link_antennas(study, end, links.table)[0]
+        )
+        for end in ("tx", "rx")
+    )
     excess = free_space - gain - links.path_loss_db
     below = excess > BELOW_FREE_SPACE_DB
     if below.mean() > 0.1:

@@ -99,6 +99,12 @@ class StudyModel(Section, ABC):
             )
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
+        if self.links.mountings and self.engine.name != "replay":
+            end = next(iter(self.links.mountings))
+            raise InputError(
+                f"links.{end}_antenna with engine.name = {self.engine.name!r}: antennas that differ between links are "
+                "applied to stored paths; use engine 'replay'"
+            )
         self._check_materials()
         self._check_parameters()
         return self
@@ -162,13 +168,29 @@ class StudyModel(Section, ABC):
 
     @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
-        """The transmit and the receive antenna, with resolved paths of gain tables."""
-        return self._antenna("tx", self.antennas.tx), self._antenna("rx", self.antennas.rx)
+        """The transmit and the receive antenna that links are traced with, with resolved paths of gain tables.
 
-    def _antenna(self, end: str, antenna: Antenna) -> Antenna:
+        An end whose antennas differ between links is traced with an isotropic vertical one.
+        """
+        mounted, (tx, rx) = self.links.mountings, self.stated_antennas.values()
+        return Antenna() if "tx" in mounted else tx, Antenna() if "rx" in mounted else rx
+
+    @property
+    def stated_antennas(self) -> dict[str, Antenna]:
+        """The antennas of both ends, "tx" and "rx", with resolved paths of gain tables."""
+        return {name: self._antenna(name, getattr(self.antennas, name)) for name in ("tx", "rx")}
+
+    @property
+    def antenna_types(self) -> dict[str, Antenna]:
+        """The antennas of ``[antennas.types]`` by name, with resolved paths of gain tables."""
+        return {
+            name: self._antenna(f"types.{name}", antenna) for name, antenna in self.antennas.types.items()
+        }
+
+    def _antenna(self, key: str, antenna: Antenna) -> Antenna:
         if antenna.gain_file is None:
             return antenna
-        file = self._resolve(f"antennas.{end}.pattern", antenna.pattern).resolve()
+        file = self._resolve(f"antennas.{key}.pattern", antenna.pattern).resolve()
         return Antenna(str(file), antenna.polarization, antenna.orientation)
 
     @property
@@ -277,10 +299,11 @@ class StudyModel(Section, ABC):
         ]
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))
-        stated = (self.antennas.tx, self.antennas.rx)
-        for end, written, antenna in zip(("tx", "rx"), stated, self.antenna_pair, strict=True):
-            if antenna.gain_file is not None:
-                files.append((f"antennas.{end}.pattern", written.pattern, Path(antenna.gain_file)))
+        written = [("tx", self.antennas.tx), ("rx", self.antennas.rx)]
+        written += [(f"types.{name}", antenna) for name, antenna in self.antennas.types.items()]
+        for key, antenna in written:
+            if (file := self._antenna(key, antenna).gain_file) is not None:
+                files.append((f"antennas.{key}.pattern", antenna.pattern, Path(file)))
         return [
             (name, written, path) for name, written, path in files if written is not None and path is not None
         ]

@@ -10,6 +10,7 @@ from calibray.coordinates import Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
 from calibray.study.model import StudyModel
+from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
 
 if TYPE_CHECKING:
     from calibray.measurements import Ground, MoveOutside
@@ -25,6 +26,8 @@ def link_columns(study: StudyModel) -> LinkColumns:
         InputError: Keys of ``[links]`` contradict each other.
     """
     columns = study.links.model_dump(include=_COLUMN_KEYS)
+    if states_port_power(study):
+        columns["tx_power_dbm"] = PORT_POWER
     return LinkColumns(**columns, group=study.offset_groups or None)
 
 
@@ -45,7 +48,16 @@ def row_steps(study: StudyModel) -> Preparation:
         noise_floor_dbm=links.noise_floor_dbm,
         censored=links.below_floor == "censor",
         averaging=None if links.average is None else Averaging(**links.average.model_dump()),
-        keep=list(dict.fromkeys([*study.offset_groups, *([links.frequency] if links.frequency else [])])),
+        keep=list(
+            dict.fromkeys(
+                [
+                    *study.offset_groups,
+                    *([links.frequency] if links.frequency else []),
+                    *mounting_columns(study),
+                ]
+            )
+        ),
+        computed={PORT_POWER: partial(port_power, study)} if states_port_power(study) else {},
         inside=inside,
         outside=None if inside is None else _move_outside(study),
     )
@@ -69,6 +81,7 @@ def position_steps(study: StudyModel) -> Preparation:
         transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
         unit_m=links.position_unit,
+        computed={PORT_POWER: partial(port_power, study, optional=True)} if states_port_power(study) else {},
         frame=scene_frame(study) if links.position == "geographic" else None,
     )
 

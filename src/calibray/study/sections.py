@@ -150,6 +150,40 @@ class TrackSection(Section):
     clock: float = 0.0
 
 
+class MountingSection(Section):
+    """``[links.tx_antenna]`` or ``[links.rx_antenna]``: which antenna each link has at this end, and where it points.
+
+    Attributes:
+        type: Column of names of ``[antennas.types]``; all have the antenna of ``[antennas]`` if absent.
+        azimuth_deg: Azimuth [deg], a number or a column; along x if absent. It turns the antenna's own orientation.
+        azimuth_from: "north" for compass bearings (clockwise from y), "east" for angles counter-clockwise from x.
+        downtilt_deg: Mechanical downtilt [deg], a number or a column.
+        electrical_downtilt_deg: Shift of the pattern downwards in the antenna's frame [deg], a number or a column.
+        aim: "other end" points every antenna at the other end of its link, in place of azimuth and downtilt.
+    """
+
+    type: Text | None = None
+    azimuth_deg: Coordinate | None = None
+    azimuth_from: Literal["north", "east"] = "north"
+    downtilt_deg: Coordinate = 0.0
+    electrical_downtilt_deg: Coordinate = 0.0
+    aim: Literal["other end"] | None = None
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> Self:
+        if self.aim is not None and (self.azimuth_deg is not None or self.downtilt_deg != 0):
+            raise InputError(
+                "aim = 'other end' gives azimuth and downtilt; leave azimuth_deg and downtilt_deg out"
+            )
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of the links that it names."""
+        stated = (self.type, self.azimuth_deg, self.downtilt_deg, self.electrical_downtilt_deg)
+        return tuple(name for name in stated if isinstance(name, str))
+
+
 class LinksSection(Section):
     """``[links]``: the table of measured links, and how its rows become links.
 
@@ -167,6 +201,10 @@ class LinksSection(Section):
         weight: Column of relative weights [1].
         std: Standard deviation [dB] of the values, a number or a column.
         tx_power_dbm: Transmitted power [dBm], a number or a column, for received power.
+        eirp_dbm: Radiated power [dBm] in the main direction, in place of the transmitted power.
+        cable_loss_db: Loss between transmitter and antenna [dB], a number or a column, with a transmitted power.
+        tx_antenna: Antennas of the transmitters, if they differ.
+        rx_antenna: Antennas of the receivers, if they differ.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
         track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
@@ -192,6 +230,10 @@ class LinksSection(Section):
     weight: Text | None = None
     std: Coordinate | None = None
     tx_power_dbm: Coordinate | None = None
+    eirp_dbm: Coordinate | None = None
+    cable_loss_db: Coordinate | None = None
+    tx_antenna: MountingSection | None = None
+    rx_antenna: MountingSection | None = None
     frequency: Text | None = None
     wide: dict[str, Text] = Field(default_factory=dict)
     track: TrackSection | None = None
@@ -212,6 +254,23 @@ class LinksSection(Section):
                 "leave it out"
             )
         return self
+
+    @model_validator(mode="after")
+    def _one_power(self) -> Self:
+        if self.eirp_dbm is not None and (self.tx_power_dbm is not None or self.cable_loss_db is not None):
+            raise InputError(
+                "links.eirp_dbm includes the transmitted power, cables and the antenna's gain; leave tx_power_dbm and "
+                "cable_loss_db out"
+            )
+        if self.cable_loss_db is not None and self.tx_power_dbm is None:
+            raise InputError("links.cable_loss_db needs tx_power_dbm [dBm], the power before the cable")
+        return self
+
+    @property
+    def mountings(self) -> dict[str, MountingSection]:
+        """The ends, "tx" and "rx", whose antennas differ between links."""
+        stated = {"tx": self.tx_antenna, "rx": self.rx_antenna}
+        return {end: section for end, section in stated.items() if section is not None}
 
     @model_validator(mode="after")
     def _power_above_its_floor(self) -> Self:
@@ -238,10 +297,12 @@ class AntennasSection(Section):
     Attributes:
         tx: The transmit antenna.
         rx: The receive antenna.
+        types: Further antennas by name, for ``links.tx_antenna.type`` and ``links.rx_antenna.type``.
     """
 
     tx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
     rx: _Antenna = Field(default_factory=_Antenna)  # type: ignore[valid-type]
+    types: dict[str, _Antenna] = Field(default_factory=dict)  # type: ignore[valid-type]
 
 
 class ObjectiveSection(Section):

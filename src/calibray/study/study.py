@@ -37,6 +37,7 @@ from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
+from calibray.study.mounting import link_mountings
 from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
 from calibray.study.sections import AntennasSection
 from calibray.study.summary import summary
@@ -46,6 +47,7 @@ from calibray.support.progress import Progress
 from calibray.tables import display
 from calibray.tracing import cache
 from calibray.tracing.default_tracer import SIONNA
+from calibray.tracing.mounting import Mounting, mount
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
 from calibray.tracing.settings import TraceSettings
@@ -350,9 +352,8 @@ class Setup:
     @cached_property
     def files(self) -> dict[str, str]:
         """SHA-256 of every file of the scene and the antennas, by the path that the study resolves to."""
-        gains = [
-            Path(antenna.gain_file) for antenna in self.study.antenna_pair if antenna.gain_file is not None
-        ]
+        antennas = [*self.study.stated_antennas.values(), *self.study.antenna_types.values()]
+        gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
         digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
         rays = [] if self.study.rays_path is None else [self.study.rays_path]
         for file in (*cache.mesh_files(self.scene), *gains, *rays):
@@ -387,13 +388,26 @@ class Setup:
             return self._paths_of_table(self.study.rays_path, materials or {})
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
-            return self._trace(self.links, scene, progress)
+            return self._mounted(self._trace(self.links, scene, progress))
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
         # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
         rank = np.argsort(np.argsort(first))
-        return take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)])
+        return self._mounted(take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]))
+
+    def _mounted(self, paths: Paths) -> Paths:
+        """The paths with the fields of the antennas that differ between links."""
+        return mount(paths, self.mountings) if self.mountings else paths
+
+    @cached_property
+    def mountings(self) -> dict[str, Mounting]:
+        """The antennas at the ends, "tx" or "rx", where they differ between links.
+
+        Raises:
+            InputError: A column is missing or malformed, or names an unknown antenna.
+        """
+        return link_mountings(self.study, self.links)
 
     def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
         study = self.study

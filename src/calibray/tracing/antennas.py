@@ -7,9 +7,8 @@ the gain.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,14 @@ SLANTS: Final = {"V": (0.0,), "H": (np.pi / 2,), "VH": (0.0, np.pi / 2), "cross"
 BEAMWIDTH: Final = np.radians(65)
 """Half-power beamwidth of "tr38901" in both planes [rad] (3GPP TR 38.901, Table 7.3-1)."""
 
-Amplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""Square root of the gain as a function of zenith and azimuth in (-pi, pi] in the antenna's frame [rad]."""
+
+class Amplitude(Protocol):
+    """Square root of the gain as a function of zenith and azimuth in (-pi, pi] in the antenna's frame [rad].
+
+    `xp` is the array library: NumPy, or `jax.numpy` within a JAX function.
+    """
+
+    def __call__(self, zenith: Any, azimuth: Any, xp: Any = np) -> Any: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,9 @@ class AntennaPattern:
         table = read_gain_table(antenna.gain_file)
         return cls(
             antenna,
-            lambda zenith, azimuth: 10 ** (table.gain(np.degrees(azimuth), 90 - np.degrees(zenith)) / 20),
+            lambda zenith, azimuth, xp=np: (
+                10 ** (table.gain(xp.degrees(azimuth), 90 - xp.degrees(zenith), xp) / 20)
+            ),
         )
 
     def jones_vectors(self, direction: NDArray[np.float64], arriving: bool = False) -> NDArray[np.complex128]:
@@ -71,28 +78,28 @@ class AntennaPattern:
         return (wave * [1, -1] if arriving else wave).astype(complex)
 
 
-def iso(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
+def iso(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of an isotropic antenna; see `Amplitude`."""
-    return np.ones(zenith.shape)
+    return xp.ones(zenith.shape)
 
 
-def dipole(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
+def dipole(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a short dipole (Balanis, Antenna Theory, eq. 4-26a); see `Amplitude`."""
-    return np.sqrt(1.5) * np.abs(np.sin(zenith))
+    return np.sqrt(1.5) * xp.abs(xp.sin(zenith))
 
 
-def hw_dipole(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
+def hw_dipole(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a half-wave dipole (Balanis, Antenna Theory, eq. 4-84); see `Amplitude`."""
-    sine = np.sin(zenith)
+    sine = xp.sin(zenith)
     # cos(pi/2 cos z) / sin z tends to 0 at the poles.
-    return np.sqrt(1.643) * np.abs(np.cos(np.pi / 2 * np.cos(zenith)) / np.where(sine > 1e-5, sine, 1.0))
+    return np.sqrt(1.643) * xp.abs(xp.cos(np.pi / 2 * xp.cos(zenith)) / xp.where(sine > 1e-5, sine, 1.0))
 
 
-def tr38901(zenith: NDArray[np.float64], azimuth: NDArray[np.float64]) -> NDArray[np.float64]:
+def tr38901(zenith: Any, azimuth: Any, xp: Any = np) -> Any:
     """Amplitude of a base station's antenna element (3GPP TR 38.901, Table 7.3-1); see `Amplitude`."""
-    vertical_loss_db = np.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
-    horizontal_loss_db = np.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
-    return 10 ** ((8 - np.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
+    vertical_loss_db = xp.minimum(12 * ((zenith - np.pi / 2) / BEAMWIDTH) ** 2, 30)
+    horizontal_loss_db = xp.minimum(12 * (azimuth / BEAMWIDTH) ** 2, 30)
+    return 10 ** ((8 - xp.minimum(vertical_loss_db + horizontal_loss_db, 30)) / 20)
 
 
 _AMPLITUDES: Final[dict[str, Amplitude]] = {

@@ -1,4 +1,4 @@
-"""Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file.
+"""Measured antenna patterns: the gain of an antenna on a grid of directions, from a CSV file or an MSI file.
 
 Between grid points the gain is interpolated bilinearly in decibels, also across the end of the azimuth axis. In
 decibels main lobes are nearly parabolas (3GPP TR 38.901, Table 7.3-1, is one), so the error is least where the antenna
@@ -10,13 +10,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
+from calibray.tracing.two_cuts import TWO_CUT_SUFFIXES, read_two_cuts
 
 COLUMNS: Final = ("azimuth_deg", "elevation_deg", "gain_dbi")
 RANGES: Final = {"azimuth_deg": (-180.0, 360.0), "elevation_deg": (-90.0, 90.0), "gain_dbi": (-200.0, 60.0)}
@@ -62,18 +63,22 @@ class GainTable:
         weight[[0, -1]] = 1 - np.sin(step) / step
         return round(float(weight @ (10 ** (self.gain_dbi / 10)).mean(axis=1)) / 2, 12)
 
-    def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> NDArray[np.float64]:
-        """Interpolate the gain [...], [dBi], at azimuths and elevations [...], [deg]; elevations from -90 to 90."""
+    def gain(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike, xp: Any = np) -> Any:
+        """Interpolate the gain [...], [dBi], at azimuths and elevations [...], [deg]; elevations from -90 to 90.
+
+        `xp` is the array library: NumPy, or `jax.numpy` within a JAX function.
+        """
         elevation_step, azimuth_step = self.steps_deg
         rows, columns = self.gain_dbi.shape
-        row = (np.asarray(elevation_deg, dtype=float) + 90) / elevation_step
-        column = ((np.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
-        i = np.clip(row.astype(int), 0, rows - 2)
+        gain_dbi = xp.asarray(self.gain_dbi)
+        row = (xp.asarray(elevation_deg, dtype=float) + 90) / elevation_step
+        column = ((xp.asarray(azimuth_deg, dtype=float) - self.first_azimuth_deg) / azimuth_step) % columns
+        i = xp.clip(row.astype(int), 0, rows - 2)
         j = column.astype(int) % columns
         next_j = (j + 1) % columns
         u, v = row - i, column - j
-        low = (1 - v) * self.gain_dbi[i, j] + v * self.gain_dbi[i, next_j]
-        high = (1 - v) * self.gain_dbi[i + 1, j] + v * self.gain_dbi[i + 1, next_j]
+        low = (1 - v) * gain_dbi[i, j] + v * gain_dbi[i, next_j]
+        high = (1 - v) * gain_dbi[i + 1, j] + v * gain_dbi[i + 1, next_j]
         return (1 - u) * low + u * high
 
     def digest(self) -> str:
@@ -83,12 +88,12 @@ class GainTable:
 
 
 def is_gain_file(pattern: str) -> bool:
-    """Whether the name of a pattern is a file of gains: it ends in ".csv"."""
-    return pattern.lower().endswith(".csv")
+    """Whether the name of a pattern is a file of gains: it ends in ".csv", ".msi", ".pln" or ".ant"."""
+    return pattern.lower().endswith((".csv", *TWO_CUT_SUFFIXES))
 
 
 def read_gain_table(path: str | Path) -> GainTable:
-    """Read the gain of an antenna.
+    """Read the gain of an antenna: a CSV file of all directions, or an MSI file of two cuts (`read_two_cuts`).
 
     The CSV file has the columns azimuth_deg, elevation_deg and gain_dbi, one row per direction, in any order. Azimuths
     cover a full turn (-180 to 180 or 0 to 360, with or without the end), elevations -90 to 90, both in equal steps of
@@ -99,6 +104,9 @@ def read_gain_table(path: str | Path) -> GainTable:
             given twice, the steps are unequal, the sphere is not covered, the gains of one direction at both ends of
             the azimuth axis differ, or the antenna would radiate more than 1.5 times its power.
     """
+    if str(path).lower().endswith(TWO_CUT_SUFFIXES):
+        cuts = read_two_cuts(path)
+        return GainTable(-180.0, cuts.gain(*np.meshgrid(np.arange(-180.0, 180.0), np.arange(-90.0, 91.0))))
     table = read_table(path)
     azimuth, elevation, gain = (_in_range(table, name) for name in COLUMNS)
     row, low, high = _axis(table, "elevation_deg", elevation)

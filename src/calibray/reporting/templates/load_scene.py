@@ -91,6 +91,10 @@ def batches(links: list[dict[str, str]]) -> list[list[dict[str, str]]]:
 
 def main() -> None:
     """Print the reported and the computed path loss of links, and the largest difference."""
+    if CALIBRATION.get("mounted"):
+        sys.exit(
+            "Antennas differ between the links of this study: the scene can be loaded, but not compared."
+        )
     with (FOLDER / "links.csv").open(encoding="utf-8", newline="") as file:
         links = list(csv.DictReader(file))
     wanted = set(sys.argv[1:])

@@ -1,0 +1,114 @@
+"""From a study and the columns of its links: the antenna of every link, where it points, and the power at its port."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.errors import InputError
+from calibray.measurements import Measurements, SourceTable
+from calibray.study.model import StudyModel
+from calibray.study.sections import MountingSection
+from calibray.support.messages import did_you_mean
+from calibray.tracing.antennas import AntennaPattern
+from calibray.tracing.mounting import Mounting, Pose
+from calibray.tracing.settings import Antenna
+
+PORT_POWER: Final = "tx_port_power_dbm"
+"""Column of the links: the power that their transmitters feed into the antenna [dBm]."""
+
+
+def mounting_columns(study: StudyModel) -> tuple[str, ...]:
+    """The columns that say which antenna a link has and where it points."""
+    return tuple(name for section in study.links.mountings.values() for name in section.columns)
+
+
+def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
+    """The antennas at the ends, "tx" or "rx", where they differ between links.
+
+    Raises:
+        InputError: A column is missing or malformed, or names an unknown antenna.
+    """
+    return {end: _mounting(study, end, section, links) for end, section in study.links.mountings.items()}
+
+
+def _mounting(study: StudyModel, end: str, section: MountingSection, links: Measurements) -> Mounting:
+    antennas, index = link_antennas(study, end, links.table)
+    away = links.rx - links.tx if end == "tx" else links.tx - links.rx
+    degrees = [
+        np.radians(_degrees(links.table, f"links.{end}_antenna.{key}", getattr(section, key) or 0.0))
+        for key in ("azimuth_deg", "downtilt_deg", "electrical_downtilt_deg")
+    ]
+    yaw, downtilt, electrical = degrees
+    if section.aim is not None:
+        yaw = np.arctan2(away[:, 1], away[:, 0])
+        downtilt = -np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))
+    elif section.azimuth_deg is not None and section.azimuth_from == "north":
+        yaw = np.pi / 2 - yaw
+    return Mounting(antennas, index, Pose(yaw, downtilt, electrical))
+
+
+def link_antennas(
+    study: StudyModel, end: str, table: SourceTable
+) -> tuple[tuple[Antenna, ...], NDArray[np.int64]]:
+    """The different antennas at one end, "tx" or "rx", and the antenna of every row [rows].
+
+    Raises:
+        InputError: The column of antennas is missing, or names an unknown one.
+    """
+    section = study.links.mountings.get(end)
+    if section is None or section.type is None:
+        return (study.stated_antennas[end],), np.zeros(len(table), dtype=np.int64)
+    types, labels = study.antenna_types, table.labels(section.type)
+    unknown = np.flatnonzero(~np.isin(labels, list(types)))
+    if len(unknown):
+        name = str(labels[unknown[0]])
+        known = did_you_mean(name, types) if types else "there is none"
+        raise InputError(
+            f"{table.cell(int(unknown[0]), section.type)}: {name!r} is no antenna of [antennas.types]; {known}"
+        )
+    names, index = np.unique(labels, return_inverse=True)
+    return tuple(types[name] for name in names.tolist()), index.reshape(-1)
+
+
+def _degrees(table: SourceTable, key: str, stated: float | str) -> NDArray[np.float64]:
+    values = table.numbers(stated)
+    wrong = np.flatnonzero(np.abs(values) > 360)
+    if len(wrong):
+        place = table.cell(int(wrong[0]), stated) if isinstance(stated, str) else key
+        raise InputError(f"{place}: {values[wrong[0]]:g} must be -360 to 360; give degrees")
+    return values
+
+
+def states_port_power(study: StudyModel) -> bool:
+    """Whether the power at the antenna's port follows from other columns than the transmitted power."""
+    return study.links.eirp_dbm is not None or study.links.cable_loss_db is not None
+
+
+def port_power(study: StudyModel, table: SourceTable, optional: bool = False) -> NDArray[np.float64] | None:
+    """Power that the transmitters feed into their antennas [rows], [dBm].
+
+    It is the transmitted power without the loss of the cable, or the EIRP without the antenna's largest gain. With
+    `optional`, a missing column gives None.
+
+    Raises:
+        InputError: A column is missing or malformed, or names an unknown antenna.
+    """
+    links = study.links
+    section = links.tx_antenna
+    stated = [links.eirp_dbm, links.tx_power_dbm, links.cable_loss_db, section.type if section else None]
+    if optional and any(isinstance(name, str) and name not in table.frame for name in stated):
+        return None
+    if links.eirp_dbm is None:
+        return table.numbers(links.tx_power_dbm or 0.0) - table.numbers(links.cable_loss_db or 0.0)
+    antennas, index = link_antennas(study, "tx", table)
+    gain = np.array([largest_gain_dbi(antenna) for antenna in antennas])
+    return table.numbers(links.eirp_dbm) - gain[index]
+
+
+def largest_gain_dbi(antenna: Antenna) -> float:
+    """Largest gain of an antenna over all directions on a grid of one degree [dBi]."""
+    zenith, azimuth = np.meshgrid(np.radians(np.arange(181.0)), np.radians(np.arange(-180.0, 180.0)))
+    return float(20 * np.log10(AntennaPattern.of(antenna).amplitude(zenith, azimuth).max()))

@@ -1,0 +1,170 @@
+"""Studies whose links differ in antenna, direction and power: from tables of transmitters to predictions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calibray as cb
+import two_ray
+from calibray.errors import InputError
+from calibray.fields import path_loss
+from calibray.measurements import SourceTable, links_from_frame
+from calibray.study import Setup, Study
+from calibray.tracing.settings import Antenna
+from two_ray import COLUMNS, TRUTH, TwoRay
+
+SITES = pd.DataFrame(
+    {
+        "transmitter": ["north", "east", "omni"],
+        "site_x": [0.0, 0.0, 40.0],
+        "antenna": ["sector", "sector", "rod"],
+        "bearing": [0.0, 90.0, 0.0],
+        "tilt": [4.0, 6.0, 0.0],
+        "remote_tilt": [0.0, 3.0, 0.0],
+        "eirp": [55.0, 53.0, 40.0],
+    }
+)
+TYPES = {
+    "sector": {"pattern": "tr38901", "polarization": "V"},
+    "rod": {"pattern": "dipole", "polarization": "V"},
+}
+TX = {
+    "type": "antenna",
+    "azimuth_deg": "bearing",
+    "downtilt_deg": "tilt",
+    "electrical_downtilt_deg": "remote_tilt",
+}
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """Received powers of three transmitters at 36 places, each traced alone with its own antenna by the tracer."""
+    folder = tmp_path_factory.mktemp("planted")
+    plain = two_ray.study(folder)
+    setup = Setup.open(plain, tracer=TwoRay)
+    truth = {"ground": replace(setup.scene.materials["ground"], relative_permittivity=TRUTH)}
+    random, parts = np.random.default_rng(1), []
+    for site in SITES.itertuples():
+        rx = np.column_stack([random.uniform(-120, 120, (12, 2)), np.full(12, 1.5)])
+        table = pd.DataFrame(np.hstack([np.tile([site.site_x, 0.0, 10.0], (12, 1)), rx]), columns=COLUMNS)
+        yaw, tilt = np.pi / 2 - np.radians(site.bearing), np.radians(site.tilt)
+        pattern, gain = ("tr38901", 8.0) if site.antenna == "sector" else ("dipole", 10 * np.log10(1.5))
+        tracer = TwoRay(
+            replace(setup.scene, materials=truth), 3.5e9, setup.trace_settings,
+            Antenna(pattern, "V", (yaw, tilt, 0.0)), Antenna("dipole"),
+        )  # fmt: skip
+        loss = path_loss(tracer.trace(links_from_frame(table)), combining="coherent")
+        parts.append(
+            table[["rx_x", "rx_y", "rx_z"]].assign(transmitter=site.transmitter, dbm=site.eirp - gain - loss)
+        )
+    pd.concat(parts).to_csv(folder / "powers.csv", index=False, float_format="%.17g")
+    SITES.assign(remote_tilt=0.0).to_csv(folder / "sites.csv", index=False)
+    return plain
+
+
+def mounted(plain: Study, tx: dict[str, Any] = TX, **links: Any) -> Study:
+    content = plain.content()
+    content["antennas"]["types"] = TYPES
+    content["links"] = {
+        "file": "powers.csv",
+        "tx": ["site_x", 0.0, 10.0],
+        "rx": ["rx_x", "rx_y", "rx_z"],
+        "value": "dbm",
+        "quantity": "received_power",
+        "eirp_dbm": "eirp",
+        "transmitters": "sites.csv",
+        "tx_antenna": tx,
+    } | links
+    return Study.from_content(
+        {name: value for name, value in content.items() if value is not None}, plain.path
+    )
+
+
+def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(planted: Study) -> None:
+    result = cb.calibrate(mounted(planted), tracer=TwoRay)
+    assert result.parameters["ground.relative_permittivity"] == pytest.approx(TRUTH, rel=1e-6)
+    assert result.rmse_db < 1e-6
+    table = pd.read_csv(planted.path.parent / "powers.csv")
+    # Pointing every sector to the east, as the study did that had one direction for all.
+    wrong = cb.calibrate(mounted(planted, TX | {"azimuth_deg": 90.0}), tracer=TwoRay)
+    assert wrong.rmse_db > 2.0
+    assert len(table) == 36
+
+
+def test_traces_are_shared_by_all_directions(planted: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CALIBRAY_CACHE", str(planted.path.parent / "cache"))
+    Setup.open(mounted(planted), tracer=TwoRay).trace()
+    monkeypatch.setattr(TwoRay, "trace", lambda *_: pytest.fail("traced again"))
+    paths = Setup.open(
+        mounted(planted, TX | {"azimuth_deg": 17.0, "downtilt_deg": 2.0}), tracer=TwoRay
+    ).trace()
+    assert paths.num_links == 36
+
+
+def test_azimuths_count_from_north_or_from_east(planted: Study) -> None:
+    compass = Setup.open(mounted(planted, {"azimuth_deg": 30.0}), tracer=TwoRay).mountings["tx"]
+    turned = {"azimuth_deg": 60.0, "azimuth_from": "east"}
+    other = Setup.open(mounted(planted, turned), tracer=TwoRay).mountings["tx"]
+    np.testing.assert_allclose(compass.pose.yaw, other.pose.yaw)
+    np.testing.assert_allclose(compass.pose.yaw, np.radians(60.0))
+
+
+def test_antennas_aimed_at_each_other_have_their_largest_gain(planted: Study) -> None:
+    horns = {"type": "horn", "aim": "other end"}
+    content = mounted(planted, horns, rx_antenna=horns).content()
+    content["antennas"]["types"] = {"horn": {"pattern": "tr38901", "polarization": "V"}}
+    content["links"]["file"], content["links"]["eirp_dbm"] = "horns.csv", 30.0
+    pd.read_csv(planted.path.parent / "powers.csv").assign(horn="horn").to_csv(
+        planted.path.parent / "horns.csv", index=False
+    )
+    paths = Setup.open(Study.from_content(content, planted.path), tracer=TwoRay).trace()
+    direct = np.diff(paths.first) == 0
+    for field in (paths.tx_field, paths.rx_field):
+        np.testing.assert_allclose(
+            10 * np.log10((np.abs(field[direct]) ** 2).sum(axis=(1, 2))), 8.0, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    ("tx", "links", "message"),
+    [
+        ({"type": "transmitter"}, {}, r"row 2, column 'transmitter': 'north' is no antenna of .antennas.types."),
+        ({"azimuth_deg": "heading"}, {}, "no column 'heading'"),
+        ({"azimuth_deg": 720.0}, {}, "links.tx_antenna.azimuth_deg: 720 must be -360 to 360; give degrees"),
+        ({"azimuth_deg": 1.0, "aim": "other end"}, {}, "leave azimuth_deg and downtilt_deg out"),
+        ({}, {"cable_loss_db": 2.0}, "leave tx_power_dbm and cable_loss_db out"),
+    ],
+)  # fmt: skip
+def test_impossible_mountings_are_refused(
+    planted: Study, tx: dict[str, Any], links: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        Setup.open(mounted(planted, tx, **links), tracer=TwoRay).mountings  # noqa: B018
+
+
+def test_other_engines_refuse_antennas_that_differ_between_links(planted: Study) -> None:
+    with pytest.raises(
+        InputError, match=r"links.tx_antenna with engine.name = 'retrace'.*use engine 'replay'"
+    ):
+        mounted(planted).replace(engine="retrace")
+
+
+def test_cable_losses_lower_the_transmitted_power(planted: Study) -> None:
+    power = {"eirp_dbm": None, "tx_power_dbm": "eirp"}
+    without = mounted(planted, TX, **power).measurements()
+    with_cable = mounted(planted, TX, **power, cable_loss_db=2.5).measurements()
+    np.testing.assert_allclose(without.path_loss_db - with_cable.path_loss_db, 2.5)
+
+
+def test_predictions_at_new_links_use_their_transmitter_s_antenna(planted: Study) -> None:
+    study = mounted(planted)
+    result = cb.calibrate(study, tracer=TwoRay)
+    places = pd.DataFrame({"transmitter": ["north", "east"], "rx_x": 3.0, "rx_y": 60.0, "rx_z": 1.5})
+    setup = Setup.open(study, tracer=TwoRay, links=study.places(SourceTable(places)))
+    loss = path_loss(setup.trace(result.scene_materials), combining="coherent")
+    assert loss[1] - loss[0] > 5.0

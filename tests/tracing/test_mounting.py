@@ -1,0 +1,93 @@
+"""Antennas mounted per link: the fields equal those of Sionna RT, for any pose, at both ends, without a new trace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibray.errors import InputError
+from calibray.fields import path_gains
+from calibray.scenes import Scene, read_scene
+from calibray.tracing.antennas import AntennaPattern
+from calibray.tracing.mounting import Mounting, Pose, jones_vectors, mount
+from calibray.tracing.settings import Antenna, TraceSettings
+from calibray.tracing.sionna import Tracer
+from calibray.tracing.sionna.exported import LinkPositions
+from small_scenes import block, write_scene
+
+FREQUENCY = 3.5e9
+SETTINGS = TraceSettings(max_depth=2, refraction=True, diffraction=True, samples=20_000)
+SECTOR = Antenna("tr38901", "cross")
+DIPOLE = Antenna("hw_dipole", "V", (0.3, 0.0, 0.4))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    ground = [[(-60.0, -60.0, 0.0), (60.0, -60.0, 0.0), (60.0, 60.0, 0.0), (-60.0, 60.0, 0.0)]]
+    houses = block((5.0, -10.0, 0.0), (15.0, 10.0, 8.0)) + block((-20.0, 12.0, 0.0), (-8.0, 25.0, 12.0))
+    file = write_scene(tmp_path_factory.mktemp("scene"), {"ground": ground, "houses": houses})
+    return read_scene(file, FREQUENCY)
+
+
+def test_ten_random_poses_give_the_path_gains_of_sionna_rt(scene: Scene) -> None:
+    random = np.random.default_rng(3)
+    links = LinkPositions(tx=np.array([[-30.0, -20.0, 10.0]]), rx=np.array([[30.0, 15.0, 1.5]]))
+    paths = Tracer(scene, FREQUENCY, SETTINGS, Antenna(), Antenna()).trace(links)
+    assert paths.num_paths > 3
+    for _ in range(10):
+        yaw, tilt = random.uniform(-np.pi, np.pi, 2), random.uniform(-0.4, 0.4, 2)
+        mounted = mount(
+            paths,
+            {
+                end: Mounting(
+                    (antenna,), np.zeros(1, int), Pose(yaw[k : k + 1], tilt[k : k + 1], np.zeros(1))
+                )
+                for k, (end, antenna) in enumerate((("tx", SECTOR), ("rx", DIPOLE)))
+            },
+        )
+        turned = [
+            replace(antenna, orientation=composed(yaw[k], tilt[k], antenna))
+            for k, antenna in enumerate((SECTOR, DIPOLE))
+        ]
+        solution = Tracer(scene, FREQUENCY, SETTINGS, *turned).solve(links, {})
+        gains = path_gains(mounted)
+        largest = np.abs(solution.gain).max()
+        order, other = np.argsort(mounted.delay), np.argsort(solution.delay)
+        np.testing.assert_allclose(gains[order], solution.gain[other], atol=1e-4 * largest)
+
+
+def composed(yaw: float, tilt: float, antenna: Antenna) -> tuple[float, ...]:
+    """Yaw, pitch and roll of an antenna that is turned in its mount, by SciPy."""
+    mounted = Rotation.from_euler("ZY", [yaw, tilt]) * Rotation.from_euler("ZYX", antenna.orientation)
+    return tuple(mounted.as_euler("ZYX"))
+
+
+def test_links_differ_in_antenna_and_direction(scene: Scene) -> None:
+    tx = np.tile([-30.0, -20.0, 10.0], (3, 1))
+    links = LinkPositions(tx=tx, rx=np.array([[30.0, 15.0, 1.5], [-25.0, 20.0, 1.5], [0.0, -30.0, 2.0]]))
+    paths = Tracer(scene, FREQUENCY, SETTINGS, Antenna(), Antenna()).trace(links)
+    horn, dipole = Antenna("tr38901"), Antenna("dipole")
+    pose = Pose(np.array([0.5, 2.0, -1.0]), np.array([0.1, 0.0, 0.2]), np.zeros(3))
+    mounted = mount(paths, {"tx": Mounting((horn, dipole), np.array([0, 1, 0]), pose)})
+    for link, antenna in enumerate((horn, dipole, horn)):
+        orientation = (float(pose.yaw[link]), float(pose.downtilt[link]), 0.0)
+        alone = Tracer(scene, FREQUENCY, SETTINGS, replace(antenna, orientation=orientation), Antenna())
+        expected = alone.trace(LinkPositions(links.tx[[link]], links.rx[[link]]))
+        np.testing.assert_allclose(mounted.tx_field[mounted.link == link], expected.tx_field, atol=1e-9)
+
+
+def test_electrical_downtilt_shifts_the_pattern_in_the_antenna_s_frame() -> None:
+    elevation = np.radians(np.arange(-40.0, 41.0))
+    angles = np.stack([np.pi / 2 - elevation, np.full(81, 0.3)], axis=-1)
+    tilted = Pose(np.full(81, 0.3), np.zeros(81), np.full(81, np.radians(10.0)))
+    power = (jones_vectors(AntennaPattern.of(Antenna("tr38901")), angles, tilted) ** 2).sum(axis=(1, 2))
+    assert np.degrees(elevation[power.argmax()]) == pytest.approx(-10.0)
+
+
+def test_antennas_of_one_end_have_as_many_ports() -> None:
+    pose = Pose(np.zeros(2), np.zeros(2), np.zeros(2))
+    with pytest.raises(InputError, match=r"'V' and 'cross'.*one port, or two"):
+        Mounting((Antenna(), SECTOR), np.array([0, 1]), pose)
