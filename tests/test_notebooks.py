@@ -30,7 +30,7 @@ def cache(tmp_path_factory) -> Path:
 
 
 def test_every_notebook_is_run():
-    assert [file.name[0] for file in sorted(NOTEBOOKS.glob("*.ipynb"))] == ["1", "2", "3"]
+    assert [file.name[0] for file in sorted(NOTEBOOKS.glob("*.ipynb"))] == ["1", "2", "3", "4"]
 
 
 def test_the_first_finds_what_it_planted(monkeypatch, cache, capsys):
@@ -54,3 +54,11 @@ def test_the_third_finds_the_offset_that_was_not_declared(monkeypatch, cache, ca
     assert len(left["suggested"]) == 2
     assert left["result"].rmse_db < left["without"].rmse_db
     assert "offset" in capsys.readouterr().out
+
+
+def test_the_fourth_finds_the_planted_material_and_sets_it(monkeypatch, cache, capsys):
+    left = run("4-sionna-notebook.ipynb", monkeypatch, cache)
+    assert left["result"].parameters["marble.relative_permittivity"] == pytest.approx(9.2, rel=0.005)
+    assert np.array(left["marble"].relative_permittivity).item() == pytest.approx(9.2, rel=0.005)
+    assert np.abs(left["difference"]).max() < 0.01
+    assert "planted 9.2" in capsys.readouterr().out

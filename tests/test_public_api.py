@@ -49,6 +49,7 @@ RESULT_METHODS = {
     "allow_changed_inputs",
     "suggest": "self, candidates, count, progress, allow_changed_inputs",
     "report": "self, file, overwrite, progress",
+    "apply": "self, scene",
     "export": "self, folder, copy, overwrite",
 }
 

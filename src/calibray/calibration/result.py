@@ -185,6 +185,19 @@ class Result(Record):
 
         return report(self, file, overwrite=overwrite, progress=progress)
 
+    def apply(self, scene: object) -> None:
+        """Set the calibrated materials in a Sionna RT scene in memory.
+
+        Args:
+            scene: The `sionna.rt.Scene`, at the study's carrier.
+
+        Raises:
+            InputError: It is no scene of Sionna RT, or lacks a material.
+        """
+        from calibray.tracing.sionna.live_scene import apply_materials
+
+        apply_materials(scene, self.materials)
+
     def export(self, folder: str | Path, *, copy: bool = False, overwrite: bool = False) -> tuple[str, ...]:
         """Write the calibrated scene for Sionna RT, and its materials as tables; see `calibray.reporting.export`."""
         from calibray.reporting.export import export

@@ -31,10 +31,13 @@ def toml(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     Raises:
         InputError: A name holds characters that TOML has not.
     """
-    lines = [
-        f"#:schema {SCHEMA_FILE}",
-        "# Drafted by `calibray init`. Comments give the reason of each assumption: check antennas and heights first.",
-    ]
+    lines = []
+    if reasons:
+        lines = [
+            f"#:schema {SCHEMA_FILE}",
+            "# Drafted by `calibray init`. Comments give the reason of each assumption: check antennas and heights "
+            "first.",
+        ]
     tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
     lines += [f"{key} = {_value(value)}" for key, value in content.items() if key not in tables]
     for name, table in tables.items():

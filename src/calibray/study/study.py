@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, Final, final
 
 import numpy as np
@@ -121,6 +122,36 @@ class Study(StudyModel):
             refusal = explain(error, cls, content, str(path), tagged=("engine",))
             raise refusal from None
         study._path, study._other_engines = Path(path), other_engines
+        return study
+
+    @classmethod
+    def from_sionna(
+        cls, scene: object, measured: Any, folder: str | Path | None = None, **sections: Mapping[str, Any]
+    ) -> Study:
+        """A study of a Sionna RT scene in memory, with its carrier, transmitters, receivers, arrays and materials.
+
+        Args:
+            scene: The `sionna.rt.Scene`.
+            measured: Path loss [tx, rx], [dB], in the order of the scene's transmitters and receivers, NaN where
+                nothing was measured; or a DataFrame with names of transmitters as rows and of receivers as columns.
+            folder: Folder to write the scene, the links and `study.toml` into, for `Study.load`; if None, a temporary
+                one.
+            **sections: Sections of the study file in place of the defaults, as ``trace={"max_depth": 5}`` or
+                ``links={"quantity": "received_power"}``. Without `parameters`, the permittivity of every material is
+                calibrated.
+
+        Returns:
+            The study; `Result.apply` sets the calibrated materials in the scene.
+
+        Raises:
+            InputError: The scene or a value cannot be used, or the folder cannot be written.
+        """
+        from calibray.study.live_study import write_live_study, write_study_file
+
+        target = Path(mkdtemp(prefix="calibray-study-") if folder is None else folder)
+        content = write_live_study(scene, measured, target, sections)
+        study = cls.from_content(content, target / "study.toml")
+        write_study_file(target, content)
         return study
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -1,0 +1,105 @@
+"""A study of a Sionna RT scene in memory, and the calibrated materials in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sionna.rt as rt
+
+import calibray as cb
+from calibray.errors import InputError
+from calibray.tracing.sionna.live_scene import apply_materials
+
+PLANTED = {"marble": 9.2, "concrete": 3.1}
+
+
+def street() -> rt.Scene:
+    """The bundled street with two transmitters of one antenna, and receivers along it."""
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    scene.frequency = 3.5e9
+    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
+    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="dipole", polarization="cross")
+    for number, x in enumerate((-35.0, 0.0)):
+        name = f"tx{number}"
+        scene.add(rt.Transmitter(name, position=[x, 0, 10], orientation=[0.3, 0.1, 0], power_dbm=20 + number))
+    for number, x in enumerate(np.linspace(-25, 25, 8)):
+        scene.add(rt.Receiver(f"rx{number}", position=[float(x), float(4 * np.cos(x)), 1.5]))
+    return scene
+
+
+def path_loss_db(scene: rt.Scene) -> np.ndarray:
+    """Path loss by Sionna's own solver, power summed over receive ports [tx, rx]."""
+    paths = rt.PathSolver()(scene, max_depth=2, samples_per_src=50_000, refraction=False)
+    real, imaginary = (np.array(part, dtype=float) for part in paths.a)
+    return -10 * np.log10((real**2 + imaginary**2).sum(axis=(1, 3, 4))).T
+
+
+@pytest.fixture(scope="module")
+def measured() -> np.ndarray:
+    scene = street()
+    for name, value in PLANTED.items():
+        scene.radio_materials[name].relative_permittivity = value
+    return path_loss_db(scene)
+
+
+@pytest.fixture(scope="module")
+def study(measured: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> cb.Study:
+    return cb.Study.from_sionna(
+        street(),
+        measured,
+        tmp_path_factory.mktemp("study"),
+        trace={"max_depth": 2, "samples": 50_000},
+        parameters={f"{name}.relative_permittivity": {"bounds": [1.5, 15.0]} for name in PLANTED},
+    )
+
+
+def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measured: np.ndarray) -> None:
+    """`examples/notebooks/4-sionna-notebook.ipynb` calibrates; here the materials are the planted ones."""
+    scene, paths = street(), cb.trace(study)
+    assert np.abs(path_loss_db(scene) - measured).max() > 0.5
+    planted = {
+        name: replace(paths.materials[name], relative_permittivity=value) for name, value in PLANTED.items()
+    }
+    apply_materials(scene, planted)
+    np.testing.assert_allclose(path_loss_db(scene), measured, atol=1e-4)
+    np.testing.assert_allclose(cb.path_loss(paths, planted).reshape(measured.shape), measured, atol=0.001)
+    with pytest.raises(InputError, match="no material 'walls'"):
+        apply_materials(scene, {"walls": planted["marble"]})
+
+
+def test_a_study_can_be_saved_and_loaded(study: cb.Study) -> None:
+    loaded = cb.Study.load(study.path)
+    assert loaded.content() == study.content()
+    assert loaded.antenna_pair[0].orientation == pytest.approx((0.3, 0.1, 0))
+    assert [antenna.pattern for antenna in loaded.antenna_pair] == ["tr38901", "dipole"]
+    # Sionna has merged the buildings of a material.
+    assert len(loaded.opened().scene.objects) == 7 > len(street().objects)
+
+
+def test_values_may_be_named_missing_or_received_power(measured: np.ndarray, tmp_path: Path) -> None:
+    power = pd.DataFrame(20.0 - measured[:1, ::-1], ["tx0"], [f"rx{number}" for number in range(7, -1, -1)])
+    power.loc["tx0", "rx3"] = np.nan
+    study = cb.Study.from_sionna(street(), power, tmp_path, links={"quantity": "received_power"})
+    links = study.measurements()
+    np.testing.assert_allclose(links.path_loss_db, np.delete(measured[0], 3))
+    assert list(study.parameters) == [f"{name}.relative_permittivity" for name in study.materials]
+
+
+def test_what_a_study_cannot_state_is_refused(measured: np.ndarray, tmp_path: Path) -> None:
+    def refused(scene: object, message: str, values: object = measured) -> None:
+        with pytest.raises(InputError, match=message):
+            cb.Study.from_sionna(scene, values, tmp_path)
+
+    refused("street", "must be a scene of sionna.rt")
+    refused(street(), r"shape \(8, 2\), must be \(2, 8\)", measured.T)
+    refused(street(), "column 'r' is no receiver", pd.DataFrame(measured[:, :1], ["tx0", "tx1"], ["r"]))
+    scene = street()
+    scene.tx_array = rt.PlanarArray(num_rows=2, num_cols=1, pattern="iso", polarization="V")
+    refused(scene, "has 2 elements")
+    scene = street()
+    scene.transmitters["tx1"].orientation = [1.0, 0, 0]
+    refused(scene, "different orientations")
