@@ -51,6 +51,7 @@ class Replay:
             combine by power.
         tabulate: Whether coefficients come from tables; if None, wherever that is faster.
         batch: Largest number of candidates in one call; the program is compiled for this number.
+        effects: Effects on the paths, in the order of `paths`.
 
     Raises:
         InputError: A parameter's material is not in the paths, or the combining cannot be used.
@@ -65,8 +66,10 @@ class Replay:
         dtype: type | None = None,
         tabulate: bool | None = None,
         batch: int = BATCH,
+        effects: fields.Effects = (),
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
+        self.effects, self._options = effects, (combining, bandwidth)
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
         self._dtype, self._batch = dtype, batch
@@ -77,7 +80,9 @@ class Replay:
         used_columns, self._used_column = np.unique(self._columns, return_inverse=True)
         self._used_columns = tuple(int(column) for column in used_columns)
         self._base = paths.material_table().astype(dtype)
-        self._intervals = None if tabulate is False else self._table_intervals(force=tabulate is True)
+        self._intervals = (
+            None if tabulate is False or effects else self._table_intervals(force=tabulate is True)
+        )
         self._program = self._compile()
 
     @property
@@ -89,6 +94,10 @@ class Replay:
     def large(self) -> bool:
         """Whether there are so many interactions that a candidate takes milliseconds."""
         return self.interactions > LARGE
+
+    def without_effects(self) -> Replay:
+        """The same without the effects, for path loss that a scene alone gives."""
+        return Replay(self.paths, self.parameters, *self._options)
 
     def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Path loss of every link for candidates; see `Engine.path_loss`."""
@@ -102,12 +111,26 @@ class Replay:
         loss, jacobian = self._run(self._path_losses_and_jacobian, candidates)
         return loss, jacobian
 
-    def _path_losses(self, tables: NDArray[np.floating], count: int) -> tuple[NDArray[np.floating], float]:
+    def _path_losses(
+        self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
+    ) -> tuple[NDArray[np.floating], float]:
+        if self.effects:
+            return fields.path_losses_with_effects(
+                self._program, tables, self._effects, values, self._combining
+            ), 0.0
         return fields.path_losses(self._program, tables, self._combining, count)
 
     def _path_losses_and_jacobian(
-        self, tables: NDArray[np.floating], count: int
+        self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
     ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
+        if self.effects:
+            loss, slope, by_effect = fields.path_losses_and_slopes_with_effects(
+                self._program, tables, self._effects, values, self._used_columns, self._combining
+            )
+            jacobian = np.empty((*loss.shape, len(self.parameters)), loss.dtype)
+            jacobian[..., self.parameters.of_materials] = slope[:, :, self._rows, self._used_column]
+            jacobian[..., self.parameters.of_effects] = by_effect
+            return loss, jacobian, 0.0
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
@@ -121,12 +144,15 @@ class Replay:
             batch = values[start : start + size]
             # The program is compiled for `size` candidates: the rest of the tables keep the base values.
             tables = np.repeat(self._base[None], size, axis=0)
-            tables[: len(batch), self._rows, self._columns] = batch
-            *answers, table_error = function(tables, len(batch))
+            tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
+            of_effects = np.resize(
+                batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects))
+            )
+            *answers, table_error = function(tables, of_effects, len(batch))
             if table_error > TABLE_TOLERANCE:
                 self._refine_tables()
                 continue
-            batches.append([np.asarray(answer, dtype=float) for answer in answers])
+            batches.append([np.asarray(answer[: len(batch)], dtype=float) for answer in answers])
             start += len(batch)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
@@ -149,9 +175,9 @@ class Replay:
         self._program = self._compile()
 
     def _compile(self) -> fields.GroupedProgram:
-        return fields.layout(
-            self.paths, self._dtype, self._intervals, self._combining.kind != "power"
-        ).program
+        plan = fields.layout(self.paths, self._dtype, self._intervals, self._combining.kind != "power")
+        self._effects = tuple(effect.ordered(plan.order) for effect in self.effects)
+        return plan.program
 
     def _batch_size(self) -> int:
         """Candidates in one call: a power of two within the limits, or one if tables are filled for each candidate."""
@@ -169,10 +195,12 @@ class CarrierPaths:
     Attributes:
         paths: The path program of the links measured there, with the constants at that carrier.
         links: Indices of these links among all links [l].
+        effects: Effects on the paths.
     """
 
     paths: Paths
     links: NDArray[np.int64]
+    effects: fields.Effects = ()
 
 
 @final
@@ -206,7 +234,11 @@ class ReplayCarriers:
         self._constant = constants[0][1]
         self._first = np.unique(self._constant, return_index=True)[1]
         self._carriers = [
-            (Replay(carrier.paths, at_carrier, combining, bandwidth), carrier.paths.frequency, carrier.links)
+            (
+                Replay(carrier.paths, at_carrier, combining, bandwidth, effects=carrier.effects),
+                carrier.paths.frequency,
+                carrier.links,
+            )
             for carrier, (at_carrier, _) in zip(carriers, constants, strict=True)
         ]
 

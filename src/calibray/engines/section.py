@@ -14,6 +14,7 @@ from calibray.support.strict_models import Section
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers
+    from calibray.fields import Effects
     from calibray.materials import Material
     from calibray.measurements import Measurements
     from calibray.parameters import Parameters
@@ -101,6 +102,10 @@ class OpenedStudy(Protocol):
         self, materials: Mapping[str, Material] | None = None, progress: Progress | None = None
     ) -> Paths:
         """The paths of the links, with `materials` in place of the scene's."""
+        ...
+
+    def effects(self, paths: Paths) -> Effects:
+        """Effects on the paths that no material has."""
         ...
 
     def at(self, links: Measurements) -> Self:

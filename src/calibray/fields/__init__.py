@@ -9,11 +9,14 @@ Programs are in double precision by default, single on request. Functions comput
 
 from calibray.fields.coefficient_tables import FINEST, table_intervals
 from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
+from calibray.fields.effects import Effect, Effects, ExtraLoss
 from calibray.fields.evaluation import (
     path_gains,
     path_loss,
     path_losses,
     path_losses_and_slopes,
+    path_losses_and_slopes_with_effects,
+    path_losses_with_effects,
     path_powers,
     program_path_loss,
 )
@@ -24,6 +27,9 @@ __all__ = [
     "COMBINING",
     "FINEST",
     "Combining",
+    "Effect",
+    "Effects",
+    "ExtraLoss",
     "GroupedProgram",
     "Layout",
     "jax_settings",
@@ -33,6 +39,8 @@ __all__ = [
     "path_loss_of_gains",
     "path_losses",
     "path_losses_and_slopes",
+    "path_losses_and_slopes_with_effects",
+    "path_losses_with_effects",
     "path_powers",
     "program_path_loss",
     "table_intervals",

@@ -27,6 +27,7 @@ from calibray.fields import coefficient_tables
 from calibray.fields.arithmetic import materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
 from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
+from calibray.fields.effects import Effects, apply_effects
 from calibray.fields.grouping import COEFFICIENT
 from calibray.fields.jax_context import jax_settings
 from calibray.fields.material_response import (
@@ -171,6 +172,37 @@ def path_losses_and_slopes(
     return np.asarray(_decibel(jnp.stack(powers))), np.asarray(jnp.stack(slopes)), float(np.max(errors))
 
 
+@jax_settings()
+def path_losses_with_effects(
+    program: GroupedProgram,
+    tables: NDArray[np.floating],
+    effects: Effects,
+    values: NDArray[np.floating],
+    combining: Combining = POWER,
+) -> NDArray[np.floating]:
+    """Path loss [n, L], [dB], of candidates with material constants [n, M, 8] and effect parameters [n, e]."""
+    return np.asarray(
+        _losses_with_effects(program, jnp.asarray(tables), effects, jnp.asarray(values), combining)
+    )
+
+
+@jax_settings()
+def path_losses_and_slopes_with_effects(
+    program: GroupedProgram,
+    tables: NDArray[np.floating],
+    effects: Effects,
+    values: NDArray[np.floating],
+    columns: tuple[int, ...],
+    combining: Combining = POWER,
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+    """Path loss with effects, its derivatives by materials [n, L, M, columns] and by effect parameters [n, L, e]."""
+    answers = _slopes_with_effects(
+        program, jnp.asarray(tables), effects, jnp.asarray(values), columns, combining
+    )
+    loss, slope, by_effect = (np.asarray(answer) for answer in answers)
+    return loss, slope, by_effect
+
+
 def _power(
     program: GroupedProgram, responses: tuple[GroupResponse, ...], combining: Combining, keep: bool = False
 ) -> jax.Array:
@@ -288,3 +320,47 @@ def _slopes_by_formula(
     losses = jnp.zeros((len(tables), program.num_links), tables.dtype)
     slopes = jnp.zeros((*losses.shape, tables.shape[1], len(columns)), tables.dtype)
     return jax.lax.fori_loop(0, count, evaluate, (losses, slopes))
+
+
+@partial(jax.jit, compiler_options=_WIDE)
+def _losses_with_effects(
+    program: GroupedProgram, tables: jax.Array, effects: Effects, values: jax.Array, combining: Combining
+) -> jax.Array:
+    """Path loss [n, L] of candidates, one after the other."""
+    return jax.lax.map(
+        lambda candidate: program_path_loss(
+            apply_effects(program, effects, candidate[1]), candidate[0], combining
+        ),
+        (tables, values),
+    )
+
+
+@partial(jax.jit, static_argnums=4, compiler_options=_WIDE)
+def _slopes_with_effects(
+    program: GroupedProgram,
+    tables: jax.Array,
+    effects: Effects,
+    values: jax.Array,
+    columns: tuple[int, ...],
+    combining: Combining,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of candidates, one after the other."""
+    stored = partial(materialize, positive=program.wavelength)
+
+    def evaluate(candidate: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        table, value = candidate
+        changed = apply_effects(program, effects, value)
+        response, derivatives = stored(response_and_derivatives(changed, table, columns))
+        responses = split_by_step(changed, response)
+        power, by_step = stored(_slope(changed, responses, combining))
+        by_effect = jax.jacfwd(
+            lambda value: _power(apply_effects(program, effects, value), responses, combining)
+        )(value)
+        inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
+        if columns:
+            slope = _contract(changed, power, by_step, derivatives, tables.shape[1])
+        else:
+            slope = jnp.zeros((program.num_links, tables.shape[1], 0), tables.dtype)
+        return decibel(power), slope, -10 / np.log(10) * inverse[:, None] * by_effect
+
+    return jax.lax.map(evaluate, (tables, values))

@@ -31,6 +31,12 @@ CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Fields that a parameter may set, each with the constant of the material that it changes."""
 
+EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
+    {"region": {"specific_attenuation": Bound(0.0, inf, "dB/m")}}
+)
+"""Kinds of things other than materials that have parameters, as in "region:trees.specific_attenuation", with the
+physical bounds of each field."""
+
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
         **BOUNDS,
@@ -38,6 +44,7 @@ PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "itu_b": Bound(-10.0, 10.0, "1"),
         "itu_c": Bound(0.0, inf, "S/m"),
         "itu_d": Bound(-10.0, 10.0, "1"),
+        **{field: bound for fields in EFFECTS.values() for field, bound in fields.items()},
     }
 )
 """Physical bounds of each field; the value of a law is checked by `check_law`."""

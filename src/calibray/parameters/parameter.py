@@ -17,7 +17,13 @@ from calibray.materials import (
     itu_law,
     itu_material,
 )
-from calibray.parameters.laws import CONSTANT_OF_FIELD, LAWS, PARAMETER_BOUNDS, frequency_independent_law
+from calibray.parameters.laws import (
+    CONSTANT_OF_FIELD,
+    EFFECTS,
+    LAWS,
+    PARAMETER_BOUNDS,
+    frequency_independent_law,
+)
 from calibray.support.messages import did_you_mean
 
 Scale = Literal["linear", "log"]
@@ -28,11 +34,12 @@ _PATTERN_FIELDS: Final = ("alpha_r", "alpha_i", "lambda_")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One calibrated number: a field of a material, with its bounds and its start value.
+    """One calibrated number: a field of a material or of an effect, with its bounds and its start value.
 
     Attributes:
         name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are the constants of a
-            material and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz.
+            material and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz. An
+            effect has its kind before a colon: "region:trees.specific_attenuation".
         lower: Lower bound, in the field's unit.
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.
@@ -93,8 +100,13 @@ class Parameter:
 
     @property
     def constant(self) -> str:
-        """The constant of the material that it changes, one of `FIELDS`."""
-        return CONSTANT_OF_FIELD[self.field]
+        """The constant of the material that it changes, one of `FIELDS`; the field itself of an effect."""
+        return CONSTANT_OF_FIELD.get(self.field, self.field)
+
+    @property
+    def is_effect(self) -> bool:
+        """Whether it belongs to an effect, not to a material."""
+        return is_effect(self.name)
 
 
 def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
@@ -119,6 +131,17 @@ def fixed_constant(name: str, value: float, spread: float) -> Parameter | None:
     return Parameter(name, lower, upper, value, "log")
 
 
+def is_effect(name: str) -> bool:
+    """Whether the name of a parameter is that of an effect.
+
+    Example:
+        >>> is_effect("region:trees.specific_attenuation"), is_effect("walls.thickness")
+        (True, False)
+    """
+    kind, colon, _ = name.partition(":")
+    return bool(colon) and kind in EFFECTS
+
+
 def split_name(name: str) -> tuple[str, str]:
     """Split the name of a parameter at the last dot into material and field.
 
@@ -130,12 +153,13 @@ def split_name(name: str) -> tuple[str, str]:
         ('block.7', 'thickness')
     """
     material, _, field = name.rpartition(".")
+    allowed = EFFECTS[name.partition(":")[0]] if is_effect(name) else CONSTANT_OF_FIELD
     if not material:
         raise InputError(
             f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"
         )
-    if field not in CONSTANT_OF_FIELD:
-        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, CONSTANT_OF_FIELD)}")
+    if field not in allowed:
+        raise InputError(f"parameter {name!r}: no field {field!r}; {did_you_mean(field, allowed)}")
     return material, field
 
 
@@ -200,6 +224,8 @@ def itu_start(name: str, start: str, frequency: float) -> float:
         InputError: The text has another form, the field has no ITU-R law, or as for `itu_material`.
     """
     field = split_name(name)[1]
+    if is_effect(name):
+        raise InputError(f"{name}: {start!r}: ITU-R P.2040 gives materials only; give a number")
     if not start.startswith(_ITU_PREFIX):
         raise InputError(
             f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"

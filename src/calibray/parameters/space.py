@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -118,6 +119,16 @@ class Parameters:
     def named(self, candidate: ArrayLike) -> dict[str, float]:
         """The values of a candidate [parameters] by the parameters' names."""
         return dict(zip(self.names, self._components(candidate).tolist(), strict=True))
+
+    @cached_property
+    def of_effects(self) -> NDArray[np.int64]:
+        """Indices of the parameters that belong to effects, not to materials."""
+        return np.array([k for k, item in enumerate(self.items) if item.is_effect], dtype=np.int64)
+
+    @cached_property
+    def of_materials(self) -> NDArray[np.int64]:
+        """Indices of the parameters that belong to materials."""
+        return np.array([k for k, item in enumerate(self.items) if not item.is_effect], dtype=np.int64)
 
     # Constants of materials
 
@@ -238,12 +249,14 @@ class Parameters:
         changes: dict[str, dict[str, float]] = {}
         constants, _ = self.constants_and_slopes(values, frequency)
         for parameter, value in zip(self.items, constants.tolist(), strict=True):
+            if parameter.is_effect:
+                continue
             check_material(parameter.name, base)
             changes.setdefault(parameter.material, {})[parameter.constant] = value
         return {name: replace(material, **changes.get(name, {})) for name, material in base.items()}
 
     def matrix_indices(self, materials: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and column, in a matrix of constants [materials, fields], of each parameter [parameters].
+        """Row and column, in a matrix of constants [materials, fields], of each parameter of a material.
 
         Replay scatters candidates with them: ``constants.at[..., rows, columns].set(candidates)``. Coefficients of laws
         have no cell; take the parameters `at_carrier` first.
@@ -257,10 +270,11 @@ class Parameters:
                 "them at a carrier"
             )
         row_of = {name: row for row, name in enumerate(materials)}
-        for name in self.names:
-            check_material(name, row_of)
-        rows = np.array([row_of[parameter.material] for parameter in self.items], dtype=np.int64)
-        columns = np.array([FIELDS.index(parameter.field) for parameter in self.items], dtype=np.int64)
+        items = [parameter for parameter in self.items if not parameter.is_effect]
+        for parameter in items:
+            check_material(parameter.name, row_of)
+        rows = np.array([row_of[parameter.material] for parameter in items], dtype=np.int64)
+        columns = np.array([FIELDS.index(parameter.field) for parameter in items], dtype=np.int64)
         return rows, columns
 
     def constants_of(
@@ -280,7 +294,8 @@ class Parameters:
         rows, columns = parameters.matrix_indices(list(base))
         matrix = constants_matrix(base)
         batch = np.broadcast_to(matrix, (*values.shape[:-1], *matrix.shape)).copy()
-        batch[..., rows[indices], columns[indices]] = values
+        cell = np.searchsorted(parameters.of_materials, indices[self.of_materials])
+        batch[..., rows[cell], columns[cell]] = values[..., self.of_materials]
         return batch
 
     # The search space: logarithms of the parameters that span decades, the others in their physical unit as in the

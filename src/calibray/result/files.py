@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from calibray.errors import InputError
+from calibray.parameters import is_effect
 from calibray.result.held_out import HeldOutErrors, Model
 from calibray.result.record import (
     Accuracy,
@@ -246,6 +247,8 @@ def _check_consistent(stored: Stored, study: Study, source: Path) -> None:
                 "the study again"
             )
     for name in names:
+        if is_effect(name):
+            continue
         material, _, constant = name.rpartition(".")
         if material not in fit.materials:
             raise InputError(

@@ -344,7 +344,8 @@ def scene_alone_text(record: Record) -> str:
     rms_db = float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
     if rms_db < SCENE_ALONE_DB:
         return ""
-    cause = ", ".join(term.name for term in model.terms) or "its ceiling"
+    missing = [*(f"the region {name}" for name in record.study.regions), *(term.name for term in model.terms)]
+    cause = ", ".join(missing) or "its ceiling"
     if model.parameters is None:
         return (
             f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "

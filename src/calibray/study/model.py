@@ -16,9 +16,10 @@ from calibray.engines.kinds import AnyEngine, default
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
-from calibray.parameters import LogNormal, Parameter, Parameters, itu_start, make_parameter
+from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, itu_start, make_parameter
 from calibray.parameters.laws import frequency_independent_law
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
+from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import (
     AntennasSection,
     FidelitySection,
@@ -37,7 +38,7 @@ from calibray.study.sections import (
 )
 from calibray.study.toml_file import expand
 from calibray.study.validation_errors import dotted
-from calibray.support.messages import shortened
+from calibray.support.messages import did_you_mean, shortened
 from calibray.support.output_files import exists
 from calibray.support.strict_models import Section, Text
 from calibray.tracing.settings import Antenna
@@ -64,6 +65,7 @@ class StudyModel(Section, ABC):
     trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
     objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
     parameters: dict[str, ParameterSection]
+    regions: dict[str, RegionSection] = Field(default_factory=dict)
     offset: OffsetSection | None = None
     nuisance: dict[str, NuisanceSection] = Field(default_factory=dict)
     noise: NoiseSection = Field(default_factory=NoiseSection)
@@ -97,6 +99,7 @@ class StudyModel(Section, ABC):
                 f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are "
                 "counted as if their errors were independent; leave one of them out"
             )
+        self._check_regions()
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
         if self.links.mountings and self.engine.name != "replay":
@@ -108,6 +111,20 @@ class StudyModel(Section, ABC):
         self._check_materials()
         self._check_parameters()
         return self
+
+    def _check_regions(self) -> None:
+        for name in self.parameters:
+            region = name.removeprefix(PREFIX).rpartition(".")[0]
+            if name.startswith(PREFIX) and region not in self.regions:
+                raise InputError(
+                    f"parameters: {name!r}: no [regions.{region}]; {did_you_mean(region, self.regions)}"
+                )
+        if self.regions and self.engine.name != "replay":
+            raise InputError(
+                f"[regions] needs engine.name = 'replay'; the engine {self.engine.name!r} knows no regions"
+            )
+        if self.regions and getattr(self.engine, "compress_db", None) is not None:
+            raise InputError("engine.compress_db: few weighted paths have no place in [regions]; remove it")
 
     def _check_materials(self) -> None:
         for name, material in self.materials.items():
@@ -165,6 +182,14 @@ class StudyModel(Section, ABC):
         """The ray table that is replayed, if there is one."""
         file = self.engine.rays if isinstance(self.engine, ReplaySection) else None
         return None if file is None else self._resolve("engine.rays", file)
+
+    @property
+    def region_paths(self) -> dict[str, Path | None]:
+        """The file of every region by name; None for one of boxes."""
+        return {
+            name: None if section.file is None else self._resolve(f"regions.{name}.file", section.file)
+            for name, section in self.regions.items()
+        }
 
     @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
@@ -242,7 +267,9 @@ class StudyModel(Section, ABC):
         frequency = self.scene.frequency
         try:
             items = tuple(
-                make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
+                self._effect_parameter(name)
+                if is_effect(name)
+                else make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
                 for name, entry in self.parameters.items()
             )
             all_laws = {name: frequency_independent_law(material) for name, material in base.items()} | dict(
@@ -255,6 +282,11 @@ class StudyModel(Section, ABC):
         except InputError as error:
             raise InputError(f"{self._path}: {error}") from None
         return parameters
+
+    def _effect_parameter(self, name: str) -> Parameter:
+        entry, region = self.parameters[name], self.regions[name.removeprefix(PREFIX).rpartition(".")[0]]
+        start = region.specific_attenuation if entry.start is None else float(entry.start)
+        return Parameter(name, *entry.bounds, start, entry.scale)
 
     def content(self) -> dict[str, Any]:
         """The study as plain values with every default written out; `Study.from_content` reads it."""
@@ -297,6 +329,8 @@ class StudyModel(Section, ABC):
             ("links.track.file", links.track and links.track.file, self.track_path),
             ("engine.rays", getattr(self.engine, "rays", None), self.rays_path),
         ]
+        for name, path in self.region_paths.items():
+            files.append((f"regions.{name}.file", self.regions[name].file, path))
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))
         written = [("tx", self.antennas.tx), ("rx", self.antennas.rx)]

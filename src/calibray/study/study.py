@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from calibray.engines.section import EngineSection, RadioSettings
 from calibray.errors import InputError
+from calibray.fields import Effects
 from calibray.materials import Material
 from calibray.measurements import (
     LINK_COLUMNS,
@@ -35,11 +36,13 @@ from calibray.measurements import (
 from calibray.parameters import Parameters
 from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
+from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.mounting import link_mountings
-from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track
+from calibray.study.regions import region_effects
+from calibray.study.row_steps import known_frame, link_columns, position_steps, row_steps, row_track
 from calibray.study.sections import AntennasSection
 from calibray.study.summary import summary
 from calibray.study.toml_file import read_content, refuse_unquoted_names, split_engine_keys
@@ -318,6 +321,16 @@ class Setup:
         links = with_obstruction(self.links, self.scene, self.study.scene.frequency)
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
+    def effects(self, paths: Paths) -> Effects:
+        """Effects of regions on the paths of the links."""
+        return region_effects(self.study.regions, self._regions, self.parameters, paths)
+
+    @cached_property
+    def _regions(self) -> dict[str, Region]:
+        frame = known_frame(self.study) if self.study.regions else None
+        paths = self.study.region_paths
+        return {name: section.region(paths[name], frame) for name, section in self.study.regions.items()}
+
     @property
     def radio(self) -> RadioSettings:
         """Carrier, bandwidth, combining and antennas."""
@@ -387,7 +400,8 @@ class Setup:
         gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
         digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
         rays = [] if self.study.rays_path is None else [self.study.rays_path]
-        for file in (*cache.mesh_files(self.scene), *gains, *rays):
+        regions = [file for file in self.study.region_paths.values() if file is not None]
+        for file in (*cache.mesh_files(self.scene), *gains, *rays, *regions):
             digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
         return digests
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
 from calibray.fitting.problem import Problem
-from calibray.materials import BOUNDS
 from calibray.parameters import Parameters
+from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.paths import Paths
 from calibray.scenes import Scene, building_numbers, read_triangles
 
@@ -51,7 +51,7 @@ class SplitReplay:
         Returns:
             Path loss [n, L], [dB].
         """
-        bounds = [BOUNDS[parameter.field] for parameter in self.engine.parameters]
+        bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in self.engine.parameters]
         lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
         return self.engine.path_loss(np.clip(values[:, self.parameter_of] * factors, lower, upper))
 
@@ -91,6 +91,11 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
     split_names = [f"{name} of {of}" for name, of in zip(original, number, strict=True)]
     items, parameter_of, building_of = [], [], []
     for index, parameter in enumerate(parameters):
+        if parameter.is_effect:
+            items.append(parameter)
+            parameter_of.append(index)
+            building_of.append(-1)
+            continue
         for split_name, name, of in zip(split_names, original, number, strict=True):
             if name == parameter.material:
                 items.append(replace(parameter, name=f"{split_name}.{parameter.field}"))
@@ -104,6 +109,7 @@ def split_replay(problem: Problem, parameters: Parameters, *, by_building: bool)
         study.objective.combining,
         study.scene.bandwidth,
         batch=1 << (batch.bit_length() - 1),
+        effects=problem.engine.effects,  # type: ignore[attr-defined]
     )
     return SplitReplay(engine, np.array(parameter_of), np.array(building_of))
 

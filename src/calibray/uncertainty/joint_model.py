@@ -264,7 +264,9 @@ def _fixed_constants(problem: Problem) -> list[Parameter]:
     materials, spread = problem.engine.materials, problem.setup.study.noise.constants_spread
     names = [
         f"{material}.{field_name}"
-        for material in dict.fromkeys(parameter.material for parameter in problem.parameters)
+        for material in dict.fromkeys(
+            parameter.material for parameter in problem.parameters if not parameter.is_effect
+        )
         for field_name in FIXED_FIELDS
     ]
     items = []

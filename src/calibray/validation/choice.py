@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.replay import Replay
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
@@ -114,6 +115,8 @@ def fit_prediction_model(
         residuals.blocks,
     )
     materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
+    if isinstance(problem.engine, Replay) and problem.engine.effects:
+        scene_db = problem.engine.without_effects().path_loss(candidate[None])[0]
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
 
 

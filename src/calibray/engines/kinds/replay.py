@@ -118,12 +118,13 @@ def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -
     if compress_db is not None:
         paths = compress(paths, parameters, compress_db).paths
     if links.frequency is None and not parameters.has_laws:
-        return Replay(paths, parameters, *options)
+        return Replay(paths, parameters, *options, effects=study.effects(paths))
     if links.frequency is None:
-        carriers = [CarrierPaths(paths, np.arange(len(links)))]
+        at_carriers = [(paths, np.arange(len(links)))]
     else:
-        carriers = [
-            CarrierPaths(take_links(paths, index).at(frequency, study.carriers[frequency]), index)
+        at_carriers = [
+            (take_links(paths, index).at(frequency, study.carriers[frequency]), index)
             for frequency, index in links.carriers
         ]
+    carriers = [CarrierPaths(part, index, study.effects(part)) for part, index in at_carriers]
     return ReplayCarriers(carriers, parameters, paths.materials, *options)

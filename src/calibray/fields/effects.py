@@ -1,0 +1,79 @@
+"""Effects on a path program that no material has: they change the antenna fields of its paths.
+
+An effect takes the values of its own parameters. All that follows from the fields (path loss, delay spread, derivatives
+by the materials) is evaluated on the changed program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.fields.program import GroupedProgram
+
+
+class Effect(Protocol):
+    """An effect on the paths of a program; an immutable pytree."""
+
+    def ordered(self, order: NDArray[np.int64]) -> Effect:
+        """The same effect with its paths in another order, that of a program [P]."""
+        ...
+
+    def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
+        """The program with changed antenna fields, for the values of all effect parameters [e]."""
+        ...
+
+
+Effects = tuple[Effect, ...]
+
+
+def apply_effects(program: GroupedProgram, effects: Effects, values: jax.Array) -> GroupedProgram:
+    """The program with all effects, for the values of their parameters [e]."""
+    return reduce(lambda changed, effect: effect.apply(changed, values), effects, program)
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["length", "maximum_db"], meta_fields=["index", "fixed"]
+)
+@dataclass(frozen=True, eq=False)
+class ExtraLoss:
+    """Loss of paths through regions such as woodland: it saturates with the length of the path in them.
+
+    Attributes:
+        length: Length of every path inside the regions [P], [m].
+        maximum_db: Loss of a very long path [dB].
+        index: Number of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
+        fixed: The specific attenuation if it is fixed [dB/m].
+    """
+
+    length: jax.Array | NDArray[np.float64]
+    maximum_db: float
+    index: int | None
+    fixed: float = 0.0
+
+    def ordered(self, order: NDArray[np.int64]) -> ExtraLoss:
+        """See `Effect.ordered`."""
+        return replace(self, length=np.asarray(self.length)[order])
+
+    def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
+        """See `Effect.apply`."""
+        specific = self.fixed if self.index is None else values[self.index]
+        # A = A_m (1 - exp(-d gamma / A_m)), ITU-R P.833-10 equation 1
+        loss_db = self.maximum_db * -jnp.expm1(-jnp.asarray(self.length) * specific / self.maximum_db)
+        return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db))
+
+
+def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:
+    """The program with the fields of its paths, in its order, times an amplitude [P]."""
+    groups, first = [], 0
+    for group in program.groups:
+        own = amplitude[first : first + group.size].astype(group.rx.dtype)
+        groups.append(replace(group, rx=group.rx * own))
+        first += group.size
+    return replace(program, groups=tuple(groups))

@@ -1,0 +1,182 @@
+"""``[regions.NAME]``: regions of extra loss, such as trees, and their effect on the paths of a study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from calibray.coordinates import WGS84, Frame
+from calibray.errors import InputError
+from calibray.fields import Effects, ExtraLoss
+from calibray.parameters import Parameters
+from calibray.paths import Paths
+from calibray.scenes.regions import Region
+from calibray.support.lazy_imports import library
+from calibray.support.messages import did_you_mean, shortened
+from calibray.support.strict_models import Section, Text
+
+PREFIX: Final = "region:"
+"""Beginning of the names of a region's parameters."""
+
+WOODLAND: Final = (1.15, 0.43)
+"""A_1 [dB] and alpha of the largest loss A_1 f^alpha in woodland, f in MHz (ITU-R P.833-10, section 2, Mulhouse)."""
+
+Height = float | str
+
+
+class RegionSection(Section):
+    """``[regions.NAME]``: polygons with extra loss along the path of a ray inside them.
+
+    Attributes:
+        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file with the polygons, relative to the study file.
+        boxes: Rectangles in place of a file: west, south, east, north [m] in the scene's frame.
+        position: "geographic" if the file's coordinates are those of its reference system, "scene" for metres in the
+            scene's frame.
+        bottom: Height at which the region begins [m] in the scene's frame, a number or a column of the file.
+        top: Height at which it ends, likewise.
+        specific_attenuation: Loss per length of a short path inside [dB/m], the start value if it is a parameter.
+        maximum_db: Loss of a very long path inside [dB]; that of woodland in ITU-R P.833 if absent.
+    """
+
+    file: Text | None = None
+    boxes: tuple[tuple[float, float, float, float], ...] = ()
+    position: Literal["geographic", "scene"] = "geographic"
+    bottom: Height = 0.0
+    top: Height
+    specific_attenuation: Annotated[float, Field(ge=0)]
+    maximum_db: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.file is None) == (not self.boxes):
+            raise InputError("a region is given by a file or by boxes: give one of them")
+        for box in self.boxes:
+            west, south, east, north = box
+            if not (west < east and south < north):
+                raise InputError(
+                    f"boxes: {list(box)}: must be west, south, east, north [m], west less than east and south less "
+                    "than north"
+                )
+        if self.file is None and (isinstance(self.bottom, str) or isinstance(self.top, str)):
+            raise InputError("boxes: bottom and top must be numbers [m]; columns need a file")
+        if isinstance(self.bottom, float) and isinstance(self.top, float) and not self.bottom < self.top:
+            raise InputError(f"bottom = {self.bottom:g}: must be less than top = {self.top:g} [m]")
+        return self
+
+    def largest_loss_db(self, frequency: float) -> float:
+        """Loss of a very long path inside at a carrier [Hz], [dB]."""
+        scale, exponent = WOODLAND
+        return scale * (frequency / 1e6) ** exponent if self.maximum_db is None else self.maximum_db
+
+    def region(self, path: Path | None, frame: Frame | None) -> Region:
+        """The region in the scene's frame.
+
+        Args:
+            path: The file, resolved.
+            frame: Place of the scene on the globe, if it is known.
+
+        Raises:
+            InputError: The file cannot be read or holds no polygon, a height is not a number, or the scene's place is
+                unknown.
+        """
+        shapely = library("shapely", "scenes")
+        if path is None:
+            outline = np.array([shapely.box(*box) for box in self.boxes])
+            columns: dict[str, NDArray] = {}
+        else:
+            from calibray.scenes.authoring.footprints import project
+            from calibray.scenes.authoring.geodata import read_features
+
+            features = read_features(path, None)
+            polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
+            if not polygon.any():
+                raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
+            outline = shapely.make_valid(features.outline[polygon])
+            columns = {name: values[polygon] for name, values in features.columns.items()}
+            if self.position == "geographic":
+                if frame is None:
+                    raise InputError(
+                        f"{path}: the place of the scene on the globe is unknown; give [scene] origin or crs, or "
+                        "position = 'scene'"
+                    )
+                outline = project(outline, frame, features.crs or WGS84)
+        bottom, top = (
+            _heights(path, key, height, columns, len(outline))
+            for key, height in (("bottom", self.bottom), ("top", self.top))
+        )
+        if (wrong := np.flatnonzero(~(bottom < top))).size:
+            raise InputError(
+                f"{path}: bottom = {bottom[wrong[0]]:g} of polygon {wrong[0] + 1} must be less than top = "
+                f"{top[wrong[0]]:g} [m]"
+            )
+        return Region(outline, bottom, top)
+
+
+def _heights(
+    path: Path | None, key: str, height: float | str, columns: dict[str, NDArray], count: int
+) -> NDArray[np.float64]:
+    if not isinstance(height, str):
+        return np.full(count, float(height))
+    if height not in columns:
+        raise InputError(f"{path}: {key}: no column {shortened(height)!r}; {did_you_mean(height, columns)}")
+    try:
+        values = columns[height].astype(np.float64)
+    except (TypeError, ValueError):
+        values = np.full(count, np.nan)
+    if (wrong := np.flatnonzero(~np.isfinite(values))).size:
+        raise InputError(
+            f"{path}: {key}: column {shortened(height)!r} is no number [m] at polygon {wrong[0] + 1}"
+        )
+    return values
+
+
+def region_effects(
+    sections: dict[str, RegionSection],
+    regions: dict[str, Region],
+    parameters: Parameters,
+    paths: Paths,
+) -> Effects:
+    """The extra loss of paths through regions.
+
+    Args:
+        sections: The sections by name.
+        regions: Their polygons by name.
+        parameters: The study's parameters.
+        paths: The paths.
+    """
+    path, start, end = _segments(paths)
+    names = [parameters.names[index] for index in parameters.of_effects]
+    effects = []
+    for name, section in sections.items():
+        parameter = f"{PREFIX}{name}.specific_attenuation"
+        length = np.zeros(paths.num_paths)
+        np.add.at(length, path, regions[name].length_inside(start, end))
+        effects.append(
+            ExtraLoss(
+                length,
+                section.largest_loss_db(paths.frequency),
+                names.index(parameter) if parameter in names else None,
+                section.specific_attenuation,
+            )
+        )
+    return tuple(effects)
+
+
+def _segments(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The straight pieces of all paths: number of the path [k], and both ends [k, 3], [m]."""
+    number = np.arange(paths.num_paths)
+    path = np.repeat(number, np.diff(paths.first) + 1)
+    begins, ends = paths.first[:-1] + number, paths.first[1:] + number
+    start = np.empty((len(path), 3))
+    end = np.empty((len(path), 3))
+    start[begins], end[ends] = paths.tx_position[paths.link], paths.rx_position[paths.link]
+    inner = np.ones(len(path), dtype=bool)
+    inner[begins] = False
+    start[inner] = paths.vertex
+    inner[begins], inner[ends] = True, False
+    end[inner] = paths.vertex
+    return path, start, end
