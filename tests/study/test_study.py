@@ -339,7 +339,12 @@ def keys(model, prefix=""):
         options = get_args(annotation) or (annotation,)
         # Several where a table is of one kind or another.
         tables = [o for o in options if is_table(o)]
-        wild = {"materials": ".NAME", "parameters": '."NAME.FIELD"', "nuisance": ".NAME"}.get(name, "")
+        wild = {
+            "materials": ".NAME",
+            "parameters": '."NAME.FIELD"',
+            "nuisance": ".NAME",
+            "regions": ".NAME",
+        }.get(name, "")
         inner = (key for table in tables for key in keys(table, f"{prefix}{name}{wild}."))
         yield from dict.fromkeys(inner) if tables else [f"{prefix}{name}"]
 
