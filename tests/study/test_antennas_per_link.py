@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -168,3 +169,38 @@ def test_predictions_at_new_links_use_their_transmitter_s_antenna(planted: Study
     setup = Setup.open(study, tracer=TwoRay, links=study.places(SourceTable(places)))
     loss = path_loss(setup.trace(result.scene_materials), combining="coherent")
     assert loss[1] - loss[0] > 5.0
+
+
+POSE = {
+    "tx:north.azimuth": {"bounds": [-30.0, 30.0]},
+    "tx:east.azimuth": {"bounds": [-30.0, 30.0]},
+    "tx:north.downtilt": {"bounds": [-8.0, 8.0]},
+}
+
+
+def misdirected(plain: Study, **parameters: Any) -> Study:
+    """The study whose table of transmitters states azimuths that are 12 and -9 degrees wrong, and a tilt by 2."""
+    wrong = SITES.assign(remote_tilt=0.0)
+    wrong["bearing"] += [12.0, -9.0, 0.0]
+    wrong["tilt"] -= [2.0, 0.0, 0.0]
+    wrong.to_csv(plain.path.parent / "misdirected.csv", index=False)
+    content = mounted(plain, transmitters="misdirected.csv").content()
+    content["parameters"] |= parameters
+    return Study.from_content(content, plain.path)
+
+
+def test_wrong_directions_are_found_with_the_materials(planted: Study, tmp_path: Path) -> None:
+    without = cb.calibrate(misdirected(planted), tracer=TwoRay)
+    assert without.rmse_db > 0.5
+    result = cb.calibrate(misdirected(planted, **POSE), tracer=TwoRay)
+    assert result.rmse_db < 1e-4
+    assert result.parameters["ground.relative_permittivity"] == pytest.approx(TRUTH, rel=1e-4)
+    for name, error in (("tx:north.azimuth", -12.0), ("tx:east.azimuth", 9.0), ("tx:north.downtilt", 2.0)):
+        assert result.parameters[name] == pytest.approx(error, abs=0.01)
+    assert list(result.scene_materials) == ["ground"]
+    result.save(tmp_path / "result")
+
+
+def test_unknown_transmitters_are_refused(planted: Study) -> None:
+    with pytest.raises(InputError, match=r"'tx:nort.gain': no link has the transmitter 'nort'.*'north'"):
+        Setup.open(misdirected(planted, **{"tx:nort.gain": {"bounds": [-5.0, 5.0]}}), tracer=TwoRay)

@@ -13,6 +13,9 @@ from calibray.support.progress import Progress
 from calibray.support.strict_models import Section
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from calibray.engines.cluster.workers import Workers
     from calibray.fields import Effects
     from calibray.materials import Material
@@ -104,8 +107,8 @@ class OpenedStudy(Protocol):
         """The paths of the links, with `materials` in place of the scene's."""
         ...
 
-    def effects(self, paths: Paths) -> Effects:
-        """Effects on the paths that no material has."""
+    def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
+        """Effects on the paths of links, of all links if None, that no material has."""
         ...
 
     def at(self, links: Measurements) -> Self:

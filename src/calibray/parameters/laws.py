@@ -32,7 +32,14 @@ CONSTANT_OF_FIELD: Final[Mapping[str, str]] = MappingProxyType(
 """Fields that a parameter may set, each with the constant of the material that it changes."""
 
 EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
-    {"region": {"specific_attenuation": Bound(0.0, inf, "dB/m")}}
+    {
+        "region": {"specific_attenuation": Bound(0.0, inf, "dB/m")},
+        "tx": {
+            "azimuth": Bound(-180.0, 180.0, "deg"),
+            "downtilt": Bound(-90.0, 90.0, "deg"),
+            "gain": Bound(-100.0, 100.0, "dB"),
+        },
+    }
 )
 """Kinds of things other than materials that have parameters, as in "region:trees.specific_attenuation", with the
 physical bounds of each field."""

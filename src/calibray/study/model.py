@@ -14,6 +14,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from calibray.engines.kinds import AnyEngine, default
 from calibray.engines.kinds.replay import ReplaySection
+from calibray.engines.pose import POSE
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, itu_start, make_parameter
@@ -100,6 +101,7 @@ class StudyModel(Section, ABC):
                 "counted as if their errors were independent; leave one of them out"
             )
         self._check_regions()
+        self._check_poses()
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
         if self.links.mountings and self.engine.name != "replay":
@@ -125,6 +127,15 @@ class StudyModel(Section, ABC):
             )
         if self.regions and getattr(self.engine, "compress_db", None) is not None:
             raise InputError("engine.compress_db: few weighted paths have no place in [regions]; remove it")
+
+    def _check_poses(self) -> None:
+        names = [name for name in self.parameters if name.startswith(POSE)]
+        if names and self.links.tx_antenna is None:
+            raise InputError(
+                f"parameters: {names[0]!r} needs [links.tx_antenna], the stated directions of the transmit antennas"
+            )
+        if names and getattr(self.engine, "compress_db", None) is not None:
+            raise InputError("engine.compress_db: few weighted paths have no direction; remove it")
 
     def _check_materials(self) -> None:
         for name, material in self.materials.items():
@@ -284,9 +295,13 @@ class StudyModel(Section, ABC):
         return parameters
 
     def _effect_parameter(self, name: str) -> Parameter:
-        entry, region = self.parameters[name], self.regions[name.removeprefix(PREFIX).rpartition(".")[0]]
-        start = region.specific_attenuation if entry.start is None else float(entry.start)
-        return Parameter(name, *entry.bounds, start, entry.scale)
+        """The parameter of a region, or of a transmit antenna, whose stated pose is the start value 0."""
+        entry = self.parameters[name]
+        region = self.regions.get(name.removeprefix(PREFIX).rpartition(".")[0]) if PREFIX in name else None
+        start = 0.0 if region is None else region.specific_attenuation
+        return Parameter(
+            name, *entry.bounds, start if entry.start is None else float(entry.start), entry.scale
+        )
 
     def content(self) -> dict[str, Any]:
         """The study as plain values with every default written out; `Study.from_content` reads it."""

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.engines.pose import EVERY, POSE, pose_error
 from calibray.errors import InputError
+from calibray.fields import Effects
 from calibray.measurements import Measurements, SourceTable
+from calibray.parameters import Parameter, Parameters
+from calibray.paths import Paths
 from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
@@ -48,6 +53,69 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     return Mounting(antennas, index, Pose(yaw, downtilt, electrical))
+
+
+def pose_effects(
+    study: StudyModel,
+    mountings: Mapping[str, Mounting],
+    table: SourceTable,
+    parameters: Parameters,
+    paths: tuple[Paths, NDArray[np.int64]],
+) -> Effects:
+    """Errors of transmit antennas on paths, if parameters such as "tx:CELL.azimuth" state any.
+
+    Args:
+        study: The study.
+        mountings: The antennas of all links.
+        table: The rows of all links.
+        parameters: The parameters of a candidate.
+        paths: The paths of some links, and the indices of these links.
+
+    Raises:
+        InputError: The column of transmitters is missing.
+    """
+    items = [parameters.items[index] for index in parameters.of_effects]
+    if not any(item.name.startswith(POSE) for item in items):
+        return ()
+    stored, chosen = paths
+    section = study.links.mountings["tx"]
+    labels = transmitter_labels(study, table, items)[chosen]
+    effect = pose_error(
+        stored, mountings["tx"].of_paths(chosen), labels, items, section.azimuth_from == "north"
+    )
+    return () if effect is None else (effect,)
+
+
+def transmitter_labels(study: StudyModel, table: SourceTable, items: Sequence[Parameter]) -> NDArray[np.str_]:
+    """Name of every row's transmitter [rows]; empty names if all parameters are those of every transmitter.
+
+    Raises:
+        InputError: The column of transmitters is missing.
+    """
+    if all(item.material in (POSE + EVERY,) for item in items if item.name.startswith(POSE)):
+        return np.full(len(table), "")
+    return table.labels(study.links.transmitter)
+
+
+def check_poses(study: StudyModel, links: Measurements) -> None:
+    """Refuse parameters of transmitters that no link has.
+
+    Raises:
+        InputError: A transmitter is unknown, or the column of transmitters is missing.
+    """
+    stated = {
+        name.removeprefix(POSE).rpartition(".")[0]: name for name in study.parameters if name.startswith(POSE)
+    }
+    stated.pop(EVERY, None)
+    if not stated:
+        return
+    known = set(links.table.labels(study.links.transmitter).tolist())
+    for label, name in stated.items():
+        if label not in known:
+            raise InputError(
+                f"{study.path}: parameters: {name!r}: no link has the transmitter {label!r} in column "
+                f"{study.links.transmitter!r}; {did_you_mean(label, known)}"
+            )
 
 
 def link_antennas(

@@ -40,7 +40,7 @@ from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
-from calibray.study.mounting import link_mountings
+from calibray.study.mounting import check_poses, link_mountings, pose_effects
 from calibray.study.regions import region_effects
 from calibray.study.row_steps import known_frame, link_columns, position_steps, row_steps, row_track
 from calibray.study.sections import AntennasSection
@@ -288,6 +288,7 @@ class Setup:
         if links is None:
             links = study.measurements()
             held_out = study.held_out(links)
+            check_poses(study, links)
         scene = read_scene(study.scene_source, study.scene.frequency, study.overrides, study.objects)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
@@ -321,9 +322,16 @@ class Setup:
         links = with_obstruction(self.links, self.scene, self.study.scene.frequency)
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
-    def effects(self, paths: Paths) -> Effects:
-        """Effects of regions on the paths of the links."""
-        return region_effects(self.study.regions, self._regions, self.parameters, paths)
+    def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
+        """Effects on paths that no material has: wrong directions of antennas, and regions.
+
+        Args:
+            paths: The paths of some links.
+            links: Indices of these links among all links; all links if None.
+        """
+        chosen = np.arange(len(self.links)) if links is None else links
+        poses = pose_effects(self.study, self.mountings, self.links.table, self.parameters, (paths, chosen))
+        return poses + region_effects(self.study.regions, self._regions, self.parameters, paths)
 
     @cached_property
     def _regions(self) -> dict[str, Region]:

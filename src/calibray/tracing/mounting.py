@@ -71,16 +71,34 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
     """
     fields = {}
     for end, mounting in mountings.items():
-        on_paths = mounting.of_paths(paths.link)
-        angles = paths.departure if end == "tx" else paths.arrival
-        jones = np.zeros((paths.num_paths, mounting.antennas[0].ports, 2))
-        for number, antenna in enumerate(mounting.antennas):
-            chosen = on_paths.index == number
-            pose = Pose(*(angle[chosen] for angle in on_paths.pose))
-            jones[chosen] = jones_vectors(AntennaPattern.of(antenna), angles[chosen], pose)
+        jones = _stated(paths, mounting, paths.departure if end == "tx" else paths.arrival)
         axis = getattr(paths, f"{end}_field").real[:, 0]
         fields[f"{end}_field"] = in_frame(jones, axis, arriving=end == "rx").astype(complex)
     return replace(paths, **fields)
+
+
+def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
+    """Theta vector of departing paths in the frame of their first interaction [P, 2], from mounted transmit antennas.
+
+    A path that leaves in a perfect null of its antenna has none, and gets zeros: it stays without power.
+    """
+    theta, phi = _stated(paths, mounting, paths.departure)[:, 0].T
+    field = paths.tx_field[:, 0].real
+    # As complex numbers, the field is the axis times the Jones vector (`in_frame`).
+    jones = theta + 1j * phi
+    axis = np.where(jones == 0, 0.0, (field[:, 0] + 1j * field[:, 1]) / np.where(jones == 0, 1.0, jones))
+    return np.stack([axis.real, axis.imag], axis=-1)
+
+
+def _stated(paths: Paths, mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Jones vectors of the stated antennas in the directions of paths [P, ports, 2]."""
+    on_paths = mounting.of_paths(paths.link)
+    jones = np.zeros((paths.num_paths, mounting.antennas[0].ports, 2))
+    for number, antenna in enumerate(mounting.antennas):
+        chosen = on_paths.index == number
+        pose = Pose(*(angle[chosen] for angle in on_paths.pose))
+        jones[chosen] = jones_vectors(AntennaPattern.of(antenna), angles[chosen], pose)
+    return jones
 
 
 def jones_vectors(pattern: AntennaPattern, angles: Any, pose: Pose, xp: Any = np) -> Any:
@@ -91,32 +109,29 @@ def jones_vectors(pattern: AntennaPattern, angles: Any, pose: Pose, xp: Any = np
     """
     zenith, azimuth = angles[:, 0], angles[:, 1] - pose.yaw
     sin_z, cos_z, sin_a, cos_a = xp.sin(zenith), xp.cos(zenith), xp.sin(azimuth), xp.cos(azimuth)
-    zero = xp.zeros_like(sin_z)
-    # The direction and its basis vectors theta and phi [3, P, 3] in the antenna's frame (3GPP TR 38.901, eq. 7.1-15).
-    vectors = xp.stack(
-        [
-            xp.stack([sin_z * cos_a, sin_z * sin_a, cos_z], axis=-1),
-            xp.stack([cos_z * cos_a, cos_z * sin_a, -sin_z], axis=-1),
-            xp.stack([-sin_a, cos_a, zero], axis=-1),
-        ]
-    )
+    to_mount = rotation_matrix(pattern.antenna.orientation).T
     cos_t, sin_t = xp.cos(pose.downtilt), xp.sin(pose.downtilt)
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    vectors = xp.stack([x * cos_t - z * sin_t, y, x * sin_t + z * cos_t], axis=-1)
-    vectors = vectors @ xp.asarray(rotation_matrix(pattern.antenna.orientation))
-    local, theta, phi = vectors
+
+    def in_antenna(x: Any, y: Any, z: Any) -> list[Any]:
+        """Components in the antenna's frame of a vector that was turned back by yaw [P] each."""
+        x, z = x * cos_t - z * sin_t, x * sin_t + z * cos_t
+        return [row[0] * x + row[1] * y + row[2] * z for row in to_mount]
+
+    # The direction and its basis vectors theta and phi (3GPP TR 38.901, eq. 7.1-12 and 7.1-13).
+    x, y, z = in_antenna(sin_z * cos_a, sin_z * sin_a, cos_z)
+    theta = in_antenna(cos_z * cos_a, cos_z * sin_a, -sin_z)
+    phi = in_antenna(-sin_a, cos_a, 0.0)
     # A direction along the antenna's own axis has no azimuth; any will do.
-    rho_squared = local[:, 0] ** 2 + local[:, 1] ** 2
-    axial = rho_squared < 1e-20
-    east, rho = xp.where(axial, 1.0, local[:, 0]), xp.sqrt(xp.where(axial, 1.0, rho_squared))
-    north = xp.where(axial, 0.0, local[:, 1])
-    own_zenith = xp.arctan2(xp.where(axial, 0.0, rho), local[:, 2])
-    shifted = xp.clip(own_zenith - pose.electrical_downtilt, 0.0, np.pi)
-    amplitude = pattern.amplitude(shifted, xp.arctan2(north, east), xp)
-    cos_own, sin_own = east / rho, north / rho
-    own_theta = xp.stack([local[:, 2] * cos_own, local[:, 2] * sin_own, -xp.where(axial, 0.0, rho)], axis=-1)
-    # The own basis is the one of the path turned about the direction.
-    cosine, sine = xp.sum(theta * own_theta, axis=-1), xp.sum(phi * own_theta, axis=-1)
+    axial = x**2 + y**2 < 1e-20
+    rho = xp.sqrt(xp.where(axial, 1.0, x**2 + y**2))
+    cos_own, sin_own = xp.where(axial, 1.0, x / rho), xp.where(axial, 0.0, y / rho)
+    sin_zenith = xp.where(axial, 0.0, rho)
+    shifted = xp.clip(xp.arctan2(sin_zenith, z) - pose.electrical_downtilt, 0.0, np.pi)
+    amplitude = pattern.amplitude(shifted, xp.arctan2(sin_own, cos_own), xp)
+    # The antenna's own theta vector is that of the path turned about the direction.
+    cosine, sine = (
+        vector[0] * z * cos_own + vector[1] * z * sin_own - vector[2] * sin_zenith for vector in (theta, phi)
+    )
     ports = []
     for slant in SLANTS[pattern.antenna.polarization]:
         a, b = np.cos(slant), np.sin(slant)

@@ -126,5 +126,5 @@ def replay(study: OpenedStudy, paths: Paths, compress_db: float | None = None) -
             (take_links(paths, index).at(frequency, study.carriers[frequency]), index)
             for frequency, index in links.carriers
         ]
-    carriers = [CarrierPaths(part, index, study.effects(part)) for part, index in at_carriers]
+    carriers = [CarrierPaths(part, index, study.effects(part, index)) for part, index in at_carriers]
     return ReplayCarriers(carriers, parameters, paths.materials, *options)
