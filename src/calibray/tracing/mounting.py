@@ -87,7 +87,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
     # As complex numbers, the field is the axis times the Jones vector (`in_frame`).
     jones = theta + 1j * phi
     axis = np.where(jones == 0, 0.0, (field[:, 0] + 1j * field[:, 1]) / np.where(jones == 0, 1.0, jones))
-    return np.stack([axis.real, axis.imag], axis=-1)
+    return np.stack([np.real(axis), np.imag(axis)], axis=-1)
 
 
 def _stated(paths: Paths, mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
