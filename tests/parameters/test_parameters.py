@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, Material, constants_matrix
-from calibray.parameters import Parameter, Parameters, make_parameter, split_name
+from calibray.parameters import LogNormal, Parameter, Parameters, make_parameter, split_name
 
 BASE = {
     "ground": Material(3.0, 0.01, 0.5),
@@ -178,3 +178,12 @@ def test_starts_that_cannot_be_are_refused(name, start, message):
     else:
         with pytest.raises(InputError, match=message):
             make_parameter(*arguments)
+
+
+def test_a_linear_prior_is_gaussian_in_the_value():
+    prior = LogNormal((0, 2), (4.0, 1.0), (0.3, 5.0), linear=(2,))
+    candidates = np.array([[8.0, 1.0, -9.0], [4.0, 1.0, 1.0]])
+    assert prior.residuals(candidates) == pytest.approx(np.array([[np.log(2) / 0.3, -2.0], [0.0, 0.0]]))
+    step = np.array([[0.0, 0.0, 1e-6]])
+    slope = (prior.residuals(candidates[:1] + step) - prior.residuals(candidates[:1] - step)) / 2e-6
+    assert prior.jacobian(candidates[:1])[0, :, 2] == pytest.approx(slope[0])

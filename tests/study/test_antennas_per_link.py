@@ -204,3 +204,11 @@ def test_wrong_directions_are_found_with_the_materials(planted: Study, tmp_path:
 def test_unknown_transmitters_are_refused(planted: Study) -> None:
     with pytest.raises(InputError, match=r"'tx:nort.gain': no link has the transmitter 'nort'.*'north'"):
         Setup.open(misdirected(planted, **{"tx:nort.gain": {"bounds": [-5.0, 5.0]}}), tracer=TwoRay)
+
+
+def test_directions_have_gaussian_priors_and_materials_have_not(planted: Study) -> None:
+    study = misdirected(planted, **{"tx:north.azimuth": {"bounds": [-30.0, 30.0], "prior": {"std": 5.0}}})
+    assert (study.priors.index, study.priors.centre) == ((1,), (0.0,))
+    assert (study.priors.spread, study.priors.linear) == ((5.0,), (1,))
+    with pytest.raises(InputError, match=r"prior.std is for antennas"):
+        misdirected(planted, **{"ground.conductivity": {"bounds": [0.1, 2.0], "prior": {"std": 0.1}}})

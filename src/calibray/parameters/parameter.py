@@ -230,7 +230,7 @@ def itu_start(name: str, start: str, frequency: float) -> float:
         raise InputError(
             f"{name}: start = {start!r}: must be a number or 'itu:NAME', as 'itu:concrete@P.2040-1'"
         )
-    if CONSTANT_OF_FIELD[field] not in LAWS:
+    if CONSTANT_OF_FIELD.get(field) not in LAWS:
         raise InputError(f"{name}: start = {start!r}: ITU-R P.2040 gives no {field}; give a number")
     itu_name, _, revision = start.removeprefix(_ITU_PREFIX).partition("@")
     try:

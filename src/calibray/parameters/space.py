@@ -348,12 +348,13 @@ def _constant_name(parameter: Parameter) -> str:
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Independent Gaussian priors of the logarithms of k parameters.
+    """Independent Gaussian priors of the logarithms of k parameters, or of the values of some of them.
 
     Attributes:
         index: Numbers of the parameters that have a prior.
         centre: Medians, in the parameters' units.
-        spread: Standard deviations of the logarithms: 0.3 is about 30 %.
+        spread: Standard deviations of the logarithms: 0.3 is about 30 %; of the values of those in `linear`.
+        linear: Numbers of the parameters whose prior is Gaussian in the value itself, which can be negative.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -364,6 +365,7 @@ class LogNormal:
     index: tuple[int, ...] = ()
     centre: tuple[float, ...] = ()
     spread: tuple[float, ...] = ()
+    linear: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.index)
@@ -371,15 +373,22 @@ class LogNormal:
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """The priors as residuals of a least-squares problem: (log value - log centre) / spread [n, k].
 
-        Candidates [n, d] are in the fields' units, greater than 0.
+        Candidates [n, d] are in the fields' units, greater than 0 unless `linear`.
         """
-        return (np.log(candidates[:, self._columns]) - np.log(self.centre)) / self.spread
+        values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
+        logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
+        return np.where(linear, values - centre, logarithm) / self.spread
 
     def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives of the residuals with respect to the parameters [n, k, d]; arguments as for `residuals`."""
         jacobian = np.zeros((len(candidates), len(self), candidates.shape[1]))
-        jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (candidates[:, self._columns] * self.spread)
+        slope = np.where(self._linear, 1.0, candidates[:, self._columns])
+        jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (slope * self.spread)
         return jacobian
+
+    @property
+    def _linear(self) -> NDArray[np.bool_]:
+        return np.isin(self._columns, self.linear)
 
     @property
     def _columns(self) -> NDArray[np.int64]:

@@ -317,6 +317,7 @@ def _with_priors(result: Record, problem: Problem) -> Problem:
             (*priors.index, *range(first, first + len(constants))),
             (*priors.centre, *(item.start for item in constants)),
             (*priors.spread, *(result.study.noise.constants_spread for _ in constants)),
+            priors.linear,
         ),
     )
 

@@ -153,7 +153,10 @@ class StudyModel(Section, ABC):
             start = itu_start(name, entry.start, frequency) if isinstance(entry.start, str) else entry.start
             lower, upper = entry.bounds
             parameters.append(Parameter(name, lower, upper, lower if start is None else start, entry.scale))
-            if entry.prior is not None:
+            if entry.prior is not None and entry.prior.std is not None:
+                if not name.startswith(POSE):
+                    raise InputError(f"{name}: prior.std is for antennas; give itu or value, and spread")
+            elif entry.prior is not None:
                 entry.centre(name, frequency)
         Parameters(tuple(parameters))
 
@@ -253,17 +256,15 @@ class StudyModel(Section, ABC):
     @property
     def priors(self) -> LogNormal:
         """The priors of the parameters, by their indices in a candidate."""
-        entries = enumerate(self.parameters.items())
-        priors = [
-            (index, entry.centre(name, self.scene.frequency), entry.prior.spread)
-            for index, (name, entry) in entries
-            if entry.prior is not None
-        ]
-        return LogNormal(
-            tuple(index for index, _, _ in priors),
-            tuple(centre for _, centre, _ in priors),
-            tuple(spread for _, _, spread in priors),
-        )
+        priors, linear = [], []
+        for index, (name, entry) in enumerate(self.parameters.items()):
+            if entry.prior is not None and entry.prior.std is not None:
+                priors.append((index, float(entry.start or 0.0), entry.prior.std))
+                linear.append(index)
+            elif entry.prior is not None:
+                priors.append((index, entry.centre(name, self.scene.frequency), entry.prior.spread))
+        indices, centres, spreads = zip(*priors, strict=True) if priors else ((), (), ())
+        return LogNormal(indices, centres, spreads, tuple(linear))
 
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None

@@ -334,20 +334,30 @@ class ObjectiveSection(Section):
 
 
 class PriorSection(Section):
-    """The prior of a parameter: log-normal around a value.
+    """The prior of a parameter: log-normal around a value, or Gaussian around the start value.
 
     Attributes:
         itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
         value: The value itself, in the field's unit, in place of `itu`.
         spread: Standard deviation of the logarithm: 0.3 is about 30 %.
+        std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
     """
 
     itu: Text | None = None
     value: Annotated[float, Field(gt=0)] | None = None
-    spread: Annotated[float, Field(gt=0, le=10)]
+    spread: Annotated[float, Field(gt=0, le=10)] | None = None
+    std: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _one_centre(self) -> Self:
+        if self.std is not None:
+            if (self.itu, self.value, self.spread) != (None, None, None):
+                raise InputError(
+                    "a prior with std is Gaussian around the start value: leave itu, value and spread out"
+                )
+            return self
+        if self.spread is None:
+            raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
         if (self.itu is None) == (self.value is None):
             raise InputError("a prior is centred on an ITU material or a value: give one of itu and value")
         return self

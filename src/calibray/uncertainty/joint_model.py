@@ -241,6 +241,7 @@ def _with_constants(
             (*model.priors.index, *range(len(study), len(parameters))),
             (*model.priors.centre, *(item.start for item in fixed)),
             (*model.priors.spread, *(known_to for _ in fixed)),
+            model.priors.linear,
         ),
         gaps=gaps_of,
         loss=lambda values: replay.path_loss(values, np.ones((len(values), len(replay.parameter_of)))),

@@ -209,4 +209,5 @@ def _priors_around_start(problem: Problem) -> LogNormal:
         (*priors.index, *added),
         (*priors.centre, *(float(parameters.start[index]) for index in added)),
         (*priors.spread, *(PRIOR_SPREAD for _ in added)),
+        priors.linear,
     )
