@@ -97,6 +97,7 @@ class Problem:
         Raises:
             InputError: No calibration link is left, or a group has held-out links only.
         """
+        setup = setup.with_position_noise()
         study, links, held_out = setup.study, setup.links, setup.held_out
         before = observable.modelled(engine, engine.parameters.start[None])[0]
         censored = np.zeros(len(links), dtype=bool) if links.censored is None else links.censored
@@ -290,6 +291,8 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
 
 def _noise(study: Study, links: Measurements) -> float:
     """Declared standard deviation of a link's error at the mean weight [dB]; 1 until it is estimated."""
+    if study.links.position_error_m is not None:
+        return float(1.0 / np.sqrt(links.weight.mean()))
     if study.noise.std_db is not None:
         return study.noise.std_db
     return 1.0 if study.links.std is None else float(1.0 / np.sqrt(links.weight.mean()))

@@ -102,6 +102,7 @@ class StudyModel(Section, ABC):
             )
         self._check_regions()
         self._check_poses()
+        self._check_position_errors()
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
         if self.links.mountings and self.engine.name != "replay":
@@ -127,6 +128,27 @@ class StudyModel(Section, ABC):
             )
         if self.regions and getattr(self.engine, "compress_db", None) is not None:
             raise InputError("engine.compress_db: few weighted paths have no place in [regions]; remove it")
+
+    def _check_position_errors(self) -> None:
+        links = self.links
+        if links.position_error_m is None:
+            return
+        refused = {
+            "links.weight": links.weight is not None,
+            "links.frequency": links.frequency is not None,
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            f"engine.name = {self.engine.name!r}": self.engine.name != "replay",
+        }
+        for key, stated in refused.items():
+            if stated:
+                raise InputError(
+                    f"links.position_error_m: powers at displaced receivers are averaged on replay, at one carrier; it "
+                    f"does not go with {key}"
+                )
+        if links.std is None and self.noise.std_db is None:
+            raise InputError(
+                "links.position_error_m adds to the other errors of a link: give links.std or noise.std_db [dB]"
+            )
 
     def _check_poses(self) -> None:
         names = [name for name in self.parameters if name.startswith(POSE)]

@@ -205,6 +205,7 @@ class LinksSection(Section):
         cable_loss_db: Loss between transmitter and antenna [dB], a number or a column, with a transmitted power.
         tx_antenna: Antennas of the transmitters, if they differ.
         rx_antenna: Antennas of the receivers, if they differ.
+        position_error_m: Standard deviation of the receivers' positions along x and y [m], a number or a column.
         frequency: Column of carrier frequencies [Hz]; if absent, all links have the scene's carrier.
         wide: Name of the transmitter by column, for a table with one column per transmitter.
         track: GPX track that gives each row the columns `track_longitude` and `track_latitude` [deg].
@@ -234,6 +235,7 @@ class LinksSection(Section):
     cable_loss_db: Coordinate | None = None
     tx_antenna: MountingSection | None = None
     rx_antenna: MountingSection | None = None
+    position_error_m: Coordinate | None = None
     frequency: Text | None = None
     wide: dict[str, Text] = Field(default_factory=dict)
     track: TrackSection | None = None

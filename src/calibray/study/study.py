@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from calibray.engines.section import EngineSection, RadioSettings
 from calibray.errors import InputError
-from calibray.fields import Effects
+from calibray.fields import Effects, path_loss
 from calibray.materials import Material
 from calibray.measurements import (
     LINK_COLUMNS,
@@ -41,6 +41,7 @@ from calibray.scenes.scene_file import read_content as scene_content
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.mounting import check_poses, link_mountings, pose_effects
+from calibray.study.position_errors import averaged, displaced, mounted_at_displaced, spread_db
 from calibray.study.regions import region_effects
 from calibray.study.row_steps import known_frame, link_columns, position_steps, row_steps, row_track
 from calibray.study.sections import AntennasSection
@@ -441,13 +442,49 @@ class Setup:
             return self._paths_of_table(self.study.rays_path, materials or {})
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
-            return self._mounted(self._trace(self.links, scene, progress))
+            return self._mounted(self._trace_links(scene, progress))
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
         # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
         rank = np.argsort(np.argsort(first))
         return self._mounted(take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]))
+
+    def _trace_links(self, scene: Scene, progress: Progress | None) -> Paths:
+        """Paths of the links, or the mean over displaced receivers if positions have errors."""
+        errors = self._position_error_m
+        if errors is None:
+            return self._trace(self.links, scene, progress)
+        return averaged(self._trace(displaced(self.links, errors), scene, progress), self.links)
+
+    @cached_property
+    def _position_error_m(self) -> NDArray[np.float64] | None:
+        """Standard deviation of the receivers' positions along x and y [L], [m]; None for exact or predicted ones."""
+        stated = self.study.links.position_error_m
+        if stated is None or not self.links.measured:
+            return None
+        errors = self.links.table.numbers(stated)
+        if (errors < 0).any():
+            row = int(np.flatnonzero(errors < 0)[0])
+            place = (
+                self.links.table.cell(row, stated) if isinstance(stated, str) else "links.position_error_m"
+            )
+            raise InputError(f"{place}: {errors[row]:g} must be at least 0 [m]")
+        return errors
+
+    def with_position_noise(self) -> Setup:
+        """The same, its links weighted by the noise that errors of their positions add; itself without such errors.
+
+        The noise is the spread of path loss between displaced receivers at the start values.
+        """
+        errors, links, study = self._position_error_m, self.links, self.study
+        if errors is None:
+            return self
+        paths = self._trace(displaced(links, errors), self.scene, None)
+        loss = path_loss(mount(paths, mounted_at_displaced(self.mountings, len(links))))
+        variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
+        weight = 1 / (variance + spread_db(loss) ** 2)
+        return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
     def _mounted(self, paths: Paths) -> Paths:
         """The paths with the fields of the antennas that differ between links."""

@@ -1,0 +1,90 @@
+"""Errors of positions: the mean power of displaced receivers, and the noise that their spread adds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibray as cb
+import two_ray
+from calibray.errors import InputError
+from calibray.fields import path_loss
+from calibray.measurements import Measurements
+from calibray.study import Setup, Study
+from two_ray import TwoRay
+
+ERROR_M = 4.0
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    return two_ray.study(tmp_path_factory.mktemp("exact"), objective={"combining": "power"})
+
+
+def with_error(exact: Study, **links: object) -> Study:
+    content = exact.content()
+    content["links"] |= {"position_error_m": ERROR_M} | links
+    content["noise"]["std_db"] = 2.0
+    return Study.from_content(content, exact.path)
+
+
+def test_power_is_the_mean_over_displaced_receivers(exact: Study) -> None:
+    setup = Setup.open(with_error(exact), tracer=TwoRay)
+    links = setup.links
+    powers, losses = [], []
+    for angle in np.radians([0.0, 90.0, 180.0, 270.0]):
+        rx = links.rx + np.sqrt(2) * ERROR_M * np.array([np.cos(angle), np.sin(angle), 0.0])
+        moved = Measurements(tx=links.tx, rx=rx, path_loss_db=np.zeros(len(links)))
+        loss = path_loss(Setup.open(exact, tracer=TwoRay, links=moved).trace())
+        powers.append(10 ** (-loss / 10))
+        losses.append(loss)
+    expected = -10 * np.log10(np.mean(powers, axis=0))
+    np.testing.assert_allclose(path_loss(setup.trace()), expected, atol=1e-9)
+    weight = setup.with_position_noise().links.weight
+    np.testing.assert_allclose(1 / weight, 2.0**2 + np.std(losses, axis=0) ** 2, rtol=1e-9)
+    # Near the transmitter, four metres matter.
+    assert weight[0] < weight[-1] / 1.5
+
+
+def test_a_column_of_errors_and_exact_predictions(exact: Study) -> None:
+    table = exact.measurements().frame.assign(error=0.0)
+    table.to_csv(exact.path.parent / "errors.csv", index=False, float_format="%.17g")
+    setup = Setup.open(with_error(exact, file="errors.csv", position_error_m="error"), tracer=TwoRay)
+    plain = path_loss(Setup.open(exact, tracer=TwoRay).trace())
+    np.testing.assert_allclose(path_loss(setup.trace()), plain, atol=1e-9)
+    new = Measurements(tx=setup.links.tx, rx=setup.links.rx, path_loss_db=np.full(len(plain), np.nan))
+    predicted = Setup.open(with_error(exact), tracer=TwoRay, links=new)
+    assert predicted.trace().num_paths == Setup.open(exact, tracer=TwoRay).trace().num_paths
+    assert predicted.with_position_noise() is predicted
+
+
+def test_a_study_with_errors_is_calibrated(exact: Study) -> None:
+    result = cb.calibrate(with_error(exact), tracer=TwoRay)
+    assert np.isfinite(result.rmse_db)
+    assert (
+        result.intervals["ground.relative_permittivity"].lower
+        < result.parameters["ground.relative_permittivity"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": {}}, r"give links.std or noise.std_db"),
+        ({"objective": {"combining": "coherent"}}, r"does not go with objective.combining = 'coherent'"),
+        ({"engine": {"name": "retrace"}}, r"does not go with engine.name = 'retrace'"),
+    ],
+)
+def test_studies_that_errors_do_not_suit_are_refused(
+    exact: Study, change: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    content = with_error(exact).content() | change
+    with pytest.raises(InputError, match=message):
+        Study.from_content(content, tmp_path / "study.toml")
+
+
+def test_negative_errors_are_refused(exact: Study) -> None:
+    with pytest.raises(InputError, match=r"links.position_error_m: -1 must be at least 0"):
+        Setup.open(with_error(exact, position_error_m=-1.0), tracer=TwoRay).trace()
