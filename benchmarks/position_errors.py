@@ -4,7 +4,8 @@
 
 Districts are those of antenna_pose.py, with stated directions that are right. Measured are true positions; the study
 states positions that are off by 5 m (standard deviation along x and along y), with or without
-`links.position_error_m = 5`. The noise is 3 dB. The table says how often the 90 % intervals of the draws hold the truth.
+`links.position_error_m = 5`. The noise is 3 dB. The table says how often the 90 % intervals of the draws hold the
+truth.
 """
 
 from __future__ import annotations

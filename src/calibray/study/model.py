@@ -105,6 +105,13 @@ class StudyModel(Section, ABC):
         self._check_position_errors()
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
+        if getattr(self.engine, "rays", None) is not None and (
+            self.links.mountings or self.links.position_error_m is not None
+        ):
+            raise InputError(
+                "engine.rays holds paths of one position and one antenna: leave links.tx_antenna, rx_antenna and "
+                "position_error_m out"
+            )
         if self.links.mountings and self.engine.name != "replay":
             end = next(iter(self.links.mountings))
             raise InputError(
