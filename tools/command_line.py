@@ -18,7 +18,7 @@ FOLDER: Final = Path(__file__).resolve().parents[1] / "docs" / "reference" / "co
 PAGES: Final = {
     "calibrate.md": ("Commands: calibrate", ("demo", "run", "trace", "validate", "compare", "ledger")),
     "use-results.md": ("Commands: use a result", ("predict", "map", "suggest", "report", "export")),
-    "prepare.md": ("Commands: prepare", ("doctor", "scene", "init", "schema", "cache")),
+    "prepare.md": ("Commands: prepare", ("doctor", "open", "scene", "init", "schema", "cache")),
 }
 """Title and commands of every page."""
 

@@ -20,6 +20,7 @@ from calibray.cli.export import export
 from calibray.cli.init import init, schema
 from calibray.cli.ledger import ledger
 from calibray.cli.map import map
+from calibray.cli.open import open
 from calibray.cli.predict import predict
 from calibray.cli.report import report
 from calibray.cli.run import run
@@ -120,6 +121,7 @@ def calibray(
 COMMANDS = (  # in the order of `--help`
     doctor,
     demo,
+    open,
     init,
     schema,
     run,

@@ -81,7 +81,20 @@ def plan(survey: Survey, triangles: Triangles | None) -> Plan:
     Returns:
         The map.
     """
-    ends = np.concatenate([survey.tx, survey.rx])[:, :2]
+    return lay_out(np.concatenate([survey.tx, survey.rx]), triangles)
+
+
+def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
+    """Lay out a map that shows positions.
+
+    Args:
+        ends: The positions [n, 2 or 3], [m].
+        triangles: The scene; None where it cannot be read.
+
+    Returns:
+        The map.
+    """
+    ends = ends[:, :2]
     low, high = ends.min(axis=0), ends.max(axis=0)
     extent = np.maximum((high - low) * (1 + 2 * MARGIN), LEAST_EXTENT)
     extent[1] = max(extent[1], LEAST_ASPECT * extent[0])

@@ -1,0 +1,152 @@
+"""A study's folder: the files that the command line reads and writes, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from calibray.errors import InputError
+from calibray.support.messages import shortened
+from calibray.support.output_files import write_text
+
+STUDY: Final = "study.toml"
+MAPS: Final = (".osm", ".pbf", ".geojson", ".gpkg", ".shp", ".dxf", ".csv")
+TABLES: Final = (".csv", ".xlsx", ".parquet")
+MESHES: Final = (".ply", ".obj")
+PARTS: Final = (".shx", ".dbf", ".prj", ".cpg", ".tif", ".tiff", ".gpx", ".xml", ".json", ".msi")
+LARGEST: Final = 2**30
+"""Bytes of an uploaded file at most; larger ones are better put into the folder."""
+
+_NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
+_REASON: Final = re.compile(r"^(?P<setting>.*\S)  # (?P<reason>.*)$")
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """A study's folder.
+
+    Attributes:
+        path: The folder, absolute.
+    """
+
+    path: Path
+
+    @property
+    def study_file(self) -> Path:
+        """The study file, which may not exist yet."""
+        return self.path / STUDY
+
+    def files(self, endings: tuple[str, ...]) -> list[str]:
+        """Names of the folder's files with one of the endings."""
+        found = (file for file in self.path.iterdir() if file.name.lower().endswith(endings))
+        return sorted(file.name for file in found if file.is_file() and not file.name.startswith("."))
+
+    def scenes(self) -> list[str]:
+        """The scenes of the folder and of its folders, apart from those of results."""
+        found = [*self.path.glob("*.xml"), *self.path.glob("*/*.xml")]
+        names = (file.relative_to(self.path).as_posix() for file in found if file.name != "result-scene.xml")
+        return sorted(name for name in names if not name.startswith("."))
+
+    def results(self) -> list[str]:
+        """The folders with results."""
+        return sorted(file.parent.name for file in self.path.glob("*/result.json") if file.is_file())
+
+    def result(self, name: str) -> dict[str, Any]:
+        """The record of a result.
+
+        Raises:
+            InputError: There is no such result, or it cannot be read.
+        """
+        if name not in self.results():
+            raise InputError(f"{shortened(name)}: no such result")
+        file = self.path / name / "result.json"
+        try:
+            return json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{file}: cannot be read ({shortened(str(error))})") from None
+
+    def check_upload(self, name: str) -> Path:
+        """Where an uploaded file goes; meshes lie in `meshes`, as scenes name them.
+
+        Raises:
+            InputError: The name is no plain file name, its kind is none that Calibray reads, or the file exists.
+        """
+        shown = shortened(ascii(name))
+        if not _NAME.fullmatch(name) or name.endswith((" ", ".")):
+            raise InputError(
+                f"{shown}: use letters, digits, spaces, and . _ - ( ) + in names of files; rename it"
+            )
+        ending = Path(name).suffix.lower()
+        if ending not in (*MAPS, *TABLES, *PARTS, *MESHES):
+            raise InputError(
+                f"{shown}: files of this kind are not read; give a map, a plan, a table or a scene"
+            )
+        target = (self.path / "meshes" if ending in MESHES else self.path) / name
+        if target.exists() or target.is_symlink():
+            raise InputError(f"{shown}: exists already; rename one of them")
+        return target
+
+    def content(self) -> dict[str, Any]:
+        """The sections of the study file; empty without one or if it is not TOML."""
+        try:
+            return tomllib.loads(self.study_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return {}
+
+    def text(self) -> str:
+        """The study file; empty without one."""
+        try:
+            return self.study_file.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+
+    def reasons(self) -> dict[str, str]:
+        """Reasons by the dotted name of a section or key: the comments that a draft has."""
+        reasons: dict[str, str] = {}
+        section, pending = "", ""
+        for line in self.text().splitlines():
+            if line.startswith("# "):
+                pending = line[2:]
+            elif line.startswith("[") and line.endswith("]"):
+                section = line[1:-1].strip('"')
+                if pending:
+                    reasons[section] = pending
+            elif (match := _REASON.match(line)) and _same(match["setting"], line):
+                key = next(iter(tomllib.loads(match["setting"])))
+                reasons[f"{section}.{key}"] = match["reason"]
+            if not line.startswith("# "):
+                pending = ""
+        return reasons
+
+    def save(self, content: Mapping[str, Any]) -> None:
+        """Write the study file, with the reasons that it has.
+
+        Raises:
+            InputError: The content is no study; the file is as before.
+        """
+        from calibray.study import Study
+        from calibray.study.draft import toml
+
+        text = toml(content, self.reasons())
+        Study.from_content(tomllib.loads(text), self.study_file)
+        write_text(self.study_file, text)
+
+    def set_aside(self) -> None:
+        """Rename the study file, so that another one can be drafted."""
+        number = 1
+        while (target := self.path / f"study-{number}.toml").exists():
+            number += 1
+        self.study_file.rename(target)
+
+
+def _same(setting: str, line: str) -> bool:
+    """Whether what follows a setting is a comment, and not part of a text with a number sign."""
+    try:
+        return len(tomllib.loads(setting)) == 1 and tomllib.loads(setting) == tomllib.loads(line)
+    except ValueError:
+        return False

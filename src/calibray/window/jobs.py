@@ -1,0 +1,166 @@
+"""Commands that the window started in a study's folder, and runs that a terminal started there.
+
+Each is a process of its own with three files in `.calibray-window`: `0001.json` says what runs, `0001.log` is what it
+printed, `0001.exit` its exit status. A command without exit status and without process died; the same command resumes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import Final
+
+import psutil
+
+from calibray.errors import InputError
+from calibray.support.output_files import write_text
+
+FOLDER: Final = ".calibray-window"
+TAIL: Final = 16_384
+"""Bytes of a log that are shown: some screens full."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command and its state.
+
+    Attributes:
+        number: Its number in the folder; 0 for one that a terminal started.
+        words: Its arguments.
+        state: "running", "done", "failed", "stopped" or "died".
+        pid: Its process.
+        log: The end of what it printed.
+    """
+
+    number: int
+    words: tuple[str, ...]
+    state: str
+    pid: int
+    log: str = ""
+
+    @property
+    def command(self) -> str:
+        """The command as a terminal takes it."""
+        return shlex.join(["calibray", *self.words])
+
+
+class Jobs:
+    """The commands of one study folder."""
+
+    def __init__(self, study_folder: Path) -> None:
+        self._study_folder = study_folder
+        self._folder = study_folder / FOLDER
+
+    def start(self, words: Sequence[str]) -> Job:
+        """Start a command.
+
+        Raises:
+            InputError: Another command runs, or the folder cannot be written.
+        """
+        if running := self.running():
+            raise InputError(f"{running.command}: is running; wait for its end, or stop it")
+        if self._folder.is_symlink():
+            raise InputError(f"{self._folder}: is a link; remove it")
+        try:
+            self._folder.mkdir(exist_ok=True)
+            number = max((job.number for job in self.list()), default=0) + 1
+            stem = self._folder / f"{number:04d}"
+            arguments = [sys.executable, "-m", "calibray.window.runner", f"{stem}.exit", *words]
+            # The command writes while it runs; an exclusive file follows no link and replaces nothing.
+            with os.fdopen(os.open(f"{stem}.log", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as log:
+                child = subprocess.Popen(
+                    arguments, cwd=self._study_folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                    start_new_session=True,
+                )  # fmt: skip
+            # Without a wait the ended process would stay in the system's table.
+            Thread(target=child.wait, daemon=True).start()
+            record = {
+                "words": list(words),
+                "pid": child.pid,
+                "created": psutil.Process(child.pid).create_time(),
+            }
+            write_text(Path(f"{stem}.json"), json.dumps(record) + "\n")
+        except OSError as error:
+            raise InputError(f"{self._folder}: cannot be written ({error.strerror})") from None
+        return Job(number, tuple(words), "running", child.pid)
+
+    def list(self) -> list[Job]:
+        """The commands of the folder, the latest first."""
+        files = sorted(self._folder.glob("[0-9]*.json"), reverse=True)
+        return [job for job in map(_read, files) if job is not None]
+
+    def running(self) -> Job | None:
+        """The command that runs now, if any."""
+        return next((job for job in self.list() if job.state == "running"), None)
+
+    def elsewhere(self) -> list[Job]:
+        """Commands that run in the folder and were started in a terminal."""
+        own = {job.pid for job in self.list() if job.state == "running"}
+        found = []
+        for process in psutil.process_iter(["pid", "ppid", "cmdline", "cwd"]):
+            line, parent = process.info["cmdline"] or [], process.info["ppid"]
+            start = next((k for k, word in enumerate(line[:3]) if Path(word).name == "calibray"), None)
+            here = process.info["cwd"] == str(self._study_folder)
+            if start is not None and here and parent not in own and line[start + 1 : start + 2] != ["open"]:
+                found.append(Job(0, tuple(line[start + 1 :]), "running", process.info["pid"]))
+        return found
+
+    def stop(self, job: Job) -> None:
+        """Interrupt a command as Ctrl-C does; what it has finished is kept."""
+        with suppress(ProcessLookupError, PermissionError):
+            if job.number:
+                os.killpg(job.pid, signal.SIGINT)
+
+    def wait(self, job: Job, seconds: float) -> Job:
+        """Wait until a command has ended, and return its state then."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            now = next(each for each in self.list() if each.number == job.number)
+            if now.state != "running":
+                return now
+            time.sleep(0.05)
+        return job
+
+
+def _read(file: Path) -> Job | None:
+    """The command of a file; None if the window did not write the file."""
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        words, pid = tuple(map(str, record["words"])), int(record["pid"])
+        created = float(record["created"])
+        number = int(file.stem)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return Job(
+        number, words, _state(file.with_suffix(".exit"), pid, created), pid, _tail(file.with_suffix(".log"))
+    )
+
+
+def _state(exit_file: Path, pid: int, created: float) -> str:
+    with suppress(OSError, ValueError):
+        return {0: "done", 130: "stopped", -2: "stopped"}.get(int(exit_file.read_text()[:20]), "failed")
+    with suppress(psutil.Error, OverflowError, ValueError):
+        process = psutil.Process(pid)
+        # Another process may have got the number since; it must not be taken for the command, nor be stopped.
+        if abs(process.create_time() - created) < 1 and process.status() != psutil.STATUS_ZOMBIE:
+            return "running"
+    return "died"
+
+
+def _tail(file: Path) -> str:
+    try:
+        with file.open("rb") as stream:
+            stream.seek(max(0, file.stat().st_size - TAIL))
+            return stream.read(TAIL).decode("utf-8", errors="replace")
+    except OSError:
+        return ""

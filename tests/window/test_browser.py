@@ -1,0 +1,149 @@
+"""The window in a browser: from an empty folder to a drafted study by clicks, by keyboard, at all sizes.
+
+Needs Playwright and Debian's `chromium`, or the browser that CALIBRAY_CHROMIUM names. `benchmarks/window_walk.py` walks
+on, through a calibration.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nicegui")
+pytest.importorskip("shapely")
+
+from axe_playwright_python.sync_playwright import Axe
+
+from window_server import CHROMIUM, SIZES, add, launched, opened, press, served, step
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "bring_your_own" / "flat"
+GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "result" / "result.json"
+HOSTILE = "<img src=x onerror='window.hostile=1'>"
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """A folder that clicks have brought to a drafted study, and its page; the server is killed once in between."""
+    folder = tmp_path_factory.mktemp("study")
+    with launched() as browser:
+        with served(folder, kill=True) as address:
+            page = opened(browser, address)
+            add(page, "Map or plan", [EXAMPLES / "plan.csv"])
+            press(page, "Map or plan", "Make the scene")
+        # A result whose study has hostile names, with a report that tries to leave its frame.
+        (folder / "result").mkdir()
+        record = json.loads(GOLDEN.read_text())
+        record["fit"]["parameters"][HOSTILE] = 1.0
+        (folder / "result" / "result.json").write_text(json.dumps(record))
+        script = "try { parent.hostile = 1 } catch {}; fetch('/').catch(() => 0)"
+        report = f"<h1>Report</h1>{HOSTILE}<script>{script}</script>"
+        (folder / "result" / "report.html").write_text(report)
+        with served(folder) as address:
+            page = opened(browser, address)
+            add(page, "Measurements", [EXAMPLES / "rss.csv", EXAMPLES / "access_points.csv"])
+            page.get_by_label("Carrier frequency [Hz]").fill("2.44e9")
+            press(page, "Measurements", "Draft the study")
+            page.wait_for_timeout(3000)
+            yield folder, page, browser, address
+
+
+def test_the_clicks_wrote_what_the_command_line_writes(walked):
+    folder, page, _, _ = walked
+    study = tomllib.loads((folder / "study.toml").read_text())
+    assert study["scene"] == {"file": "scene/scene.xml", "frequency": 2.44e9}
+    assert study["links"]["wide"] == {"rss_ap1": "ap1", "rss_ap2": "ap2", "rss_ap3": "ap3"}
+    # Commands of before the kill are still listed.
+    runs = page.get_by_role("list", name="Commands").inner_text()
+    assert "calibray scene plan plan.csv --out scene" in runs
+    assert "calibray init scene/scene.xml rss.csv" in runs
+
+
+def test_the_links_are_on_the_map_with_their_reasons_beside(walked):
+    _, page, _, _ = walked
+    assert page.locator("#plan").get_attribute("data-links") == "84"
+    assert (
+        step(page, "Measurements")
+        .get_by_text("columns named as metres; no height: 1.5 m", exact=True)
+        .count()
+        == 1
+    )
+
+
+def test_nothing_is_asked_of_other_machines_and_hostile_names_are_text(walked):
+    _, page, _, _ = walked
+    assert page.noted == []
+    assert page.get_by_role("rowheader", name=HOSTILE).count() == 1
+    assert page.evaluate("window.hostile") is None
+    assert page.frame_locator("iframe").locator("h1").inner_text() == "Report"
+    assert page.get_by_text("Refused").count() == 0
+
+
+def test_another_page_without_the_token_gets_nothing(walked):
+    _, _, browser, address = walked
+    page = browser.new_context().new_page()
+    for path in ("/", "/data/plan.json", "/_nicegui/x", "/result/result/report.html", "/window/plan.js"):
+        assert page.goto(address.partition("/?")[0] + path).status == 403
+    page.context.close()
+
+
+def test_only_the_page_and_the_map_of_a_result_are_served(walked):
+    _, page, _, address = walked
+    origin = address.partition("/?")[0]
+    for path in ("/result/result/result.json", "/result/scene/scene.xml", "/window/none.js"):
+        assert page.request.get(origin + path, max_redirects=0).status == 404
+    # Any other path is the page itself.
+    assert page.request.get(f"{origin}/study.toml").text().startswith("<!doctype html>")
+    answer = page.request.get(f"{origin}/result/result/report.html")
+    assert answer.headers["content-security-policy"].startswith("sandbox allow-scripts; default-src 'none'")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_contrast_names_and_roles_meet_wcag_aa(walked, size, scheme):
+    _, page, _, _ = walked
+    page.set_viewport_size(dict(zip(("width", "height"), SIZES[size], strict=True)))
+    page.emulate_media(color_scheme=scheme)
+    page.wait_for_timeout(800)
+    assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size][0]
+    rules = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21aa"]}, "iframes": False}
+    found = Axe().run(page, options=rules).response["violations"]
+    assert not found, "\n".join(
+        f"{each['id']}: {node['html'][:300]}" for each in found for node in each["nodes"]
+    )
+
+
+def test_the_keyboard_alone_saves_bounds_and_chooses_a_place(walked):
+    folder, page, _, _ = walked
+    page.locator("#plan").focus()
+    before = int(page.locator("#plan").get_attribute("data-drawn"))
+    for key in ("ArrowLeft", "+", "Enter"):
+        page.keyboard.press(key)
+    page.get_by_text("Chosen place: x").wait_for()
+    assert int(page.locator("#plan").get_attribute("data-drawn")) > before
+    highest = step(page, "Parameters").get_by_label("Highest").first
+    highest.focus()
+    page.keyboard.press("Control+A")
+    page.keyboard.type("9")
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.innerText").strip() == "Save parameters":
+            break
+    page.keyboard.press("Enter")
+    page.get_by_text("Saved").first.wait_for()
+    study = tomllib.loads((folder / "study.toml").read_text())
+    assert next(iter(study["parameters"].values()))["bounds"] == [1.5, 9.0]
+
+
+def test_a_hostile_upload_is_refused(walked, tmp_path):
+    folder, page, _, _ = walked
+    bad = tmp_path / "<b>x.csv"
+    shutil.copy(EXAMPLES / "rss.csv", bad)
+    step(page, "Map or plan").locator("input[type=file]").first.set_input_files(bad)
+    page.get_by_text("use letters, digits").wait_for()
+    assert not (folder / "<b>x.csv").exists()

@@ -1,0 +1,83 @@
+"""The study folder of the window: names of uploads, and a study that is changed with its reasons kept."""
+
+from __future__ import annotations
+
+import pytest
+
+from calibray.errors import InputError
+from calibray.window.folder import StudyFolder
+
+STUDY = """version = 1
+
+[scene]
+file = "sionna:box"
+frequency = 3.5e9  # given # twice
+
+# offsets of cables
+[links]
+file = "links # 1.csv"
+tx = ["tx_x", "tx_y", 2.0]
+rx = ["rx_x", "rx_y", 1.5]
+value = "loss"  # the only column of its kind
+
+[parameters]
+"walls.relative_permittivity" = { bounds = [1.5, 12.0] }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY)
+    return StudyFolder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../up.csv", "/etc/passwd.csv", "a/b.csv", "a\\b.csv", "..", ".hidden.csv", "nul\x00.csv", "line\nbreak.csv",
+        "<script>.csv", "a" * 300 + ".csv", "study.toml", "run.py", "page.html", "", "\u202evsc.csv", "-o.csv",
+        "a.csv ",
+    ],
+)  # fmt: skip
+def test_hostile_names_of_uploads_are_refused(folder, name):
+    with pytest.raises(InputError):
+        folder.check_upload(name)
+
+
+def test_an_upload_replaces_nothing_and_follows_no_link(folder, tmp_path):
+    assert folder.check_upload("Messung März (2).csv") == tmp_path / "Messung März (2).csv"
+    assert folder.check_upload("wall.ply") == tmp_path / "meshes" / "wall.ply"
+    (tmp_path / "there.csv").write_text("")
+    (tmp_path / "link.csv").symlink_to(tmp_path / "nowhere")
+    for name in ("there.csv", "link.csv"):
+        with pytest.raises(InputError, match="exists already"):
+            folder.check_upload(name)
+
+
+def test_reasons_are_read_from_comments_only(folder):
+    assert folder.reasons() == {
+        "scene.frequency": "given # twice",
+        "links": "offsets of cables",
+        "links.value": "the only column of its kind",
+    }
+
+
+def test_a_changed_study_keeps_its_reasons_and_a_wrong_one_is_not_written(folder):
+    content, before = folder.content(), folder.text()
+    content["links"]["value"] = "other"
+    with pytest.raises(InputError, match="frequency"):
+        folder.save({**content, "scene": {"file": "sionna:box", "frequency": -1.0}})
+    assert folder.text() == before
+    folder.save(content)
+    assert folder.content() == content
+    assert folder.reasons()["links.value"] == "the only column of its kind"
+
+
+def test_results_are_named_by_folders_with_a_record(folder, tmp_path):
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result" / "result.json").write_text('{"fit": {}}')
+    (tmp_path / "other").mkdir()
+    assert folder.results() == ["result"]
+    assert folder.result("result") == {"fit": {}}
+    with pytest.raises(InputError, match="no such result"):
+        folder.result("../result")
