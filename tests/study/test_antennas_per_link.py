@@ -189,7 +189,9 @@ def misdirected(plain: Study, **parameters: Any) -> Study:
     return Study.from_content(content, plain.path)
 
 
-def test_wrong_directions_are_found_with_the_materials(planted: Study, tmp_path: Path) -> None:
+def test_wrong_directions_are_found_with_the_materials(
+    planted: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     without = cb.calibrate(misdirected(planted), tracer=TwoRay)
     assert without.rmse_db > 0.5
     result = cb.calibrate(misdirected(planted, **POSE), tracer=TwoRay)
@@ -199,6 +201,23 @@ def test_wrong_directions_are_found_with_the_materials(planted: Study, tmp_path:
         assert result.parameters[name] == pytest.approx(error, abs=0.01)
     assert list(result.scene_materials) == ["ground"]
     result.save(tmp_path / "result")
+    monkeypatch.setattr(
+        "calibray.tracing.default_tracer.SionnaFactory.__call__", lambda _, *opened: TwoRay(*opened)
+    )
+    loaded = cb.Result.load(tmp_path / "result")
+    powers = pd.read_csv(planted.path.parent / "powers.csv")
+    loss = SITES.set_index("transmitter")["eirp"][powers["transmitter"]].to_numpy() - powers["dbm"]
+    gain = np.where(powers["transmitter"] == "omni", 10 * np.log10(1.5), 8.0)
+    np.testing.assert_allclose(loaded.predict(powers.drop(columns="dbm")), loss - gain, atol=0.01)
+    with pytest.raises(InputError, match=r"needs the links' column"):
+        loaded.coverage_map([0.0, 0.0, 10.0], cell=50.0, level=None)
+    maps = [
+        loaded.coverage_map([0.0, 0.0, 10.0], cell=50.0, level=None, columns={"transmitter": name})
+        for name in ("north", "east")
+    ]
+    assert np.nanmax(np.abs(maps[0].path_loss_db - maps[1].path_loss_db)) > 10.0
+    loaded.report(tmp_path / "report.html")
+    assert "tx:north.azimuth" in (tmp_path / "report.html").read_text()
 
 
 def test_unknown_transmitters_are_refused(planted: Study) -> None:

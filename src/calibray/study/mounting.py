@@ -26,8 +26,10 @@ PORT_POWER: Final = "tx_port_power_dbm"
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
-    """The columns that say which antenna a link has and where it points."""
-    return tuple(name for section in study.links.mountings.values() for name in section.columns)
+    """The columns that say which antenna a link has and where it points, and whose parameters change that."""
+    columns = [name for section in study.links.mountings.values() for name in section.columns]
+    own = [name for name in study.parameters if name.startswith(POSE) and not name.startswith(POSE + EVERY)]
+    return tuple(dict.fromkeys([*columns, *([study.links.transmitter] if own else [])]))
 
 
 def link_mountings(study: StudyModel, links: Measurements) -> dict[str, Mounting]:
