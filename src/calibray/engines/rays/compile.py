@@ -101,7 +101,7 @@ def rays_of(paths: Paths) -> RayTable:
     material = np.full(shape, "", dtype=object)
     kind[present], vertex[present] = paths.kind, paths.vertex
     material[present] = np.array(list(paths.materials), dtype=object)[paths.material]
-    power = _powers(paths)
+    power = powers(paths)
     if not (power > 0).all():
         raise InputError(
             f"path {int(np.argmin(power))} has no power, which a ray table cannot state; leave it out with "
@@ -113,7 +113,7 @@ def rays_of(paths: Paths) -> RayTable:
     )  # fmt: skip
 
 
-def _powers(paths: Paths) -> NDArray[np.float64]:
+def powers(paths: Paths) -> NDArray[np.float64]:
     """Power gain of every path, summed over receive ports and averaged over transmit ports [P]."""
     gain = path_gains(paths).reshape(paths.num_paths, paths.rx_field.shape[1], paths.tx_field.shape[1])
     return (np.abs(gain) ** 2).sum(axis=1).mean(axis=1)
@@ -261,7 +261,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
     """Refuse a direct path whose power no antenna explains."""
     direct = np.diff(paths.first) == 0
     replayed = (
-        _powers(paths) if known else (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
+        powers(paths) if known else (paths.spreading * speed_of_light / paths.frequency / (4 * np.pi)) ** 2
     )
     with np.errstate(divide="ignore"):
         off = 10 * np.log10(power / replayed)
@@ -277,7 +277,7 @@ def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], kno
 
 
 def _correction(table: RayTable, paths: Paths, power: NDArray[np.float64]) -> NDArray[np.float64]:
-    replayed = _powers(paths)
+    replayed = powers(paths)
     if not (replayed > 0).all():
         material = list(paths.materials)[paths.material[paths.first[int(np.argmin(replayed))]]]
         raise InputError(
