@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from calibray.calibration.observable_fits import observable_fits
 from calibray.calibration.result import Result
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
@@ -141,7 +142,8 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             **diagnostics.columns,
         }
     )
-    table = table.assign(**_as_measured(study, links, table))
+    further, further_columns = observable_fits(problem, trail.best)
+    table = table.assign(**_as_measured(study, links, table), **further_columns)
     if validation is None:
         accuracy, name, residuals = _on_held_out_links(problem, trail, models)
     else:
@@ -171,6 +173,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             retrace_gap_db=largest_gap(gap_db, counted),
             laws=parameters.law_coefficients(trail.best),
             power_shares=diagnostics.power_shares,
+            observables=further,
         ),
         accuracy=accuracy,
         uncertainty=Uncertainty(

@@ -84,7 +84,8 @@ def predict(
         names, texts = (PREDICTIONS[:1], TEXTS[:1]) if level is None else (PREDICTIONS, TEXTS)
         # A prediction of NaN for the first link shows which columns the measured quantity adds.
         measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
-        renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *texts))
+        further = [f"{name}_{section.unit}" for name, section in study.observables.items()]
+        renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *further, *texts))
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)
         warnings: dict[str, array[int]] = {}
@@ -97,6 +98,7 @@ def predict(
             ):
                 columns = {name: predictions[name].to_numpy() for name in (*names, *texts)}
                 measured = as_measured(study, links, predictions)
+                measured |= {name: predictions[name].to_numpy() for name in further if name in predictions}
                 # In the order: predictions, basis, the measured quantity, remark.
                 remark = {} if level is None else {"remark": columns.pop("remark")}
                 append(links.frame.rename(columns=renamed).assign(**columns, **measured, **remark))

@@ -6,12 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
+from calibray.fields.observables import Statistic, link_statistics
 from calibray.materials import Material
 from calibray.parameters import Parameters
 from calibray.paths import Paths
@@ -36,6 +39,9 @@ TABLE_CANDIDATES: Final = 32
 
 BATCH: Final = 32
 """Largest number of candidates in one call."""
+
+OBSERVED_SIZES: Final = (1, 8, 64)
+"""Numbers of candidates that functions of further observables are compiled for."""
 
 
 @final
@@ -69,6 +75,7 @@ class Replay:
         effects: fields.Effects = (),
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
+        self._observing: dict[tuple[tuple[Statistic, ...], bool], Callable] = {}
         self.effects, self._options = effects, (combining, bandwidth)
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
@@ -110,6 +117,50 @@ class Replay:
         """Path loss of every link and its derivatives; see `Differentiable.path_loss_and_jacobian`."""
         loss, jacobian = self._run(self._path_losses_and_jacobian, candidates)
         return loss, jacobian
+
+    def observe(self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> NDArray[np.float64]:
+        """Statistics of every link for candidates [n, K, L]; NaN where a link has no path."""
+        return self._observed(candidates, wanted, False)[0]
+
+    def observe_and_jacobian(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The same with derivatives by the parameters [n, K, L, d]."""
+        values, jacobian = self._observed(candidates, wanted, True)
+        return values, jacobian
+
+    @fields.jax_settings()
+    def _observed(
+        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool
+    ) -> tuple[NDArray[np.float64], ...]:
+        values = check_candidates(candidates, len(self.parameters))
+        if (wanted, derivatives) not in self._observing:
+            self._observing[wanted, derivatives] = self._compile_statistics(wanted, derivatives)
+        function, batches = self._observing[wanted, derivatives], []
+        for start in range(0, len(values), OBSERVED_SIZES[-1]):
+            batch = values[start : start + OBSERVED_SIZES[-1]]
+            size = next(size for size in OBSERVED_SIZES if size >= len(batch))
+            padded = np.concatenate([batch, np.tile(batch[-1:], (size - len(batch), 1))])
+            batches.append([np.asarray(answer)[: len(batch)] for answer in function(jnp.asarray(padded))])
+        self.calls += len(values)
+        return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
+
+    def _compile_statistics(self, wanted: tuple[Statistic, ...], derivatives: bool) -> Callable:
+        plan = fields.layout(self.paths)
+        effects = tuple(effect.ordered(plan.order) for effect in self.effects)
+        departure, arrival = self.paths.departure[plan.order, 1], self.paths.arrival[plan.order, 1]
+        azimuths = jnp.asarray(departure), jnp.asarray(arrival)
+        base, parameters = jnp.asarray(self.paths.material_table()), self.parameters
+
+        def evaluate(candidate: jax.Array) -> jax.Array:
+            table = base.at[self._rows, self._columns].set(candidate[parameters.of_materials])
+            of_effects = candidate[parameters.of_effects]
+            return link_statistics(plan.program, table, effects, of_effects, azimuths, wanted)
+
+        def with_jacobian(candidate: jax.Array) -> tuple[jax.Array, ...]:
+            return (evaluate(candidate), *([jax.jacfwd(evaluate)(candidate)] if derivatives else []))
+
+        return jax.jit(lambda values: jax.lax.map(with_jacobian, values))
 
     def _path_losses(
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int

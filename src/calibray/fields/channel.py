@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.fields.arithmetic import safe_sqrt
 from calibray.fields.evaluation import path_powers
 from calibray.fields.jax_context import jax_settings
 from calibray.fields.program import GroupedProgram, layout
@@ -96,11 +97,13 @@ def statistics(
     def azimuth_spread(angle: jax.Array) -> jax.Array:
         # 3GPP TR 38.901 annex A.1: sqrt(-2 ln |sum P e^{j phi} / sum P|)
         resultant = jnp.hypot(mean(jnp.cos(angle)), mean(jnp.sin(angle)))
-        return jnp.sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
+        spread = safe_sqrt(jnp.maximum(-2 * jnp.log(jnp.clip(resultant, 1e-300, 1.0)), 0.0))
+        return jnp.where(reached, spread, jnp.nan)
 
     return ChannelStatistics(
         mean_delay=mean_delay,
-        delay_spread=jnp.sqrt(mean(excess_delay**2)),  # ITU-R P.1407-8 eq. 3
+        # ITU-R P.1407-8 eq. 3
+        delay_spread=jnp.where(reached, safe_sqrt(mean(excess_delay**2)), jnp.nan),
         k_factor_db=jnp.where(reached, 10 * jnp.log10(ratio), jnp.nan),
         departure_spread=azimuth_spread(departure),
         arrival_spread=azimuth_spread(arrival),

@@ -13,9 +13,11 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibray.errors import InputError
 from calibray.fitting.objective import Objective
+from calibray.fitting.observed import with_errors
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import least_squares
 from calibray.support.progress import Progress
@@ -99,7 +101,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         InputError: The noise is not declared and cannot be estimated.
     """
     study = problem.setup.study
-    if not problem.has_priors or study.noise.std_db is not None or study.links.std is not None:
+    stated = study.noise.std_db is not None or study.links.std is not None
+    if not problem.has_priors or (stated and not problem.observed):
         return problem
     if not problem.differentiable or problem.freedom < 1:
         cause = (
@@ -110,18 +113,39 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
             "noise; give the standard deviation of a link's error [dB]"
         )
     starts = problem.parameters.to_search(problem.parameters.start)[None]
-    noise_db = float(problem.squares(starts).rmse_db[0])
+    noise_db = problem.objective.noise_db if stated else float(problem.squares(starts).rmse_db[0])
     for turn in range(NOISE_ESTIMATES):
         problem = _with_noise(problem, noise_db)
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)
         starts = fit.minima[:SEARCHES]
         if progress is not None:
             progress("estimating noise", turn + 1, NOISE_ESTIMATES)
-        before, links = noise_db, problem.objective.num_counted
-        noise_db = float(problem.squares(fit.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
-        if abs(noise_db - before) <= TOLERANCE * before:
+        before, links, errors = noise_db, problem.objective.num_counted, problem.observed
+        problem = with_estimated_errors(problem, fit.best.x)
+        if not stated:
+            noise_db = float(problem.squares(fit.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
+        changes = [abs(noise_db / before - 1)]
+        changes += [abs(each.std / old.std - 1) for each, old in zip(problem.observed, errors, strict=True)]
+        if max(changes) <= TOLERANCE:
             break
     return _with_noise(problem, noise_db)
+
+
+def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:
+    """The problem with errors of its further observables estimated at a point of the search space [d].
+
+    Args:
+        problem: The problem.
+        point: The point.
+
+    Returns:
+        The problem; unchanged without further observables.
+    """
+    if not problem.observed:
+        return problem
+    candidate = problem.parameters.from_search(point[None])
+    values = problem.replay.observe(candidate, problem.statistics)[0]
+    return replace(problem, observed=with_errors(problem.observed, values, problem.objective.weight))
 
 
 def _with_noise(problem: Problem, noise_db: float) -> Problem:

@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import PATH_LOSS, Chunked, Differentiable, Engine, Observable, Reduced
+from calibray.engines.replay import Replay
 from calibray.errors import InputError
+from calibray.fields.observables import Statistic
 from calibray.fitting.nuisance import OFFSET, Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
+from calibray.fitting.observed import Observed, observed
 from calibray.fitting.sums_of_squares import Share, rows, total
 from calibray.measurements import Measurements
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
@@ -75,6 +78,7 @@ class Problem:
         priors: Priors of the parameters.
         faint: Mask of the links left out because they are censored or predicted near the noise floor [L]; None if no
             link is.
+        observed: Further observables of the links, whose residuals follow those of path loss.
     """
 
     setup: Setup
@@ -84,6 +88,7 @@ class Problem:
     observable: Observable = PATH_LOSS
     priors: LogNormal = NO_PRIOR
     faint: NDArray[np.bool_] | None = None
+    observed: tuple[Observed, ...] = ()
 
     @classmethod
     def of(cls, setup: Setup, engine: Engine, observable: Observable = PATH_LOSS) -> Problem:
@@ -112,12 +117,19 @@ class Problem:
         objective = replace(objective, measured=observable.measured(links))
         _check_groups(links, objective, held_out & ~censored & np.isfinite(before))
         faint = censored if censored.any() else None
-        return cls(setup, engine, objective, before, observable, study.priors, faint)
+        further = observed(setup, engine) if observable is PATH_LOSS else ()
+        return cls(setup, engine, objective, before, observable, study.priors, faint, further)
 
     @property
     def has_priors(self) -> bool:
-        """Whether a parameter or a coefficient has a prior, so that the optimum depends on the noise level."""
-        return bool(len(self.priors)) or bool(np.isfinite(self.objective.nuisance.prior).any())
+        """Whether the optimum depends on the noise level, as with a prior or a further observable."""
+        of_coefficients = np.isfinite(self.objective.nuisance.prior).any()
+        return bool(len(self.priors)) or bool(of_coefficients) or bool(self.observed)
+
+    @property
+    def statistics(self) -> tuple[Statistic, ...]:
+        """What the further observables are."""
+        return tuple(each.statistic for each in self.observed)
 
     @property
     def parameters(self) -> Parameters:
@@ -217,7 +229,7 @@ class Problem:
     @cached_property
     def _chunks(self) -> tuple[Reduced, list[Share]] | None:
         """The engine's chunks reduced to sums, with their shares; None if the engine has no chunks."""
-        if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS:
+        if not isinstance(self.engine, Chunked) or self.observable is not PATH_LOSS or self.observed:
             return None
         shares = self.objective.shares(self.engine.chunks)
         return self.engine.reducing(shares), shares
@@ -234,11 +246,15 @@ class Problem:
         Returns:
             The residuals [n, m].
         """
-        residuals = self.objective.residuals(modelled)
-        if not len(self.priors):
-            return residuals
-        rows = self.objective.noise_db * self.priors.residuals(candidates)
-        return np.concatenate([residuals, rows], axis=1)
+        parts = [self.objective.residuals(modelled)]
+        if len(self.priors):
+            parts.append(self.objective.noise_db * self.priors.residuals(candidates))
+        if self.observed:
+            values = self.replay.observe(candidates, self.statistics)
+            for index, each in enumerate(self.observed):
+                rows, _ = each.residuals(values[:, index], self.objective.weight)
+                parts.append(self.objective.noise_db / each.std * rows)
+        return np.concatenate(parts, axis=1)
 
     def slopes(
         self,
@@ -256,13 +272,33 @@ class Problem:
         Returns:
             Derivatives of the residuals by the same variables [n, m, k].
         """
-        jacobian = self.objective.jacobian(modelled, slope)
-        if not len(self.priors):
-            return jacobian
-        unit = self.parameters.search_slope(candidates)
-        rows = self.objective.noise_db * self.priors.jacobian(candidates) * unit[:, None, :]
-        others = np.zeros((*rows.shape[:2], slope.shape[2] - rows.shape[2]))
-        return np.concatenate([jacobian, np.concatenate([rows, others], axis=2)], axis=1)
+        parts, noise_db = [self.objective.jacobian(modelled, slope)], self.objective.noise_db
+        unit = self.parameters.search_slope(candidates)[:, None, :]
+        rows = []
+        if len(self.priors):
+            rows.append(noise_db * self.priors.jacobian(candidates) * unit)
+        if self.observed:
+            _, slopes = self.replay.observe_and_jacobian(candidates, self.statistics)
+            for index, each in enumerate(self.observed):
+                of_rows = each.slopes(slopes[:, index], self.objective.weight)
+                rows.append(noise_db / each.std * of_rows * unit)
+        for part in rows:
+            others = np.zeros((*part.shape[:2], slope.shape[2] - part.shape[2]))
+            parts.append(np.concatenate([part, others], axis=2))
+        return np.concatenate(parts, axis=1)
+
+    @property
+    def replay(self) -> Replay:
+        """The engine, which gives further observables.
+
+        Raises:
+            InputError: It is no replay in this process.
+        """
+        if not isinstance(self.engine, Replay):
+            raise InputError(
+                f"{self.setup.study.path}: [observables] needs the engine 'replay' in this process"
+            )
+        return self.engine
 
 
 def study_nuisance(study: Study, links: Measurements) -> Nuisance:

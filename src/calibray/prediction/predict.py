@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calibray.engines.kinds.replay import replay
+from calibray.engines.replay import Replay
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
@@ -194,6 +195,7 @@ def interval(
         path_loss_db = _path_loss(result, setup, progress)
         basis = np.full(len(path_loss_db), str(result.prediction.model.name), dtype=object)
         table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
+        table = table.assign(**further_observables(result, setup))
         return fill_missing(result.prediction, result.study, setup.links, table)
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
@@ -233,6 +235,7 @@ def interval(
             "lower_db": best - half_width,
             "upper_db": best + half_width,
             "basis": link_basis.astype(object),
+            **further_observables(result, setup),
         }
     )
     return fill_missing(result.prediction, result.study, links, table, level, half_width)
@@ -272,6 +275,30 @@ def with_constants(result: Record, setup: Setup) -> Setup:
         items += [] if item is None else [item]
     parameters = replace(setup.parameters, items=(*setup.parameters.items, *items))
     return replace(setup, parameters=parameters)
+
+
+def further_observables(result: Record, setup: Setup) -> dict[str, NDArray[np.float64]]:
+    """Further observables at opened links [links] by column name, as `spread_ns`; without the biases of devices.
+
+    Args:
+        result: The calibration.
+        setup: Its study, opened for the links.
+
+    Returns:
+        The columns; empty without further observables, or if the prediction model uses no scene.
+    """
+    sections, prediction = result.study.observables, result.prediction
+    if not sections or prediction.model.parameters is None:
+        return {}
+    engine = replay(setup, setup.trace(traced_materials(result, prediction.materials)))
+    if not isinstance(engine, Replay):
+        return {}
+    values = np.array([[prediction.model.parameters[name] for name in setup.parameters.names]])
+    found = engine.observe(values, tuple(section.statistic for section in sections.values()))[0]
+    return {
+        f"{name}_{section.unit}": found[index] / section.scale
+        for index, (name, section) in enumerate(sections.items())
+    }
 
 
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:

@@ -52,7 +52,7 @@ def summary(result: Record) -> tuple[Table | str, ...]:
     Returns:
         The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
     """
-    parts = (parameters(result), nuisances(result), accuracy(result))
+    parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
 
 
@@ -66,8 +66,8 @@ def tables(result: Record) -> tuple[Table, ...]:
         Those that have rows.
     """
     parts = (
-        links(result), parameters(result), reasons(result), nuisances(result), accuracy(result), remarks(result),
-        diagnostics_table(result), costs(result),
+        links(result), parameters(result), reasons(result), nuisances(result), accuracy(result), observables(result),
+        remarks(result), diagnostics_table(result), costs(result),
     )  # fmt: skip
     return tuple(table for table in parts if table.rows)
 
@@ -167,6 +167,29 @@ def reasons(result: Record) -> Table:
         (name, explanation_text(interval)) for name, interval in result.intervals.items() if interval.reason
     ]
     return Table("Reasons", (Column(), Column()), tuple(rows))
+
+
+def observables(result: Record) -> Table:
+    """The fit of further observables, each in its unit.
+
+    Args:
+        result: The calibration.
+
+    Returns:
+        The table; without rows if the study has none.
+    """
+    rows = []
+    for name, fit in result.fit.observables.items():
+        biases = ", ".join(f"{label or 'all'} {value:+.3g}" for label, value in fit.biases.items())
+        figures = (fit.initial_rmse, fit.rmse, fit.mean_rmse, fit.error)
+        rows.append(
+            (f"{name} [{fit.unit}]", str(fit.links), *(f"{figure:.3g}" for figure in figures), biases)
+        )
+    columns = (
+        Column(), numbers("links"), numbers("RMSE before"), numbers("RMSE after"), numbers("RMSE of the mean"),
+        numbers("error"), Column("bias"),
+    )  # fmt: skip
+    return Table("Observables", columns, tuple(rows))
 
 
 def remarks(result: Record) -> Table:

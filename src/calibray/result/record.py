@@ -27,6 +27,31 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
+class ObservableFit:
+    """How well the calibrated model fits a further observable of the calibration links.
+
+    Attributes:
+        kind: What was measured.
+        unit: The unit of the other values.
+        links: Number of calibration links with a value.
+        rmse: RMSE of the calibrated model.
+        initial_rmse: RMSE with the initial materials.
+        mean_rmse: RMSE of the mean value, as a rival.
+        error: Standard deviation of a value's error, stated or estimated.
+        biases: Bias by group; the group "" stands for all links.
+    """
+
+    kind: str
+    unit: str
+    links: Count
+    rmse: NonNegative
+    initial_rmse: NonNegative
+    mean_rmse: NonNegative
+    error: NonNegative
+    biases: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Fit:
     """The candidate of least RMSE, and how well it fits the calibration links.
 
@@ -43,6 +68,7 @@ class Fit:
             calibrated materials [dB]; None where the paths do not depend on the materials.
         power_shares: Share of the links' power by material and kind of interaction; "line of sight" for paths
             without interaction. Shares add up to more than 1, since a path counts for each of its interactions.
+        observables: The further observables by name.
     """
 
     parameters: dict[str, float]
@@ -55,6 +81,7 @@ class Fit:
     retrace_gap_db: NonNegative | None = None
     laws: dict[str, dict[str, float]] = field(default_factory=dict)
     power_shares: dict[str, dict[str, Share]] = field(default_factory=dict)
+    observables: dict[str, ObservableFit] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -202,6 +202,16 @@ def _approximate_intervals(values: dict[str, Any]) -> str:
     )
 
 
+def _conflict(values: dict[str, Any]) -> str:
+    rows = zip(values["names"], values["path_loss"], values["further"], strict=True)
+    answers = "; ".join(f"{name} {first:.4g} or {second:.4g}" for name, first, second in rows)
+    observables = ", ".join(values["observables"])
+    return (
+        f"Path loss and {observables} want different parameters, by {values['standard_errors']:.1f} standard errors: "
+        f"{answers}. Check units, the receiver's range and the scene; the common fit explains neither."
+    )
+
+
 def _unreached_links(values: dict[str, Any]) -> str:
     trials = zip(values["switches"], values["reached"], strict=True)
     reached = ", ".join(f"{switch} reaches {count:.0f}" for switch, count in trials)
@@ -238,6 +248,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.UNREACHED_LINKS: _unreached_links,
+    RemarkKind.CONFLICT: _conflict,
 }
 
 

@@ -20,6 +20,7 @@ from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, itu_start, make_parameter
 from calibray.parameters.laws import frequency_independent_law
 from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
+from calibray.study.observables import ObservableSection
 from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import (
     AntennasSection,
@@ -66,6 +67,7 @@ class StudyModel(Section, ABC):
     trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
     objective: ObjectiveSection = Field(default_factory=ObjectiveSection)
     parameters: dict[str, ParameterSection]
+    observables: dict[str, ObservableSection] = Field(default_factory=dict)
     regions: dict[str, RegionSection] = Field(default_factory=dict)
     offset: OffsetSection | None = None
     nuisance: dict[str, NuisanceSection] = Field(default_factory=dict)

@@ -20,6 +20,7 @@ from calibray.result.verdict import CONFIDENCE, Interval, Reason, ReasonKind, Ve
 from calibray.support.memory import single_blas_thread
 from calibray.support.progress import Progress
 from calibray.uncertainty.buildings import can_split
+from calibray.uncertainty.conflict import conflict
 from calibray.uncertainty.draws import systematic_resampling
 from calibray.uncertainty.emulator import emulate
 from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
@@ -193,6 +194,8 @@ def _assess(
         remarks += missed(problem, posterior.means, trail)
     remarks += outside_interval(problem, best, intervals, most_probable, log_odds, noise)
     intervals = {name: consistent(interval, best[name]) for name, interval in intervals.items()}
+    if problem.observed:
+        remarks += conflict(problem, relevant)
     if not posterior.means.agree:
         remarks.append(Remark(RemarkKind.FEW_DRAWS))
     return replace(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
+from calibray.fields.observables import Statistic
 from calibray.fitting.problem import Problem
 from calibray.parameters import Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
@@ -51,9 +52,18 @@ class SplitReplay:
         Returns:
             Path loss [n, L], [dB].
         """
+        return self.engine.path_loss(self._candidates(values, factors))
+
+    def observe(
+        self, values: NDArray[np.float64], factors: NDArray[np.float64], wanted: tuple[Statistic, ...]
+    ) -> NDArray[np.float64]:
+        """Further observables of buildings that differ [n, K, L]; arguments as for `path_loss`."""
+        return self.engine.observe(self._candidates(values, factors), wanted)
+
+    def _candidates(self, values: NDArray[np.float64], factors: NDArray[np.float64]) -> NDArray[np.float64]:
         bounds = [PARAMETER_BOUNDS[parameter.field] for parameter in self.engine.parameters]
         lower, upper = [bound.lower for bound in bounds], [bound.upper for bound in bounds]
-        return self.engine.path_loss(np.clip(values[:, self.parameter_of] * factors, lower, upper))
+        return np.clip(values[:, self.parameter_of] * factors, lower, upper)
 
 
 def can_split(problem: Problem) -> bool:

@@ -74,6 +74,8 @@ class JointModel:
         spread: The between-building spread if the study declares it; else None.
         interactions: Interactions that one evaluation takes.
         effects_db: Change of path loss by one standard deviation of each fixed constant [dB].
+        observed: Number of rows of each further observable, which follow the m gaps of path loss; its degrees of
+            freedom; and whether the rows are in units of the stated error.
     """
 
     study: Parameters
@@ -88,6 +90,30 @@ class JointModel:
     spread: float | None = None
     interactions: int = 1
     effects_db: dict[str, float] = field(default_factory=dict)
+    observed: tuple[tuple[int, int, bool], ...] = ()
+
+    def densities(self, gaps: NDArray[np.float64], model: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Log likelihood of gaps that have one noise model each [n]."""
+        links, further = self._split(gaps)
+        return self.forms.densities(links, model) + further
+
+    def densities_by_model(self, gaps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log likelihood of gaps under every noise model, with its prior weight [n, models]."""
+        links, further = self._split(gaps)
+        return self.marginal.densities(links) + further[:, None]
+
+    def _split(self, gaps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gaps of path loss [n, m], and the log likelihood of the further observables [n].
+
+        Where their error is not stated, it is integrated out with a prior inversely proportional to it.
+        """
+        last = gaps.shape[1] - sum(count for count, _, _ in self.observed)
+        links, further = gaps[:, :last], np.zeros(len(gaps))
+        for count, freedom, stated in self.observed:
+            square = np.sum(gaps[:, last : last + count] ** 2, axis=1)
+            further += -0.5 * square if stated else -0.5 * freedom * np.log(np.maximum(square, 1e-300))
+            last += count
+        return links, further
 
     @cached_property
     def forms(self) -> QuadraticForms:
@@ -107,7 +133,7 @@ class JointModel:
         values = np.hstack([self.study.from_search(points), np.tile(constants, (len(points), 1))])
         unit = self.parameters.to_unit(values)
         gaps = self.gaps(unit, np.zeros((len(points), len(self.parameter_of))))
-        return np.logaddexp.reduce(self.marginal.densities(gaps), axis=1) + self.log_prior(unit)
+        return np.logaddexp.reduce(self.densities_by_model(gaps), axis=1) + self.log_prior(unit)
 
     def log_prior(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Logarithm of the prior density over the unit cube [n, d + k], up to a constant [n]."""
@@ -181,7 +207,8 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         return problem.observable.modelled(problem.engine, values)
 
     def gaps_of(points: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
-        return gap(loss_of(problem.parameters.from_unit(points)))
+        values = problem.parameters.from_unit(points)
+        return np.hstack([gap(loss_of(values)), *_further(problem, lambda: _observe(problem, values))])
 
     none = np.zeros(0, dtype=np.int64)
     spread = 0.0 if few else None if section.heterogeneity == "auto" else float(section.heterogeneity)
@@ -197,6 +224,10 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         none,
         spread,
         max(int(getattr(problem.engine, "interactions", 1)), 1),
+        observed=tuple(
+            (len(each.used(objective.weight)), each.freedom(objective.weight), each.stated)
+            for each in problem.observed
+        ),
     )
     return _with_constants(model, problem, best, gap) if can_split(problem) else model
 
@@ -232,7 +263,9 @@ def _with_constants(
     def gaps_of(points: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
         factors = np.ones((len(points), len(replay.parameter_of)))
         factors[:, of_building] = np.exp(logarithms)
-        return gap(replay.path_loss(parameters.from_unit(points), factors))
+        values = parameters.from_unit(points)
+        further = _further(problem, lambda: replay.observe(values, factors, problem.statistics))
+        return np.hstack([gap(replay.path_loss(values, factors)), *further])
 
     return replace(
         model,
@@ -250,6 +283,22 @@ def _with_constants(
         only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
         effects_db={item.name: effects[item.name] for item in fixed},
     )
+
+
+def _observe(problem: Problem, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return problem.replay.observe(values, problem.statistics)
+
+
+def _further(problem: Problem, observe: Callable[[], NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Rows of the further observables [n, m] each, in units of the error where that is stated."""
+    if not problem.observed:
+        return []
+    modelled = observe()
+    rows = []
+    for index, each in enumerate(problem.observed):
+        residuals, _ = each.residuals(modelled[:, index], problem.objective.weight)
+        rows.append(residuals / each.std if each.stated else residuals)
+    return rows
 
 
 def has_offset(problem: Problem) -> bool:

@@ -98,7 +98,7 @@ class Lengths:
 def evaluated(model: JointModel, population: Population) -> Population:
     """The population with gaps and densities recomputed."""
     gap = model.gaps(population.point, population.spread[:, None] * population.deviation)
-    log_likelihood = model.forms.densities(gap, population.model)
+    log_likelihood = model.densities(gap, population.model)
     log_likelihood = np.where(np.isfinite(log_likelihood), log_likelihood, NEVER)
     return replace(
         population, gap=gap, log_likelihood=log_likelihood, log_prior=model.log_prior(population.point)
@@ -243,7 +243,7 @@ class Moves:
 
     def _redraw_models(self, population: Population) -> Population:
         """Redraw the noise model of every member from its conditional probabilities."""
-        by_model = self.model.marginal.densities(population.gap)
+        by_model = self.model.densities_by_model(population.gap)
         by_model = np.where(np.isfinite(by_model), by_model, NEVER)
         # The largest of log weights plus Gumbel numbers is a draw by these weights.
         model = np.argmax(self.power * by_model + self.random.gumbel(size=by_model.shape), axis=1)

@@ -196,7 +196,7 @@ def _anneal(
         deviation,
         model.draw_spread(size, random),
         models,
-        np.zeros((size, len(model.marginal.column))),
+        np.zeros((size, len(model.marginal.column) + sum(count for count, _, _ in model.observed))),
         empty,
         empty,
     )

@@ -1,0 +1,162 @@
+"""Observables besides path loss in the objective: rows of residuals that follow those of the links.
+
+Their rows are weighted by the ratio of the errors' standard deviations, like those of priors, so that a sum of squares
+is minus twice the log likelihood in units of the noise variance of path loss. An unknown bias is eliminated: it is the
+mean residual of its group.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.engines.protocol import Engine
+from calibray.engines.replay import Replay
+from calibray.errors import InputError
+from calibray.fields.observables import Statistic
+from calibray.measurements import Measurements
+from calibray.study import Setup
+
+LEAST: Final = 1e-6
+"""Smallest standard deviation of an observable's errors, relative to that of its values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """One observable of the links.
+
+    Attributes:
+        name: Its name in the study.
+        statistic: What the model gives for it.
+        measured: Measured values [L], in the unit; NaN where a link lacks it.
+        scale: The unit in SI units.
+        group: Group of each link's bias, from 0 [L]; -1 without a bias.
+        labels: Labels of the groups; empty without a bias.
+        std: Standard deviation of a value's error, in the unit.
+        stated: Whether the study states it.
+    """
+
+    name: str
+    statistic: Statistic
+    measured: NDArray[np.float64]
+    scale: float
+    group: NDArray[np.int64]
+    labels: tuple[str, ...]
+    std: float
+    stated: bool
+
+    def used(self, weight: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The links with a value and a weight [m]."""
+        return np.flatnonzero(np.isfinite(self.measured) & (weight > 0))
+
+    def freedom(self, weight: NDArray[np.float64]) -> int:
+        """Number of values minus that of the biases."""
+        used = self.used(weight)
+        return len(used) - (len(np.unique(self.group[used])) if self.labels else 0)
+
+    def residuals(
+        self, modelled: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modelled minus measured values [n, m] in the unit, the bias eliminated, and the biases [n, groups].
+
+        Args:
+            modelled: Modelled values [n, L] in SI units.
+            weight: Weights of the links [L].
+        """
+        used = self.used(weight)
+        gap = modelled[:, used] / self.scale - self.measured[used]
+        # A link that loses its paths for a candidate has no statistic.
+        gap = np.where(np.isfinite(gap), gap, 0.0)
+        if not self.labels:
+            return gap, np.zeros((len(gap), 0))
+        bias = self._means(gap, used)
+        return gap - bias[:, self.group[used]], -bias
+
+    def slopes(self, derivative: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of the residuals [n, m, k], from those of the modelled values [n, L, k]."""
+        used = self.used(weight)
+        slope = np.nan_to_num(derivative[:, used] / self.scale)
+        if self.labels:
+            slope = (
+                slope - np.moveaxis(self._means(np.moveaxis(slope, 2, 1), used), 1, 2)[:, self.group[used]]
+            )
+        return slope
+
+    def _means(self, values: NDArray[np.float64], used: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Mean of values [..., m] over the links of each group [..., groups]."""
+        member = (self.group[used][:, None] == np.arange(len(self.labels))).astype(np.float64)
+        return values @ member / np.maximum(member.sum(axis=0), 1.0)
+
+
+def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
+    """The observables that a study states.
+
+    Args:
+        setup: The opened study.
+        engine: Its engine.
+
+    Raises:
+        InputError: A column cannot be used, too few links have a value, or the engine gives path loss only.
+    """
+    sections, links = setup.study.observables, setup.links
+    if sections and not isinstance(engine, Replay):
+        raise InputError(
+            f"{setup.study.path}: [observables] needs the engine 'replay' in this process, with one carrier, without "
+            "workers, chunk_links and coefficients of laws"
+        )
+    every = []
+    for name, section in sections.items():
+        measured = links.table.numbers(section.column, gaps=True)
+        if np.isfinite(measured).sum() < 2:
+            raise InputError(
+                f"{links.source}: column {section.column!r} of [observables.{name}] has "
+                f"{int(np.isfinite(measured).sum())} values; at least two links need one"
+            )
+        group, labels = _groups(links, section.bias)
+        std = float(np.nanstd(measured)) if section.std is None else section.std
+        every.append(
+            Observed(
+                name,
+                section.statistic,
+                measured,
+                section.scale,
+                group,
+                labels,
+                max(std, 1e-300),
+                section.std is not None,
+            )
+        )
+    return tuple(every)
+
+
+def _groups(links: Measurements, bias: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    if bias is None:
+        return np.full(len(links), -1), ()
+    if bias == "all":
+        return np.zeros(len(links), dtype=np.int64), ("",)
+    labels, group = np.unique(links.table.labels(bias), return_inverse=True)
+    return group.reshape(-1), tuple(map(str, labels))
+
+
+def with_errors(
+    every: tuple[Observed, ...], modelled: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[Observed, ...]:
+    """The observables with errors estimated from their residuals, where the study states none.
+
+    Args:
+        every: The observables.
+        modelled: Modelled values [K, L], in SI units.
+        weight: Weights of the links [L].
+    """
+    updated = []
+    for each, values in zip(every, modelled, strict=True):
+        if each.stated:
+            updated.append(each)
+            continue
+        residuals, _ = each.residuals(values[None], weight)
+        std = float(np.sqrt(np.sum(residuals**2) / max(each.freedom(weight), 1)))
+        updated.append(replace(each, std=max(std, LEAST * float(np.nanstd(each.measured)), 1e-300)))
+    return tuple(updated)

@@ -1,0 +1,128 @@
+"""Calibration on delay spreads and times of flight besides path loss, from the study to predictions."""
+
+import numpy as np
+import pytest
+
+import planted
+from calibray import engines
+from calibray.calibration.calibrate import calibrate
+from calibray.calibration.result import Result
+from calibray.errors import InputError
+from calibray.fields.observables import Statistic
+from calibray.measurements import links_from_frame
+from calibray.reporting import result_tables as tables
+from calibray.result.remark import RemarkKind
+from calibray.study import Setup
+from calibray.tables.text import render
+
+MARBLE = "marble.relative_permittivity"
+SPREAD = {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}
+FLIGHT = {"kind": "round_trip_time", "column": "rtt_ns", "unit": "ns", "bias": "half", "path": "first"}
+FEW = {"name": "auto", "options": {"starts": 8}}
+PLAN = {
+    "parameters": {
+        MARBLE: {"bounds": planted.BOUNDS},
+        "wood.relative_permittivity": {"bounds": planted.BOUNDS},
+    },
+    "offset": {},
+    "method": FEW,
+    "noise": {"constants_spread": 0, "heterogeneity": 0, "range_m": 0},
+}
+TRUTH = np.array([planted.TRUTH[MARBLE], planted.TRUTH["wood.relative_permittivity"]])
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory):
+    study = planted.study(tmp_path_factory.mktemp("plan"), planted.links(), **PLAN)
+    return engines.make(Setup.open(study, links=links_from_frame(planted.links())))
+
+
+@pytest.fixture(scope="module")
+def table(engine):
+    """Path loss with 2 dB of noise and an offset; delay spreads with 0.3 ns; round trips with a bias per half."""
+    random = np.random.default_rng(6)
+    spread, flight = engine.observe(
+        TRUTH[None], (Statistic("rms_delay_spread"), Statistic("round_trip_time", "first"))
+    )[0]
+    links = planted.links()
+    bias = links.half.map({"west": 40.0, "east": -15.0}).to_numpy()
+    return links.assign(
+        path_loss_db=engine.path_loss(TRUTH[None])[0] + 3.0 + 2.0 * random.standard_normal(planted.LINKS),
+        spread_ns=1e9 * spread + 0.3 * random.standard_normal(planted.LINKS),
+        rtt_ns=1e9 * flight + bias + 0.5 * random.standard_normal(planted.LINKS),
+    )
+
+
+def run(folder, table, **sections):
+    return calibrate(planted.study(folder, table, **(PLAN | sections)))
+
+
+def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine):
+    alone = run(tmp_path, table)
+    both = run(
+        tmp_path,
+        table.assign(spread_ns=table.spread_ns.where(table.index != 3)),
+        observables={"spread": SPREAD},
+    )
+    for name, truth in zip(engine.parameters.names, TRUTH, strict=True):
+        assert both.intervals[name].contains(truth)
+    width = [result.intervals[MARBLE].upper - result.intervals[MARBLE].lower for result in (alone, both)]
+    assert width[1] < 0.6 * width[0]
+    fit = both.fit.observables["spread"]
+    assert (fit.links, fit.unit) == (planted.LINKS - 1, "ns")
+    assert fit.rmse < 0.5 < fit.initial_rmse
+    assert fit.error == pytest.approx(0.3, rel=0.7)
+    assert fit.rmse < 0.5 * fit.mean_rmse
+    assert "spread [ns]" in render(*tables.tables(both))
+    assert not any(remark.kind == RemarkKind.CONFLICT for remark in both.uncertainty.remarks)
+    both.save(tmp_path / "out")
+    loaded = Result.load(tmp_path / "out")
+    assert loaded.fit.observables == both.fit.observables
+    predicted = loaded.predict_interval(planted.links())["spread_ns"].to_numpy()
+    assert predicted == pytest.approx(both.links.spread_after_ns.to_numpy())
+    assert predicted == pytest.approx(table.spread_ns.to_numpy(), abs=1.5)
+
+
+def test_a_bias_per_device_is_found_and_changes_no_material(tmp_path, table):
+    result = run(tmp_path, table, observables={"rtt": FLIGHT})
+    biases = result.fit.observables["rtt"].biases
+    assert biases == {"west": pytest.approx(40.0, abs=0.6), "east": pytest.approx(-15.0, abs=0.6)}
+    assert result.fit.observables["rtt"].rmse < 1.0
+
+
+def test_a_conflict_is_reported_with_both_answers(tmp_path, table, engine):
+    other = engine.observe(np.array([[2.0, 9.0]]), (Statistic("rms_delay_spread"),))[0, 0]
+    exact = engine.path_loss(TRUTH[None])[0] + 0.2 * np.random.default_rng(1).standard_normal(planted.LINKS)
+    result = run(
+        tmp_path,
+        table.assign(path_loss_db=exact, spread_ns=1e9 * other),
+        observables={"spread": SPREAD | {"std": 0.3}},
+    )
+    (remark,) = [remark for remark in result.uncertainty.remarks if remark.kind == RemarkKind.CONFLICT]
+    assert remark.values["standard_errors"] > 4.0
+    assert abs(remark.values["path_loss"][0] - 2.0) > 2.0
+    assert remark.values["further"] == pytest.approx([2.0, 9.0], abs=1.0)
+    assert any("want different parameters" in text for text in result.remarks)
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        (SPREAD | {"unit": "dB"}, "given in s or ms"),
+        (SPREAD | {"path": "first"}, "only a time of flight"),
+        (SPREAD | {"kind": "doppler"}, "rms_delay_spread"),
+        (SPREAD | {"std": 0.0}, "std"),
+    ],
+)
+def test_impossible_observables_are_refused(tmp_path, table, section, message):
+    with pytest.raises(InputError, match=message):
+        planted.study(tmp_path, table, observables={"spread": section})
+
+
+def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
+    with pytest.raises(InputError, match="no column 'nothing'"):
+        run(tmp_path, table, observables={"spread": SPREAD | {"column": "nothing"}})
+    with pytest.raises(InputError, match="at least two links"):
+        run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
+    with pytest.raises(InputError, match="needs the engine 'replay'"):
+        run(tmp_path, table, observables={"spread": SPREAD}, engine={"name": "replay", "chunk_links": 6})
