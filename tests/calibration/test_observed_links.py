@@ -59,11 +59,8 @@ def run(folder, table, **sections):
 
 def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine):
     alone = run(tmp_path, table)
-    both = run(
-        tmp_path,
-        table.assign(spread_ns=table.spread_ns.where(table.index != 3)),
-        observables={"spread": SPREAD},
-    )
+    gappy = table.assign(spread_ns=table.spread_ns.where(table.index != 3))
+    both = run(tmp_path, gappy, observables={"spread": SPREAD, "rtt": FLIGHT})
     for name, truth in zip(engine.parameters.names, TRUTH, strict=True):
         assert both.intervals[name].contains(truth)
     width = [result.intervals[MARBLE].upper - result.intervals[MARBLE].lower for result in (alone, both)]
