@@ -8,8 +8,8 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
-from calibray.fields.observables import Statistic
 from calibray.measurements import links_from_frame
+from calibray.measurements.observables import Statistic
 from calibray.reporting import result_tables as tables
 from calibray.result.remark import RemarkKind
 from calibray.study import Setup

@@ -6,7 +6,7 @@ import pytest
 import planted
 from calibray import fields
 from calibray.fields.channel import channel_statistics
-from calibray.fields.observables import KINDS, Statistic
+from calibray.measurements.observables import KINDS, Statistic
 
 ALL = tuple(Statistic(kind) for kind in KINDS)
 LIMITED = tuple(Statistic(kind, "mean", 25.0, -95.0, 6e-8) for kind in KINDS)

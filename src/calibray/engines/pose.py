@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +16,8 @@ from calibray.fields import GroupedProgram
 from calibray.parameters import Parameter
 from calibray.paths import Paths
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import Mounting, Pose, in_frame, jones_vectors, theta_axis
+from calibray.tracing.mounting import EVERY, FIELDS, POSE, Mounting, Pose, in_frame, jones_vectors, theta_axis
 from calibray.tracing.settings import Antenna
-
-POSE: Final = "tx:"
-"""Beginning of the names of the parameters of transmit antennas."""
-FIELDS: Final = ("azimuth", "downtilt", "gain")
-EVERY: Final = "*"
-"""Name of the transmitter that stands for all of them."""
 
 
 @partial(

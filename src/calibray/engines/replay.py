@@ -14,8 +14,9 @@ from scipy.stats import qmc
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
-from calibray.fields.observables import Statistic, link_statistics
+from calibray.fields.observables import link_statistics
 from calibray.materials import Material
+from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 

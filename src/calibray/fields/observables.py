@@ -7,7 +7,6 @@ limit, so that derivatives are exact. It changes the weight of paths within some
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import jax
@@ -19,47 +18,18 @@ from calibray.fields.effects import Effects, apply_effects
 from calibray.fields.material_response import material_response, split_by_step
 from calibray.fields.program import GroupedProgram
 from calibray.fields.propagation import path_fields
+from calibray.measurements.observables import (
+    ARRIVAL_SPREAD,
+    DELAY_SPREAD,
+    DEPARTURE_SPREAD,
+    EXCESS_DELAY,
+    K_FACTOR,
+    ROUND_TRIP,
+    Statistic,
+)
 
 SOFT_DB: Final = 0.5
 """Width of the limit of a receiver's range [dB]."""
-
-DELAY_SPREAD: Final = "rms_delay_spread"
-EXCESS_DELAY: Final = "mean_excess_delay"
-TIME_OF_FLIGHT: Final = "time_of_flight"
-ROUND_TRIP: Final = "round_trip_time"
-K_FACTOR: Final = "k_factor"
-DEPARTURE_SPREAD: Final = "azimuth_spread_departure"
-ARRIVAL_SPREAD: Final = "azimuth_spread_arrival"
-
-KINDS: Final = {
-    DELAY_SPREAD: "s",
-    EXCESS_DELAY: "s",
-    TIME_OF_FLIGHT: "s",
-    ROUND_TRIP: "s",
-    K_FACTOR: "dB",
-    DEPARTURE_SPREAD: "rad",
-    ARRIVAL_SPREAD: "rad",
-}
-"""Kinds of observables, with the unit of their values."""
-
-
-@dataclass(frozen=True)
-class Statistic:
-    """What is measured of a link's paths.
-
-    Attributes:
-        kind: One of `KINDS`.
-        path: Path of a time of flight: "mean", "first" or "strongest".
-        dynamic_range_db: How far below the strongest path the receiver sees paths [dB]; None for all.
-        floor_db: Path gain below which it sees none [dB]; None for no limit.
-        window: Longest delay after the first path [s]; None for no limit.
-    """
-
-    kind: str
-    path: str = "mean"
-    dynamic_range_db: float | None = None
-    floor_db: float | None = None
-    window: float | None = None
 
 
 def link_statistics(

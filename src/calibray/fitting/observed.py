@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import Engine
-from calibray.engines.replay import Replay
 from calibray.errors import InputError
-from calibray.fields.observables import Statistic
 from calibray.measurements import Measurements
+from calibray.measurements.observables import Statistic
 from calibray.study import Setup
 
 LEAST: Final = 1e-6
@@ -102,7 +101,12 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
         InputError: A column cannot be used, too few links have a value, or the engine gives path loss only.
     """
     sections, links = setup.study.observables, setup.links
-    if sections and not isinstance(engine, Replay):
+    if not sections:
+        return ()
+    # JAX is slow to import, and a comparison of methods is drawn without it.
+    from calibray.engines.replay import Replay
+
+    if not isinstance(engine, Replay):
         raise InputError(
             f"{setup.study.path}: [observables] needs the engine 'replay' in this process, with one carrier, without "
             "workers, chunk_links and coefficients of laws"

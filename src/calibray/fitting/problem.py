@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.protocol import PATH_LOSS, Chunked, Differentiable, Engine, Observable, Reduced
-from calibray.engines.replay import Replay
 from calibray.errors import InputError
-from calibray.fields.observables import Statistic
 from calibray.fitting.nuisance import OFFSET, Nuisance, make_term
 from calibray.fitting.objective import Objective, make_objective
 from calibray.fitting.observed import Observed, observed
 from calibray.fitting.sums_of_squares import Share, rows, total
 from calibray.measurements import Measurements
+from calibray.measurements.observables import Statistic
 from calibray.parameters import NO_PRIOR, LogNormal, Parameters
 from calibray.study import Setup, Study
+
+if TYPE_CHECKING:
+    from calibray.engines.replay import Replay
 
 
 class Evaluation(NamedTuple):
@@ -294,6 +296,8 @@ class Problem:
         Raises:
             InputError: It is no replay in this process.
         """
+        from calibray.engines.replay import Replay
+
         if not isinstance(self.engine, Replay):
             raise InputError(
                 f"{self.setup.study.path}: [observables] needs the engine 'replay' in this process"

@@ -14,7 +14,6 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from calibray.engines.kinds import AnyEngine, default
 from calibray.engines.kinds.replay import ReplaySection
-from calibray.engines.pose import POSE
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
 from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, itu_start, make_parameter
@@ -43,6 +42,7 @@ from calibray.study.validation_errors import dotted
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.output_files import exists
 from calibray.support.strict_models import Section, Text
+from calibray.tracing.mounting import POSE
 from calibray.tracing.settings import Antenna
 
 VERSION: Final = 1

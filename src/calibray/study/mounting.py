@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.pose import EVERY, POSE, pose_error
 from calibray.errors import InputError
-from calibray.fields import Effects
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
@@ -18,8 +16,11 @@ from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import Mounting, Pose
+from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose
 from calibray.tracing.settings import Antenna
+
+if TYPE_CHECKING:
+    from calibray.fields import Effects
 
 PORT_POWER: Final = "tx_port_power_dbm"
 """Column of the links: the power that their transmitters feed into the antenna [dBm]."""
@@ -76,6 +77,9 @@ def pose_effects(
     Raises:
         InputError: The column of transmitters is missing.
     """
+    # JAX is slow to import, and every study file that is read imports this module.
+    from calibray.engines.pose import pose_error
+
     items = [parameters.items[index] for index in parameters.of_effects]
     if not any(item.name.startswith(POSE) for item in items):
         return ()

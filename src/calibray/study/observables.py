@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from calibray.errors import InputError
-from calibray.fields.observables import KINDS, ROUND_TRIP, TIME_OF_FLIGHT, Statistic
+from calibray.measurements.observables import KINDS, ROUND_TRIP, TIME_OF_FLIGHT, Statistic
 from calibray.support.strict_models import Section, Text
 
 UNITS: Final = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,15 @@ from pydantic import Field, model_validator
 
 from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
-from calibray.fields import Effects, ExtraLoss
 from calibray.parameters import Parameters
 from calibray.paths import Paths
 from calibray.scenes.regions import Region
 from calibray.support.lazy_imports import library
 from calibray.support.messages import did_you_mean, shortened
 from calibray.support.strict_models import Section, Text
+
+if TYPE_CHECKING:
+    from calibray.fields import Effects
 
 PREFIX: Final = "region:"
 """Beginning of the names of a region's parameters."""
@@ -148,6 +150,9 @@ def region_effects(
         parameters: The study's parameters.
         paths: The paths.
     """
+    # JAX is slow to import, and every study file that is read imports this module.
+    from calibray.fields import ExtraLoss
+
     path, start, end = _segments(paths)
     names = [parameters.names[index] for index in parameters.of_effects]
     effects = []

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Final, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from pydantic import ValidationError
 
 from calibray.engines.section import EngineSection, RadioSettings
 from calibray.errors import InputError
-from calibray.fields import Effects, path_loss
 from calibray.materials import Material
 from calibray.measurements import (
     LINK_COLUMNS,
@@ -57,6 +56,9 @@ from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
 from calibray.tracing.settings import TraceSettings
 from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
+
+if TYPE_CHECKING:
+    from calibray.fields import Effects
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -481,6 +483,8 @@ class Setup:
         if errors is None:
             return self
         paths = self._trace(displaced(links, errors), self.scene, None)
+        from calibray.fields import path_loss
+
         loss = path_loss(mount(paths, mounted_at_displaced(self.mountings, len(links))))
         variance = 1 / links.weight if study.links.std is not None else (study.noise.std_db or 0.0) ** 2
         weight = 1 / (variance + spread_db(loss) ** 2)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,12 @@ from calibray.errors import InputError
 from calibray.paths import Paths
 from calibray.tracing.antennas import SLANTS, AntennaPattern, rotation_matrix
 from calibray.tracing.settings import Antenna
+
+POSE: Final = "tx:"
+"""Beginning of the names of the parameters of transmit antennas."""
+FIELDS: Final = ("azimuth", "downtilt", "gain")
+EVERY: Final = "*"
+"""Name of the transmitter that stands for all of them."""
 
 
 class Pose(NamedTuple):

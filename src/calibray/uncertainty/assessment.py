@@ -27,7 +27,7 @@ from calibray.uncertainty.joint_model import JointModel, has_offset, joint_model
 from calibray.uncertainty.linear_theory import local_intervals, with_reason
 from calibray.uncertainty.noise_models import DIFFERING
 from calibray.uncertainty.remarks import departures, fit_undeclared_offset, missed, outside_interval
-from calibray.uncertainty.sequential_monte_carlo import BUDGET, Posterior, draw_posterior, joined
+from calibray.uncertainty.sequential_monte_carlo import Posterior, draw_posterior, joined
 from calibray.uncertainty.verdicts import Axes, consistent, verdicts
 from calibray.uncertainty.verdicts import Verdict as VerdictOnDraws
 from calibray.uncertainty.width_causes import remaining_widths
@@ -218,7 +218,7 @@ def _draw(models: Sequence[JointModel], seed: int, progress: Progress | None) ->
             if progress is not None:
                 progress("drawing", round(100 * (number + share) / len(models)), 100)
 
-        parts.append(draw_posterior(model, seed, drawn, BUDGET // len(models)))
+        parts.append(draw_posterior(model, seed, drawn, models=len(models)))
     return joined(parts)
 
 

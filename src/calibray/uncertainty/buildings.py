@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from calibray.engines.protocol import PATH_LOSS
 from calibray.engines.replay import Replay
-from calibray.fields.observables import Statistic
 from calibray.fitting.problem import Problem
+from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
 from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.paths import Paths

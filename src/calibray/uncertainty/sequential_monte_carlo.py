@@ -85,18 +85,25 @@ def joined(posteriors: Sequence[Posterior]) -> Posterior:
     )
 
 
-def population_size(interactions: int, budget: int = BUDGET) -> int:
+def population_size(interactions: int, budget: int = BUDGET, models: int = 1) -> int:
     """Members of each of two populations within a budget, from the interactions of one evaluation.
 
+    Draws of several models with equal weight are pooled, so that each needs fewer.
+
     Example:
-        >>> population_size(1_000), population_size(50_000)
-        (256, 100)
+        >>> population_size(1_000), population_size(50_000), population_size(1_000, models=8)
+        (256, 100, 64)
     """
-    return int(np.clip(budget // (2 * EVALUATIONS * interactions), *SIZE))
+    fewest, most = SIZE[0], max(SIZE[0], SIZE[1] // models)
+    return int(np.clip(budget // models // (2 * EVALUATIONS * interactions), fewest, most))
 
 
 def draw_posterior(
-    model: JointModel, seed: int = 0, progress: Callable[[float], None] | None = None, budget: int = BUDGET
+    model: JointModel,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+    budget: int = BUDGET,
+    models: int = 1,
 ) -> Posterior:
     """Draw from the joint posterior.
 
@@ -105,11 +112,12 @@ def draw_posterior(
         seed: Seed of the random numbers.
         progress: Called with the share of the work done after every step.
         budget: Interactions that may be evaluated.
+        models: Number of models whose draws are pooled, which share the budget.
 
     Returns:
         The draws.
     """
-    size, replays = population_size(model.interactions, budget), 0
+    size, replays, budget = population_size(model.interactions, budget, models), 0, budget // models
 
     def counted(points: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
         nonlocal replays

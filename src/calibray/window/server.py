@@ -87,6 +87,8 @@ def _listen(port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("127.0.0.1", port))
+        # Connections wait from here on, so that the address can be opened before the server runs.
+        listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()
         raise InputError(
