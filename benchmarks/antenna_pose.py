@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +24,9 @@ import calibray as cb
 from calibray.fields import path_loss
 from calibray.scenes import Mesh, MeshObject, join_meshes, write_scene
 from calibray.study import Setup, Study
+
+Repetition = Callable[[Path, pd.DataFrame, list[int]], list[dict[str, Any]]]
+"""From the folder of a district, its links and a seed to rows of a table."""
 
 FREQUENCY: Final = 3.5e9
 NOISE_DB: Final = 3.0
@@ -112,16 +116,23 @@ def study(folder: Path, table: pd.DataFrame, posed: bool) -> Study:
     return Study.from_content(content, folder / "study.toml")
 
 
-def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[str, Any]]:
-    """Calibrate one draw of the truth with and without directions as parameters: rows of parameters and of errors."""
-    random = np.random.default_rng(seed)
+def planted(
+    folder: Path, links: pd.DataFrame, random: np.random.Generator
+) -> tuple[dict[str, float], np.ndarray, pd.DataFrame]:
+    """A draw of the materials, a mask of the links that paths reach, and the links with their noisy path loss."""
     setup = Setup.open(study(folder, links, posed=False))
     truth = {name: random.uniform(bounds[0] + 0.5, bounds[1] - 2.0) for name, bounds in MATERIALS.items()}
     values = np.array([truth[name] for name in setup.parameters.names])
     loss = path_loss(setup.trace(), setup.parameters.materials(values, setup.scene.materials))
     reached = np.isfinite(loss)
     measured = np.where(reached, loss, 0.0) + NOISE_DB * random.standard_normal(len(loss))
-    stated = links.assign(loss_db=measured)
+    return truth, reached, links.assign(loss_db=measured)
+
+
+def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[str, Any]]:
+    """Calibrate one draw of the truth with and without directions as parameters: rows of parameters and of errors."""
+    random = np.random.default_rng(seed)
+    truth, reached, stated = planted(folder, links, random)
     for sector in SECTORS:
         azimuth, downtilt = random.uniform(-1, 1, 2) * (AZIMUTH_DEG, DOWNTILT_DEG)
         here = stated["sector"] == sector
@@ -154,9 +165,9 @@ def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[
     return rows
 
 
-def main() -> None:
-    """Run the repetitions and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+def repeated(description: str, repetition: Repetition, stream: int) -> pd.DataFrame:
+    """The rows of all repetitions in all districts, as many as the command line asks for; `stream` seeds them."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--districts", type=int, default=20)
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=np.inf, help="start no repetition after this time")
@@ -167,8 +178,13 @@ def main() -> None:
             links = district(Path(root) / str(seed), seed)
             for number in range(options.repetitions):
                 if time.perf_counter() - started < options.seconds:
-                    rows += repetition(Path(root) / str(seed), links, [seed, number, 270])
-    table = pd.DataFrame(rows)
+                    rows += repetition(Path(root) / str(seed), links, [seed, number, stream])
+    return pd.DataFrame(rows)
+
+
+def main() -> None:
+    """Run the repetitions and print the table."""
+    table = repeated(__doc__.splitlines()[0] if __doc__ else "", repetition, 270)
     summary = table.groupby(["posed", "parameter"]).agg(
         count=("covered", "size"), coverage=("covered", "mean"), identified=("identified", "mean"),
         median_error=("error", "median"), median_width=("width", "median"),

@@ -63,7 +63,7 @@ def content(folder: Path, before: str = "", after: str = ANSWER, **engine: Any) 
     command = [*PYTHON, "model.py"]
     return planted.content("links.csv") | {
         "noise": {"kind": "gaussian", "range_m": 0},  # intervals of engines are quick with one noise model
-        "engine": {"name": "command", "command": command, "timeout": 20.0, "retries": 0, **engine}
+        "engine": {"name": "command", "command": command, "timeout": 20.0, "retries": 0, **engine},
     }
 
 

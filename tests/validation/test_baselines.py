@@ -8,11 +8,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import planted
 from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.measurements import Measurements, SourceTable
-from calibray.validation.baselines import OUT_OF_SIGHT_DB, has_obstruction, log_distance, obstructed
+from calibray.result.prediction_model import FittedTerm
+from calibray.study import Study
+from calibray.validation.baselines import (
+    OUT_OF_SIGHT_DB,
+    has_obstruction,
+    log_distance,
+    obstructed,
+    obstructed_objective,
+)
+from calibray.validation.choice import with_prior_mean
 
 DISTANCE = np.geomspace(5, 500, 20)
 LOSS = 38.5 + 27.0 * np.log10(DISTANCE)
@@ -99,3 +109,20 @@ def test_links_in_sight_say_nothing_of_those_out_of_sight():
 def blocked(walls):
     """Columns of links whose direct lines cross some walls."""
     return SourceTable(pd.DataFrame({"out_of_sight": 1.0 * (walls > 0), "walls_crossed": 1.0 * walls}))
+
+
+def test_a_nuisance_of_the_study_keeps_its_name_and_has_no_prior_mean():
+    """A study's own loss out of sight is not shifted, and its names are not taken."""
+    walls = np.arange(20) % 4
+    links = measured(LOSS + 12.0 * (walls > 0), table=blocked(walls))
+    own = make_term(links, "out of sight", "out_of_sight")
+    taken = make_term(links, "walls crossed")
+    model, known_db = obstructed_objective(links, objective(links, own, taken), 3.5e9)
+    assert [term.name for term in model.nuisance.terms][:2] == ["out of sight", "walls crossed"]
+    assert "walls crossed of all" in [term.name for term in model.nuisance.terms]
+    assert (known_db == 0).all()
+    fitted = (FittedTerm("out of sight", "out_of_sight", "", {"": 12.0}),)
+    content = planted.content("links.csv", nuisance={"out of sight": {"by": "out_of_sight"}})
+    assert with_prior_mean(fitted, Study.from_content(content)) == fitted
+    (shifted,) = with_prior_mean(fitted, Study.from_content(planted.content("links.csv")))
+    assert shifted.coefficients == {"": 12.0 + OUT_OF_SIGHT_DB[0]}

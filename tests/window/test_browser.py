@@ -12,10 +12,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("nicegui")
-pytest.importorskip("shapely")
-
 from axe_playwright_python.sync_playwright import Axe
 
 from window_server import CHROMIUM, SIZES, add, launched, opened, press, served, step

@@ -168,7 +168,7 @@ class Replay:
     ) -> tuple[NDArray[np.floating], float]:
         if self.effects:
             return fields.path_losses_with_effects(
-                self._program, tables, self._effects, values, self._combining
+                self._program, tables, self._effects, values, self._combining, count
             ), 0.0
         return fields.path_losses(self._program, tables, self._combining, count)
 
@@ -177,7 +177,7 @@ class Replay:
     ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
         if self.effects:
             loss, slope, by_effect = fields.path_losses_and_slopes_with_effects(
-                self._program, tables, self._effects, values, self._used_columns, self._combining
+                self._program, tables, self._effects, values, self._used_columns, self._combining, count
             )
             jacobian = np.empty((*loss.shape, len(self.parameters)), loss.dtype)
             jacobian[..., self.parameters.of_materials] = slope[:, :, self._rows, self._used_column]
@@ -204,7 +204,7 @@ class Replay:
             if table_error > TABLE_TOLERANCE:
                 self._refine_tables()
                 continue
-            batches.append([np.asarray(answer[: len(batch)], dtype=float) for answer in answers])
+            batches.append([np.asarray(answer, dtype=float) for answer in answers])
             start += len(batch)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))

@@ -179,11 +179,12 @@ def path_losses_with_effects(
     effects: Effects,
     values: NDArray[np.floating],
     combining: Combining = POWER,
+    count: int | None = None,
 ) -> NDArray[np.floating]:
-    """Path loss [n, L], [dB], of candidates with material constants [n, M, 8] and effect parameters [n, e]."""
-    return np.asarray(
-        _losses_with_effects(program, jnp.asarray(tables), effects, jnp.asarray(values), combining)
-    )
+    """Path loss [count, L], [dB], for material constants [n, M, 8] and effect parameters [n, e]; see `path_losses`."""
+    count = len(tables) if count is None else count
+    arrays = jnp.asarray(tables), jnp.asarray(values)
+    return np.asarray(_losses_with_effects(program, *arrays, effects, count, combining))[:count]
 
 
 @jax_settings()
@@ -194,12 +195,13 @@ def path_losses_and_slopes_with_effects(
     values: NDArray[np.floating],
     columns: tuple[int, ...],
     combining: Combining = POWER,
+    count: int | None = None,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
-    """Path loss with effects, its derivatives by materials [n, L, M, columns] and by effect parameters [n, L, e]."""
-    answers = _slopes_with_effects(
-        program, jnp.asarray(tables), effects, jnp.asarray(values), columns, combining
-    )
-    loss, slope, by_effect = (np.asarray(answer) for answer in answers)
+    """Path loss with effects, its derivatives by materials [count, L, M, columns] and by effects [count, L, e]."""
+    count = len(tables) if count is None else count
+    arrays = jnp.asarray(tables), jnp.asarray(values)
+    answers = _slopes_with_effects(program, *arrays, effects, count, columns, combining)
+    loss, slope, by_effect = (np.asarray(answer)[:count] for answer in answers)
     return loss, slope, by_effect
 
 
@@ -324,43 +326,53 @@ def _slopes_by_formula(
 
 @partial(jax.jit, compiler_options=_WIDE)
 def _losses_with_effects(
-    program: GroupedProgram, tables: jax.Array, effects: Effects, values: jax.Array, combining: Combining
+    program: GroupedProgram,
+    tables: jax.Array,
+    values: jax.Array,
+    effects: Effects,
+    count: int,
+    combining: Combining,
 ) -> jax.Array:
-    """Path loss [n, L] of candidates, one after the other."""
-    return jax.lax.map(
-        lambda candidate: program_path_loss(
-            apply_effects(program, effects, candidate[1]), candidate[0], combining
-        ),
-        (tables, values),
-    )
+    """Path loss [n, L] of the first candidates, one after the other."""
+
+    def evaluate(index: jax.Array, losses: jax.Array) -> jax.Array:
+        changed = apply_effects(program, effects, values[index])
+        return losses.at[index].set(program_path_loss(changed, tables[index], combining).astype(losses.dtype))
+
+    return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=4, compiler_options=_WIDE)
+@partial(jax.jit, static_argnums=5, compiler_options=_WIDE)
 def _slopes_with_effects(
     program: GroupedProgram,
     tables: jax.Array,
-    effects: Effects,
     values: jax.Array,
+    effects: Effects,
+    count: int,
     columns: tuple[int, ...],
     combining: Combining,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of candidates, one after the other."""
+) -> tuple[jax.Array, ...]:
+    """Path loss [n, L] and derivatives [n, L, M, columns], [n, L, e] of the first candidates, one after the other."""
     stored = partial(materialize, positive=program.wavelength)
 
-    def evaluate(candidate: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        table, value = candidate
-        changed = apply_effects(program, effects, value)
-        response, derivatives = stored(response_and_derivatives(changed, table, columns))
+    def evaluate(index: jax.Array, results: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        changed = apply_effects(program, effects, values[index])
+        response, derivatives = stored(response_and_derivatives(changed, tables[index], columns))
         responses = split_by_step(changed, response)
         power, by_step = stored(_slope(changed, responses, combining))
         by_effect = jax.jacfwd(
             lambda value: _power(apply_effects(program, effects, value), responses, combining)
-        )(value)
+        )(values[index])
         inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
+        slope = jnp.zeros((program.num_links, tables.shape[1], 0))
         if columns:
             slope = _contract(changed, power, by_step, derivatives, tables.shape[1])
-        else:
-            slope = jnp.zeros((program.num_links, tables.shape[1], 0), tables.dtype)
-        return decibel(power), slope, -10 / np.log(10) * inverse[:, None] * by_effect
+        answers = decibel(power), slope, -10 / np.log(10) * inverse[:, None] * by_effect
+        return tuple(
+            result.at[index].set(answer.astype(result.dtype))
+            for result, answer in zip(results, answers, strict=True)
+        )
 
-    return jax.lax.map(evaluate, (tables, values))
+    shapes = (), (tables.shape[1], len(columns)), (values.shape[1],)
+    blank = tuple(jnp.zeros((len(tables), program.num_links, *shape), tables.dtype) for shape in shapes)
+    return jax.lax.fori_loop(0, count, evaluate, blank)

@@ -120,7 +120,8 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
                 f"{int(np.isfinite(measured).sum())} values; at least two links need one"
             )
         group, labels = _groups(links, section.bias)
-        std = float(np.nanstd(measured)) if section.std is None else section.std
+        # Equal values have no deviation; the error is estimated from the residuals later.
+        std = float(np.nanstd(measured)) or 1.0 if section.std is None else section.std
         every.append(
             Observed(
                 name,
@@ -129,7 +130,7 @@ def observed(setup: Setup, engine: Engine) -> tuple[Observed, ...]:
                 section.scale,
                 group,
                 labels,
-                max(std, 1e-300),
+                std,
                 section.std is not None,
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from calibray.errors import EngineError, InputError
-from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisance, make_term
+from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisance, Term, make_term
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements
 from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
@@ -81,12 +82,9 @@ def log_distance_objective(
     # An intercept is no offset, so the bounds of the study's offset do not apply to it.
     terms = [replace(term, bounds=UNBOUNDED) for term in objective.nuisance.terms]
     present = [(term.by, term.labels) for term in terms]
-    names = {term.name for term in terms}
     for by in (CONSTANT, LOG_DISTANCE):
         if (by, ("",)) not in present:
-            candidates = (by, f"{by} of all", f"{by} of all links")
-            name = next(candidate for candidate in candidates if candidate not in names)
-            terms.append(make_term(links, name, by))
+            terms.append(make_term(links, _free_name(by, terms), by))
     nuisance = Nuisance(len(links), tuple(terms))
     return replace(objective, nuisance=nuisance, ceiling_db=None), frequency_term
 
@@ -134,20 +132,25 @@ def obstructed_objective(
         EngineError: Fewer than two links have a weight.
     """
     model, known_db = log_distance_objective(links, objective, frequency)
-    present = {term.by for term in model.nuisance.terms}
-    terms = [
-        make_term(links, by.replace("_", " "), by, prior=prior_db)
-        for by, prior_db in ((OUT_OF_SIGHT, OUT_OF_SIGHT_DB[1]), (WALLS, WALL_DB))
-        if by not in present
-    ]
+    terms, present = list(model.nuisance.terms), {term.by for term in model.nuisance.terms}
+    for by, prior_db in ((OUT_OF_SIGHT, OUT_OF_SIGHT_DB[1]), (WALLS, WALL_DB)):
+        if by not in present:
+            terms.append(make_term(links, _free_name(by, terms), by, prior=prior_db))
     if OUT_OF_SIGHT not in present:
         known_db = known_db + OUT_OF_SIGHT_DB[0] * links.table.numbers(OUT_OF_SIGHT)
-    nuisance = Nuisance(len(links), (*model.nuisance.terms, *terms))
+    nuisance = Nuisance(len(links), tuple(terms))
     model = replace(model, nuisance=nuisance)
     # The priors are weighed against the errors that remain with the losses that these errors give.
     for _ in range(ROUNDS):
         model = replace(model, noise_db=max(float(model.rmse(known_db[None])[0]), LEAST_NOISE_DB))
     return model, known_db
+
+
+def _free_name(by: str, terms: Sequence[Term]) -> str:
+    """A name for a term by a column that no other term has."""
+    names = {term.name for term in terms}
+    plain = by.replace("_", " ") if by in (OUT_OF_SIGHT, WALLS) else by
+    return next(name for name in (plain, f"{plain} of all", f"{plain} of all links") if name not in names)
 
 
 def kriging(links: Measurements, objective: Objective, trend_db: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -90,9 +90,9 @@ def fit_prediction_model(
     setup, parameters = problem.setup, problem.parameters
     candidate, scene_db = trail.best, trail.best_modelled
     objective, modelled = problem.objective, scene_db
-    known = log_distance_objective if name == Model.LOG_DISTANCE else obstructed_objective
     if name in WITHOUT_MATERIALS:
-        objective, modelled = known(setup.links, problem.objective, setup.study.scene.frequency)
+        make = log_distance_objective if name == Model.LOG_DISTANCE else obstructed_objective
+        objective, modelled = make(setup.links, problem.objective, setup.study.scene.frequency)
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before
         objective, modelled = initial_objective(problem.objective, setup), scene_db
@@ -107,7 +107,7 @@ def fit_prediction_model(
     model = PredictionModel(
         name,
         parameters.named(candidate) if uses_scene else None,
-        with_prior_mean(terms) if name == Model.OBSTRUCTION else terms,
+        with_prior_mean(terms, setup.study) if name == Model.OBSTRUCTION else terms,
         residuals.rms_db,
         residuals.basis,
         residuals.links,
@@ -120,13 +120,16 @@ def fit_prediction_model(
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
 
 
-def with_prior_mean(terms: tuple[FittedTerm, ...]) -> tuple[FittedTerm, ...]:
-    """The terms with the mean of the prior in the loss out of sight, which the fit takes as known."""
+def with_prior_mean(terms: tuple[FittedTerm, ...], study: Study) -> tuple[FittedTerm, ...]:
+    """The terms of the log-distance model with obstruction, the loss out of sight with the mean of its prior.
+
+    The fit takes that mean as known. A nuisance of the study by the same column has no such prior.
+    """
     return tuple(
         replace(
             term, coefficients={key: OUT_OF_SIGHT_DB[0] + value for key, value in term.coefficients.items()}
         )
-        if term.name == OUT_OF_SIGHT.replace("_", " ")
+        if term.by == OUT_OF_SIGHT and term.name not in study.nuisance
         else term
         for term in terms
     )

@@ -31,7 +31,7 @@ from calibray.validation.baselines import has_obstruction
 PRIOR_SPREAD: Final = 0.3
 """Standard deviation of a parameter's logarithm around its initial value, in the variants with priors."""
 
-OUT_OF_SIGHT_DB: Final = 10.0
+OUT_OF_SIGHT_PRIOR_DB: Final = 10.0
 """Standard deviation of the prior of an offset of links out of sight, around zero [dB]; in downtown Boulder such links
 lack 11.7 dB."""
 
@@ -106,7 +106,9 @@ def variants(part: Problem, best: NDArray[np.float64]) -> dict[Model, Problem]:
         Model.SLOPE: replace(part, objective=_with_term(objective, LOG_DISTANCE, setup)),
     }
     if has_obstruction(setup.links):
-        out_of_sight = replace(_with_term(objective, OUT_OF_SIGHT, setup, OUT_OF_SIGHT_DB), noise_db=noise_db)
+        out_of_sight = replace(
+            _with_term(objective, OUT_OF_SIGHT, setup, OUT_OF_SIGHT_PRIOR_DB), noise_db=noise_db
+        )
         problems[Model.OUT_OF_SIGHT] = replace(part, objective=out_of_sight)
         problems[Model.PRIOR_OUT_OF_SIGHT] = replace(with_prior, objective=out_of_sight)
     per_transmitter = _with_offset_per_transmitter(objective, setup)
