@@ -62,7 +62,6 @@ def content(folder: Path, before: str = "", after: str = ANSWER, **engine: Any) 
     links.assign(path_loss_db=expected(TRUTH, links)[0]).to_csv(folder / "links.csv", index=False)
     command = [*PYTHON, "model.py"]
     return planted.content("links.csv") | {
-        "noise": {"kind": "gaussian", "range_m": 0},  # intervals of engines are quick with one noise model
         "engine": {"name": "command", "command": command, "timeout": 20.0, "retries": 0, **engine},
     }
 

@@ -57,10 +57,10 @@ def noisy() -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory, noisy) -> Result:
-    """A calibration with noise."""
+    """A calibration with noise, which compares all noise models."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CALIBRAY_CACHE", "")
-        return run(tmp_path_factory.mktemp("plain"), noisy)
+        return run(tmp_path_factory.mktemp("plain"), noisy, noise=None)
 
 
 def test_intervals_come_from_draws_and_have_reasons(result):

@@ -60,7 +60,7 @@ def test_a_scene_with_only_ground_has_no_buildings():
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    study = Study.from_content(planted.content("links.csv"))
+    study = Study.from_content(planted.content("links.csv", noise=None))
     return Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
 
 

@@ -19,7 +19,7 @@ NAMES = tuple(planted.TRUTH)
 
 
 def remarks(optimum: dict[str, float], log_odds: float = 3.0, **sections: Any) -> tuple[str, ...]:
-    study = Study.from_content(planted.content("links.csv", **sections))
+    study = Study.from_content(planted.content("links.csv", **{"noise": None, **sections}))
     problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
     pieces = ((2.0, 3.0), (6.0, 9.0))
     intervals = {name: Interval(0.1, 2.0, 9.0, Verdict.AMBIGUOUS, pieces) for name in NAMES}
