@@ -1,6 +1,7 @@
 """The paper's experiment in the demo district: RT calls, the global optimum, files and figures."""
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import product
 
@@ -32,8 +33,13 @@ def mapping_with_few_rays(setup, *arguments):
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    out = tmp_path_factory.mktemp("demo")
+    """The experiment; one noise model makes its intervals quick."""
+    out, study = tmp_path_factory.mktemp("demo"), tmp_path_factory.mktemp("study") / "district"
+    shutil.copytree(demo_study_path().parent, study)
+    with (study / "study.toml").open("a") as file:
+        file.write('\n[noise]\nkind = "gaussian"\nrange_m = 0\n')
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "demo_study_path", lambda: study / "study.toml")
         patch.setattr(module, "MAPPING_CALLS", 1)  # each is a trace
         patch.setattr(module, "_space_mapping", mapping_with_few_rays)
         finished = run_demo()

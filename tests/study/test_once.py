@@ -35,7 +35,8 @@ def folder(tmp_path, monkeypatch):
     """A small study with every section, its folder watched, and nothing in the cache."""
     shutil.copytree(STUDY, tmp_path, dirs_exist_ok=True)
     study = tmp_path / "study.toml"
-    study.write_text(study.read_text().replace("starts = 16, iterations = 50", "starts = 1, iterations = 2"))
+    quick = study.read_text().replace("starts = 16, iterations = 50", "starts = 1, iterations = 2")
+    study.write_text(quick + '\n[noise]\nkind = "gaussian"\nrange_m = 0\n')
     monkeypatch.setenv("CALIBRAY_CACHE", "")
     WATCHED.clear()
     _inside.append(tmp_path)
