@@ -21,9 +21,10 @@ from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study import Study
-from calibray.study.draft import draft, toml
+from calibray.study.draft import draft
 from calibray.study.link_checks import count_unknowns
 from calibray.study.schema import schema_text
+from calibray.study.toml_file import study_text
 
 REPOSITORY = Path(__file__).parents[2]
 TOWN = REPOSITORY / "examples" / "bring_your_own"
@@ -102,7 +103,7 @@ def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_p
     """TOML forbids DEL in texts, JSON allows it."""
     columns = {"rx_x_m\x7f": [5.0, 9.0], "rx_y_m": [1.0, 2.0], "rx_z_m": 1.5, "path_loss_db": [70.0, 80.0]}
     file = table(tmp_path, **columns)
-    text = toml({"version": 1, "links": {"rx": list(columns), "x\x7f": 1}}, {})
+    text = study_text({"version": 1, "links": {"rx": list(columns), "x\x7f": 1}}, {})
     assert tomllib.loads(text)["links"] == {"rx": list(columns), "x\x7f": 1}
     drafted = draft(scene, file, tmp_path / "study.toml", tx=[0.0, 0.0, 12.0], frequency=3.5e9)
     assert drafted.study.links.rx[0] == "rx_x_m\x7f"
@@ -292,7 +293,7 @@ def test_a_draft_says_what_was_drafted_whatever_the_names(value, reason, key, nu
     content = {"version": 1, "links": {"value": value, key: [value, number, True], "where": {key: 3}}}
     reasons = {"links": reason, "links.value": reason, f"links.{key}": reason}
     try:
-        text = toml(content, reasons)
+        text = study_text(content, reasons)
     except InputError:  # a lone surrogate, which no TOML file can contain
         assert any("\ud800" <= letter <= "\udfff" for letter in value + key)
         return

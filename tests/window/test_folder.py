@@ -13,8 +13,7 @@ STUDY = """version = 1
 file = "sionna:box"
 frequency = 3.5e9  # given # twice
 
-# offsets of cables
-[links]
+[links]  # offsets of cables
 file = "links # 1.csv"
 tx = ["tx_x", "tx_y", 2.0]
 rx = ["rx_x", "rx_y", 1.5]

@@ -54,10 +54,10 @@ def init(
     with progress_bars(log()) as progress:
         from calibray.reporting.position_plot import save_positions
         from calibray.reporting.scene_tables import assumptions, warning_lines
-        from calibray.study.draft import SCHEMA_FILE
         from calibray.study.draft import draft as draft_study
         from calibray.study.link_checks import count_unknowns
         from calibray.study.schema import schema_text
+        from calibray.study.toml_file import SCHEMA_FILE
         from calibray.tables.text import render
 
         progress("reading scene and links", 0, None)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes import write_scene
+from calibray.study.toml_file import study_text
 from calibray.support.output_files import check_folder, write_table, write_text
 
 if TYPE_CHECKING:
@@ -61,9 +62,7 @@ def write_live_study(
 
 def write_study_file(folder: Path, content: Mapping[str, Any]) -> None:
     """Write the study file of a study."""
-    from calibray.study.draft import toml
-
-    write_text(folder / "study.toml", toml(content, {}))
+    write_text(folder / "study.toml", study_text(content, {}))
 
 
 def _numbers(material: Material) -> dict[str, float]:

@@ -7,18 +7,26 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+import tomlkit
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
+from tomlkit.items import Item, Table
 
 from calibray.engines.kinds import DEFAULT, KINDS
 from calibray.errors import InputError
 from calibray.study.sections import ParameterSection
 from calibray.study.validation_errors import describe_fault
-from calibray.support.messages import shortened
+from calibray.support.messages import printable, shortened
 from calibray.support.output_files import exists
 from calibray.support.strict_models import CLOSED
+
+SCHEMA_FILE: Final = "study.schema.json"
+HEADING: Final = (
+    f"#:schema {SCHEMA_FILE}\n"
+    "# Drafted by `calibray init`. Comments give the reason of each assumption: check antennas and heights first.\n"
+)
 
 
 def read_content(path: Path) -> dict[str, Any]:
@@ -38,6 +46,85 @@ def read_content(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         # Besides malformed TOML: a number with thousands of digits, or lists nested thousands deep.
         raise InputError(f"{path}: not valid TOML: {shortened(str(error), 300)}") from None
+
+
+def study_text(content: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
+    """The text of a study file, with reasons of assumptions as comments.
+
+    Args:
+        content: The sections of the study.
+        reasons: Reasons by the dotted name of a section or key.
+
+    Raises:
+        InputError: A name has characters that TOML cannot hold.
+    """
+    document, text, agrees = tomlkit.document(), "", False
+    try:
+        for name, section in content.items():
+            document[name] = _section(name, section, reasons)
+        text = (HEADING if reasons else "") + tomlkit.dumps(document)
+        agrees = tomllib.loads(text) == _with_lists(content)
+    except ValueError:  # a lone surrogate, which no TOML file can contain
+        pass
+    # Whatever names a table has, the file must say what was drafted and nothing else.
+    if not agrees:
+        raise InputError("draft: a column or group has a name that no study can hold; rename it in the table")
+    return text
+
+
+def reasons_in(text: str) -> dict[str, str]:
+    """The comments that follow sections and keys in a study file, by dotted name; empty if it is not TOML."""
+    try:
+        document = tomlkit.parse(text)
+    except ValueError:
+        return {}
+    sections = {name: item for name, item in document.items() if isinstance(item, Table)}
+    items: dict[str, object] = dict(sections)
+    for name, section in sections.items():
+        items |= {f"{name}.{key}": section.value.item(key) for key in section}
+    comments = {name: item.trivia.comment for name, item in items.items() if isinstance(item, Item)}
+    return {name: comment.removeprefix("#").strip() for name, comment in comments.items() if comment}
+
+
+def _section(name: str, section: Any, reasons: Mapping[str, str]) -> Any:
+    """A section, or a value before the first section."""
+    if not isinstance(section, Mapping):
+        return _item(section)
+    table = tomlkit.table()
+    for key, value in section.items():
+        table[key] = _commented(_item(value), reasons.get(f"{name}.{key}"))
+    return _commented(table, reasons.get(name))
+
+
+def _commented(item: Any, reason: str | None) -> Any:
+    """An item with a comment of one line: a line break in a column's name would end it, and TOML would follow."""
+    return item.comment(printable(reason)) if reason else item
+
+
+def _item(value: Any) -> Any:
+    """A value in TOML, tables in one line; 3.5e9 Hz is easier to read than 3500000000."""
+    if isinstance(value, Mapping):
+        table = tomlkit.inline_table()
+        table.update({key: _item(part) for key, part in value.items()})
+        return table
+    if isinstance(value, list | tuple):
+        array = tomlkit.array()
+        array.extend(_item(part) for part in value)
+        return array
+    if (
+        isinstance(value, float)
+        and 1e6 <= abs(value) < 1e16
+        and float(giga := f"{value / 1e9:.10g}e9") == value
+    ):
+        return tomlkit.value(giga)
+    return tomlkit.item(value)
+
+
+def _with_lists(value: Any) -> Any:
+    """A value with lists in place of tuples, as TOML reads them."""
+    if isinstance(value, Mapping):
+        return {key: _with_lists(part) for key, part in value.items()}
+    return [_with_lists(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def refuse_unquoted_names(parameters: Any, path: str | Path) -> None:

@@ -23,7 +23,6 @@ LARGEST: Final = 2**30
 """Bytes of an uploaded file at most; larger ones are better put into the folder."""
 
 _NAME: Final = re.compile(r"[\w][\w .()+-]{0,119}")
-_REASON: Final = re.compile(r"^(?P<setting>.*\S)  # (?P<reason>.*)$")
 
 
 @dataclass(frozen=True)
@@ -107,21 +106,9 @@ class StudyFolder:
 
     def reasons(self) -> dict[str, str]:
         """Reasons by the dotted name of a section or key: the comments that a draft has."""
-        reasons: dict[str, str] = {}
-        section, pending = "", ""
-        for line in self.text().splitlines():
-            if line.startswith("# "):
-                pending = line[2:]
-            elif line.startswith("[") and line.endswith("]"):
-                section = line[1:-1].strip('"')
-                if pending:
-                    reasons[section] = pending
-            elif (match := _REASON.match(line)) and _same(match["setting"], line):
-                key = next(iter(tomllib.loads(match["setting"])))
-                reasons[f"{section}.{key}"] = match["reason"]
-            if not line.startswith("# "):
-                pending = ""
-        return reasons
+        from calibray.study.toml_file import reasons_in
+
+        return reasons_in(self.text())
 
     def save(self, content: Mapping[str, Any]) -> None:
         """Write the study file, with the reasons that it has.
@@ -130,9 +117,9 @@ class StudyFolder:
             InputError: The content is no study; the file is as before.
         """
         from calibray.study import Study
-        from calibray.study.draft import toml
+        from calibray.study.toml_file import study_text
 
-        text = toml(content, self.reasons())
+        text = study_text(content, self.reasons())
         Study.from_content(tomllib.loads(text), self.study_file)
         write_text(self.study_file, text)
 
@@ -142,11 +129,3 @@ class StudyFolder:
         while (target := self.path / f"study-{number}.toml").exists():
             number += 1
         self.study_file.rename(target)
-
-
-def _same(setting: str, line: str) -> bool:
-    """Whether what follows a setting is a comment, and not part of a text with a number sign."""
-    try:
-        return len(tomllib.loads(setting)) == 1 and tomllib.loads(setting) == tomllib.loads(line)
-    except ValueError:
-        return False
