@@ -35,7 +35,19 @@ LIMIT = 30.0
 START = 600.0
 """Time that a worker may take to start [s]."""
 INSIDE = "CALIBRAY_FUZZ_PLACE"  # the temporary folder, set within the mount namespace
-PROGRAMS = ("study", "answer", "ledger", "line", "paths", "cache", "table", "bomb", "occupied")
+PROGRAMS = (
+    "study",
+    "answer",
+    "ledger",
+    "line",
+    "paths",
+    "cache",
+    "table",
+    "bomb",
+    "occupied",
+    "rays",
+    "section",
+)
 """Kinds that may start programs: the study's, or Calibray itself to read a file within limits."""
 COST = re.compile(r"\b(GiB|MiB|GB|rays|minutes|hours|seconds|calls)\b")
 

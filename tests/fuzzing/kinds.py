@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from random import Random
 
-from fuzzing import accidents, geometry, inputs, making, maps, outside, stored, workbooks
+from fuzzing import accidents, geometry, inputs, making, maps, outside, radio, stored, workbooks
 from fuzzing.outcome import Case
 from fuzzing.world import World
 
@@ -34,6 +34,9 @@ SHARES = {
     accidents.bomb: 2,
     accidents.terrain: 4,
     accidents.polyline: 2,
+    radio.section: 6,
+    radio.pattern: 3,
+    radio.rays: 4,
 }
 """Cases of each kind of a hundred or so."""
 

@@ -133,7 +133,7 @@ def edited(rng: Random, tree: Any) -> tuple[Any, str, bool]:
     kind = rng.choice(("replace", "replace", "replace", "near", "remove", "rename", "add", "swap"))
     old, senseless = parent[key], False
     match kind:
-        case "near" if isinstance(old, int | float) and not isinstance(old, bool):
+        case "near" if isinstance(old, int | float) and not isinstance(old, bool) and abs(old) < 1e300:
             parent[key] = rng.choice(
                 (-old, old * 1.01, old + 1, old * 1e3, old * 1e-3, str(old), [old], old == 0)
             )

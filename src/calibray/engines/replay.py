@@ -41,8 +41,8 @@ TABLE_CANDIDATES: Final = 32
 BATCH: Final = 32
 """Largest number of candidates in one call."""
 
-OBSERVED_SIZES: Final = (1, 8, 64)
-"""Numbers of candidates that functions of further observables are compiled for."""
+OBSERVED_SIZE: Final = 64
+"""Most candidates in one call of a function of further observables, which is compiled for this number."""
 
 
 @final
@@ -138,11 +138,11 @@ class Replay:
         if (wanted, derivatives) not in self._observing:
             self._observing[wanted, derivatives] = self._compile_statistics(wanted, derivatives)
         function, batches = self._observing[wanted, derivatives], []
-        for start in range(0, len(values), OBSERVED_SIZES[-1]):
-            batch = values[start : start + OBSERVED_SIZES[-1]]
-            size = next(size for size in OBSERVED_SIZES if size >= len(batch))
-            padded = np.concatenate([batch, np.tile(batch[-1:], (size - len(batch), 1))])
-            batches.append([np.asarray(answer)[: len(batch)] for answer in function(jnp.asarray(padded))])
+        for start in range(0, len(values), OBSERVED_SIZE):
+            batch = values[start : start + OBSERVED_SIZE]
+            padded = np.resize(batch, (OBSERVED_SIZE, values.shape[1]))
+            answers = function(jnp.asarray(padded), len(batch))
+            batches.append([np.asarray(answer)[: len(batch)] for answer in answers])
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
 
@@ -161,7 +161,19 @@ class Replay:
         def with_jacobian(candidate: jax.Array) -> tuple[jax.Array, ...]:
             return (evaluate(candidate), *([jax.jacfwd(evaluate)(candidate)] if derivatives else []))
 
-        return jax.jit(lambda values: jax.lax.map(with_jacobian, values))
+        @jax.jit
+        def first(values: jax.Array, count: int) -> tuple[jax.Array, ...]:
+            """The answers for the first candidates; those for the rest are 0."""
+            shapes = jax.eval_shape(with_jacobian, values[0])
+            blank = tuple(jnp.zeros((len(values), *shape.shape), shape.dtype) for shape in shapes)
+
+            def step(index: jax.Array, answers: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+                pairs = zip(answers, with_jacobian(values[index]), strict=True)
+                return tuple(array.at[index].set(answer) for array, answer in pairs)
+
+            return jax.lax.fori_loop(0, count, step, blank)
+
+        return first
 
     def _path_losses(
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int

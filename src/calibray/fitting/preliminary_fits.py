@@ -104,7 +104,7 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
     stated = study.noise.std_db is not None or study.links.std is not None
     if not problem.has_priors or (stated and not problem.observed):
         return problem
-    if not problem.differentiable or problem.freedom < 1:
+    if not stated and (not problem.differentiable or problem.freedom < 1):
         cause = (
             "there are too few links" if problem.differentiable else f"the engine is {study.engine.name!r}"
         )
@@ -114,6 +114,8 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         )
     starts = problem.parameters.to_search(problem.parameters.start)[None]
     noise_db = problem.objective.noise_db if stated else float(problem.squares(starts).rmse_db[0])
+    if progress is not None:
+        progress("estimating noise", 0, NOISE_ESTIMATES)
     for turn in range(NOISE_ESTIMATES):
         problem = _with_noise(problem, noise_db)
         fit = least_squares(problem, SEARCHES if turn == 0 else 1, starts)

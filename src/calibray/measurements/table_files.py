@@ -41,6 +41,7 @@ try:
     size = 0
     with parquet.ParquetFile({path!r}, pre_buffer=False) as file:
         for batch in file.iter_batches({rows}, use_threads=False):
+            batch.validate(full=True)
             size = batch.nbytes + (size if {whole} else 0)
             if size > {limit}:
                 raise MemoryError

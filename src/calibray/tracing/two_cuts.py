@@ -88,6 +88,10 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
             count = _count(place, key, words[1:])
             cuts[key] = _cut(path, number + 1, lines[number + 1 : number + 1 + count], count, key)
             number += count
+        elif words[0] and _NUMBER.fullmatch(words[0]):
+            raise InputError(
+                f"{place}: {shortened(lines[number])!r} belongs to no cut; correct the cut's number of lines"
+            )
         number += 1
     for key in ("HORIZONTAL", "VERTICAL"):
         if key not in cuts:
@@ -98,7 +102,7 @@ def read_two_cuts(path: str | Path) -> TwoCuts:
 
 
 def _gain_dbi(place: str, words: list[str]) -> float:
-    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?.*", " ".join(words), re.IGNORECASE)
+    joined = re.fullmatch(rf"({_NUMBER.pattern})\s*(dbi|dbd)?(?:\s.*)?", " ".join(words), re.IGNORECASE)
     if joined is None:
         raise InputError(
             f"{place}: GAIN {shortened(' '.join(words))!r}: must be a number, as 'GAIN 17.5 dBi'"
@@ -109,7 +113,7 @@ def _gain_dbi(place: str, words: list[str]) -> float:
 
 
 def _count(place: str, key: str, words: list[str]) -> int:
-    if not words or not words[0].isdigit() or not 24 <= int(words[0]) <= 7201:
+    if not words or not words[0].isdecimal() or len(words[0]) > 4 or not 24 <= int(words[0]) <= 7201:
         raise InputError(
             f"{place}: {key} {shortened(' '.join(words))!r}: must be followed by the number of its lines, 24 to 7201"
         )

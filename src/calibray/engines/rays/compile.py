@@ -228,33 +228,30 @@ def _assign_links(
         InputError: No path belongs to a link, or the paths of a link have different ends.
     """
     own = np.hstack([table.tx, table.rx])
-    if links is not None:
-        ends, chosen = np.unique(np.hstack([links.tx, links.rx]), axis=0, return_inverse=True)
-        off, link = KDTree(ends).query(own)
-        if (lost := off > TOLERANCE).any():
-            worst = int(np.argmin(np.where(lost, off, np.inf)))
-            fault = (
-                f"{table.source}: {lost.sum()} of {len(lost)} paths connect other positions than the links, as path "
-                f"{table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
-            )
-            if lost.all():
-                raise InputError(
-                    f"{fault}; export the rays of the study's links, or correct the argument axes"
-                )
-            _LOG.warning("%s; they are left out", fault)
-        return ends[:, :3], ends[:, 3:], np.where(lost, -1, link), chosen.reshape(-1)
-    if table.link is None:
-        # Positions that differ by less than a millimetre are the same.
-        _, first, link = np.unique(np.round(own, 3), axis=0, return_index=True, return_inverse=True)
-    else:
-        _, first, link = np.unique(table.link, return_index=True, return_inverse=True)
+    # Without labels, positions that differ by less than a millimetre are the same.
+    label = np.round(own, 3) if table.link is None else table.link
+    _, first, link = np.unique(label, axis=0, return_index=True, return_inverse=True)
     link = link.reshape(-1)
-    if (np.abs(own - own[first][link]).max(axis=1) > TOLERANCE).any():
-        worst = int(np.argmax(np.abs(own - own[first][link]).max(axis=1)))
+    apart = np.abs(own - own[first][link]).max(axis=1)
+    if (apart > TOLERANCE).any():
         raise InputError(
-            f"{table.source}: path {table.path[worst]} has other ends than the other paths of its link; correct them"
+            f"{table.source}: path {table.path[int(np.argmax(apart))]} has other ends than the other paths of its "
+            "link; correct them"
         )
-    return own[first, :3], own[first, 3:], link, None
+    if links is None:
+        return own[first, :3], own[first, 3:], link, None
+    ends, chosen = np.unique(np.hstack([links.tx, links.rx]), axis=0, return_inverse=True)
+    off, link = KDTree(ends).query(own)
+    if (lost := off > TOLERANCE).any():
+        worst = int(np.argmin(np.where(lost, off, np.inf)))
+        fault = (
+            f"{table.source}: {lost.sum()} of {len(lost)} paths connect other positions than the links, as path "
+            f"{table.path[worst]}: the nearest link is {off[worst]:.3g} m away"
+        )
+        if lost.all():
+            raise InputError(f"{fault}; export the rays of the study's links, or correct the argument axes")
+        _LOG.warning("%s; they are left out", fault)
+    return ends[:, :3], ends[:, 3:], np.where(lost, -1, link), chosen.reshape(-1)
 
 
 def _check_direct(table: RayTable, paths: Paths, power: NDArray[np.float64], known: bool) -> None:

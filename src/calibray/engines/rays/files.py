@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Final
 
 import h5py
 import numpy as np
@@ -11,7 +12,14 @@ import pandas as pd
 
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
+from calibray.support.messages import shortened
 from calibray.support.output_files import check_file, exists, replacing, write_table, write_text
+
+LARGEST_JSON: Final = 2**26
+"""Largest JSON file [bytes]; in memory, its numbers take some twenty times as much."""
+
+LARGEST_HDF5: Final = 2**30
+"""Largest size of the datasets in memory [bytes]; kilobytes may decompress to gigabytes."""
 
 
 def read_ray_file(file: str | Path) -> SourceTable:
@@ -28,8 +36,16 @@ def read_ray_file(file: str | Path) -> SourceTable:
         raise InputError(f"{path}: no such file")
     try:
         frame = _read_json(path) if suffix == ".json" else _read_hdf5(path)
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise InputError(f"{path}: not a ray table ({error}); see docs/reference/ray-table.md") from None
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RuntimeError,
+    ) as error:  # RecursionError is a RuntimeError
+        raise InputError(
+            f"{path}: not a ray table ({shortened(str(error))}); see docs/reference/ray-table.md"
+        ) from None
     if frame.empty:
         raise InputError(f"{path}: holds no rows; a ray table needs at least one path")
     return SourceTable(frame, source=str(path))
@@ -60,12 +76,26 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
 
 
 def _read_json(path: Path) -> pd.DataFrame:
+    if (size := path.stat().st_size) > LARGEST_JSON:
+        raise InputError(
+            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20}; write .parquet or .h5"
+        )
     return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _read_hdf5(path: Path) -> pd.DataFrame:
     with h5py.File(path, "r") as file:
-        columns = {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+        hard = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+        columns = {name: file[name] for name in hard if isinstance(file[name], h5py.Dataset)}
+        for name, item in columns.items():
+            if item.is_virtual or item.external is not None:
+                raise InputError(
+                    f"{path}: {shortened(name)!r} is stored in another file; store it in this one"
+                )
+        if (size := sum(item.nbytes for item in columns.values())) > LARGEST_HDF5:
+            raise InputError(
+                f"{path}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_HDF5 // 2**20}; export fewer links"
+            )
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(
             {
