@@ -9,6 +9,7 @@ once it has said what it will cost. Memory is the largest of any process that th
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import signal
@@ -20,6 +21,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import rasterio
+from pyarrow import parquet
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -86,6 +93,43 @@ def program(line: str) -> tuple[dict[str, Any], Callable[[Path], object]]:
     return changed("engine", name="command"), named("answer.sh", line + "\n" + world.SCRIPT)
 
 
+def rays(write: Callable[[Path], object], ending: str) -> tuple[dict[str, Any], Callable[[Path], object]]:
+    """A study on a ray table of this ending, which `write` makes."""
+    return changed("engine", rays=f"rays.{ending}"), lambda folder: write(folder / f"rays.{ending}")
+
+
+def parquet_bomb(file: Path) -> None:
+    """A Parquet file of some kilobytes whose rows share one text of 16 MB: 16 TB of text."""
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(2**20, dtype=np.int32)), pa.array(["x" * 2**24]))
+    columns = {name: text for name in ("x", "y", "loss", "half", "w", "path", "point", "type", "z")}
+    parquet.write_table(
+        pa.table(columns), file, store_schema=False, dictionary_pagesize_limit=2**30, compression="zstd"
+    )
+
+
+def hdf5_bomb(file: Path) -> None:
+    """An HDF5 file of some kilobytes with columns of 80 TB."""
+    with h5py.File(file, "w") as content:
+        for name in ("path", "point", "type", "x", "y", "z"):
+            content.create_dataset(name, (10**13,), chunks=(2**20,), dtype="f8", compression="gzip")
+
+
+def raster_bomb(folder: Path) -> None:
+    """A sparse GeoTIFF of a megabyte with 120,000 million cells, under the footprint of a house."""
+    profile = {"driver": "GTiff", "width": 400_000, "height": 300_000, "count": 1, "dtype": "uint8"}
+    options = {"tiled": True, "compress": "deflate", "sparse_ok": True, "BIGTIFF": "YES"}
+    grid = rasterio.Affine(5e-7, 0, 11.4, 0, -5e-7, 48.2)
+    with rasterio.open(folder / "ground.tif", "w", crs="EPSG:4326", transform=grid, **profile, **options):
+        pass
+    ring = [[11.5, 48.1], [11.5002, 48.1], [11.5002, 48.1002], [11.5, 48.1002], [11.5, 48.1]]
+    house = {
+        "type": "Feature",
+        "properties": {"height": 9},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }
+    (folder / "house.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
+
+
 PLY = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n"
 PLY += "property float x\nproperty float y\nproperty float z\n"
 PLY += "element face 4000000000\nproperty list uchar int vertex_indices\nend_header\n"
@@ -117,6 +161,15 @@ BOMBS = (
     Bomb("program: JSON 10^6 deep", *program("head -c 1000000 /dev/zero | tr '\\0' '[' > \"$2\"; exit")),
     Bomb("compare: 10^9 seeds", {}, words=("compare", "study.toml", "--methods", "random", "--seeds", "1000000000")),
     Bomb("validate: 10^9 blocks", {}, words=("validate", "study.toml", "--blocks", "1000000000")),
+    Bomb("links: Parquet of 16 TB", changed("links", file="rows.parquet"), lambda f: parquet_bomb(f / "rows.parquet")),
+    Bomb("rays: Parquet of 16 TB", *rays(parquet_bomb, "parquet")),
+    Bomb("rays: HDF5 of 80 TB", *rays(hdf5_bomb, "h5")),
+    Bomb("rays: JSON 10^6 deep", *rays(lambda file: file.write_text("[" * 10**6), "json")),
+    Bomb("rays: JSON of 100 MB", *rays(lambda file: file.write_text('{"path": [' + "1," * 5 * 10**7 + "1]}"), "json")),
+    Bomb(
+        "terrain: 120,000 million cells", {}, raster_bomb,
+        ("scene", "footprints", "house.geojson", "--height", "height", "--terrain", "ground.tif", "--out", "made"),
+    ),
     Bomb("plan: a file without an end", {}, words=("scene", "plan", "/dev/full", "--out", "made")),
 )  # fmt: skip
 

@@ -6,14 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
 
 import calibray as cb
 import two_ray
+from calibray.engines.rays import files
+from calibray.engines.rays.compile import RaySetting, compile_rays
+from calibray.engines.rays.files import read_ray_file
+from calibray.engines.rays.table import RayTable
 from calibray.errors import InputError
 from calibray.fields import path_gains, path_loss
+from calibray.measurements import SourceTable
 from calibray.paths import Kind, Paths, concatenate, take, take_links
 from calibray.scenes import read_scene
 from calibray.tracing.settings import Antenna, TraceSettings
@@ -215,3 +221,37 @@ def test_a_study_replays_the_rays_of_another_engine(tmp_path: Path) -> None:
     (tmp_path / "rays.parquet").unlink()
     with pytest.raises(InputError, match=r"engine\.rays = 'rays\.parquet': no such file"):
         cb.Study.from_content(study.content(), study.path).check_files()
+
+
+def test_files_that_would_fill_the_memory_or_lie_elsewhere_are_refused(
+    traced: Paths, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    columns = ("path", "point", "type", "x", "y", "z")
+    with h5py.File(tmp_path / "large.h5", "w") as content:
+        for name in columns:
+            content.create_dataset(name, (10**13,), chunks=(2**20,), dtype="f8", compression="gzip")
+    with pytest.raises(InputError, match=r"large\.h5: 457,763,672 MiB, must be at most 1024"):
+        read_ray_file(tmp_path / "large.h5")
+    cb.write_rays(traced, tmp_path / "rays.h5")
+    with h5py.File(tmp_path / "linked.h5", "w") as content:
+        for name in columns:
+            content[name] = h5py.ExternalLink("rays.h5", name)
+    with pytest.raises(InputError, match="no rows"):
+        read_ray_file(tmp_path / "linked.h5")
+    (tmp_path / "deep.json").write_text("[" * 10**6)
+    with pytest.raises(InputError, match="not a ray table"):
+        read_ray_file(tmp_path / "deep.json")
+    monkeypatch.setattr(files, "LARGEST_JSON", 100)
+    cb.write_rays(traced, tmp_path / "rays.json")
+    with pytest.raises(InputError, match="MiB of JSON"):
+        read_ray_file(tmp_path / "rays.json")
+
+
+def test_paths_of_a_link_with_other_ends_are_refused_although_the_study_has_the_link(
+    yard: Tracer, traced: Paths, rows: pd.DataFrame
+) -> None:
+    """Left out, the link would lack their power."""
+    first = rows["path"] == rows["path"][0]
+    rows.loc[first & (rows["type"] == "transmitter"), "z"] += 100.0
+    with pytest.raises(InputError, match="other ends than the other paths of its link"):
+        compile_rays(RayTable.of(SourceTable(rows)), RaySetting(yard.scene, FREQUENCY, None, LINKS))

@@ -81,12 +81,15 @@ def test_three_layouts_give_the_same_antenna(layout, tmp_path: Path) -> None:
     [
         ("GAIN 15.85", "GAIN none", r"line 3: GAIN 'none': must be a number"),
         ("GAIN 15.85", "GAIN 158.5", r"line 3: GAIN 160.65 must be -30 to 60; check the unit"),
+        ("GAIN 15.85", "GAIN 0x1", r"line 3: GAIN '0x1': must be a number"),
         ("GAIN 15.85\n", "", r"no line GAIN; add"),
         ("HORIZONTAL 360", "HORIZONTAL", r"line 5: HORIZONTAL ''.*number of its lines"),
         ("\n7.0 0.", "\nseven 0.", r"line 13: 'seven 0.*must be an angle"),
         ("\n0.0 0.6391\n", "\n0.0 -20\n", r"line 6: attenuation -20 must be -0.5 to 100; attenuations are positive"),
         ("VERTICAL 360", "VERTICAL 400", r"VERTICAL states 400 lines, but the file ends after 360"),
         ("VERTICAL 360", "HORIZONTAL 360", r"line 366: HORIZONTAL is given twice"),
+        ("HORIZONTAL 360", "HORIZONTAL \xb2", r"line 5: HORIZONTAL '.*number of its lines"),
+        ("HORIZONTAL 360", "HORIZONTAL 359", r"line 365: '359.*belongs to no cut"),
         ("VERTICAL 360", "VERTICAL 30", r"VERTICAL leaves 331 degrees without a value"),
     ],
 )  # fmt: skip
@@ -95,6 +98,6 @@ def test_malformed_files_are_refused_with_line_and_remedy(
 ) -> None:
     file, text = tmp_path / "sector.msi", classic()
     assert old in text
-    file.write_text(text.replace(old, new, 1))
+    file.write_text(text.replace(old, new, 1), encoding="latin-1")
     with pytest.raises(InputError, match=message):
         read_two_cuts(file)

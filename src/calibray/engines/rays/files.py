@@ -36,16 +36,12 @@ def read_ray_file(file: str | Path) -> SourceTable:
         raise InputError(f"{path}: no such file")
     try:
         frame = _read_json(path) if suffix == ".json" else _read_hdf5(path)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        RuntimeError,
-    ) as error:  # RecursionError is a RuntimeError
-        raise InputError(
-            f"{path}: not a ray table ({shortened(str(error))}); see docs/reference/ray-table.md"
-        ) from None
+    except InputError:
+        raise
+    # A text nested too deeply is a RuntimeError.
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        fault = shortened(str(error))
+        raise InputError(f"{path}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
     if frame.empty:
         raise InputError(f"{path}: holds no rows; a ray table needs at least one path")
     return SourceTable(frame, source=str(path))
