@@ -3,7 +3,8 @@
     python benchmarks/window_walk.py [town|flat|hill ...] [--pictures FOLDER]
 
 Each walk uploads the files of `examples/bring_your_own`, makes the scene, drafts the study, calibrates and predicts.
-Then `calibray run` calibrates the study file that the window wrote; the values must be the same to the digit.
+Then `calibray run` calibrates the study file that the window wrote; the values must be the same to the digit. Prints a
+table.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ TABLES = {
     "flat": ["flat/rss.csv", "flat/access_points.csv"],
     "hill": ["hill/power.csv", "hill/masts.csv", "hill/walk.gpx"],
 }
-FREQUENCY = {"town": None, "flat": "2.44e9", "hill": "2.1e9"}
+FREQUENCY = {"town": "3.6e9", "flat": "2.44e9", "hill": "2.1e9"}
 
 
 def walk(page, name: str) -> None:
@@ -37,8 +38,7 @@ def walk(page, name: str) -> None:
         choose(page, "Map or plan", "Height model of the ground", "ground.tif")
     press(page, "Map or plan", "Make the scene")
     add(page, "Measurements", [EXAMPLES / file for file in TABLES[name]])
-    if FREQUENCY[name]:
-        page.get_by_label("Carrier frequency [Hz]").fill(FREQUENCY[name])
+    page.get_by_label("Carrier frequency [Hz]").fill(FREQUENCY[name])
     press(page, "Measurements", "Draft the study", 120)
     press(page, "Run", "Calibrate", 600)
     step(page, "Result").locator("iframe").wait_for()
@@ -65,13 +65,17 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=list(MAPS))
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    print(
+        "| example | links | RMSE, calibrated [dB] | from an empty folder to a prediction | same by `calibray run` |"
+    )
+    print("|---|---|---|---|---|", flush=True)
     for name in options.names:
         with TemporaryDirectory() as folder, served(Path(folder)) as address, launched() as browser:
             start = time.monotonic()
             page = opened(browser, address)
             noted = page.noted  # type: ignore[attr-defined]
             walk(page, name)
-            print(f"{name}: {time.monotonic() - start:.0f} s from an empty folder to a prediction")
+            seconds = time.monotonic() - start
             assert not noted, noted
             if options.pictures:
                 options.pictures.mkdir(parents=True, exist_ok=True)
@@ -81,7 +85,15 @@ def main() -> None:
                         page.emulate_media(color_scheme=scheme)
                         page.wait_for_timeout(1500)
                         page.screenshot(path=options.pictures / f"{name}-{size}-{scheme}.png", full_page=True)
-            print(f"{name}: the same digits by calibray run: {same_digits(Path(folder))}")
+            record = json.loads((Path(folder) / "result" / "result.json").read_text())
+            cells = (
+                name,
+                record["links"]["calibrated_on"],
+                f"{record['fit']['rmse_db']:.2f}",
+                f"{seconds:.0f} s",
+            )
+            same = "to the digit" if same_digits(Path(folder)) else "no"
+            print(f"| {' | '.join(map(str, cells))} | {same} |", flush=True)
 
 
 if __name__ == "__main__":

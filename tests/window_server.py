@@ -61,10 +61,10 @@ def step(page, name: str):
 
 def add(page, name: str, files: list[Path]) -> None:
     """Upload files in a step, and wait until the page lists them."""
+    step(page, name).locator("input[type=file]").first.set_input_files(files)
     for file in files:
-        step(page, name).locator("input[type=file]").first.set_input_files(file)
         page.get_by_text(f"Added: {file.name}").wait_for()
-        page.wait_for_timeout(600)
+    page.wait_for_timeout(600)
 
 
 def press(page, name: str, button: str, seconds: float = 60) -> None:
@@ -72,13 +72,19 @@ def press(page, name: str, button: str, seconds: float = 60) -> None:
     activity = page.get_by_role("status", name="Last command")
     before = activity.inner_text() if activity.count() else ""
     step(page, name).get_by_role("button", name=button, exact=True).click()
-    for _ in range(int(seconds * 5)):
-        page.wait_for_timeout(200)
+    finished(page, seconds, before)
+
+
+def finished(page, seconds: float = 60, before: str = "") -> None:
+    """Wait until the last command, another one than before, is done."""
+    activity, text = page.get_by_role("status", name="Last command"), ""
+    for _ in range(int(seconds * 10)):
+        page.wait_for_timeout(100)
         text = activity.inner_text() if activity.count() else ""
-        if text != before and not text.startswith("running"):
+        if text not in ("", before) and not text.startswith("running"):
             assert text.startswith("done"), text
             return
-    raise AssertionError(f"{button} has not ended: {text}")
+    raise AssertionError(f"the command has not ended: {text}")
 
 
 def choose(page, name: str, label: str, option: str) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from window_server import CHROMIUM, SIZES, add, launched, opened, press, served, step
+from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, step
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")
 
@@ -25,13 +25,14 @@ HOSTILE = "<img src=x onerror='window.hostile=1'>"
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory):
-    """A folder that clicks have brought to a drafted study, and its page; the server is killed once in between."""
+    """A folder that clicks have brought to a drafted study, and its page; the server is killed during a command."""
     folder = tmp_path_factory.mktemp("study")
     with launched() as browser:
         with served(folder, kill=True) as address:
             page = opened(browser, address)
             add(page, "Map or plan", [EXAMPLES / "plan.csv"])
-            press(page, "Map or plan", "Make the scene")
+            step(page, "Map or plan").get_by_role("button", name="Make the scene").click()
+            page.get_by_text("running: calibray scene").wait_for()
         # A result whose study has hostile names, with a report that tries to leave its frame.
         (folder / "result").mkdir()
         record = json.loads(GOLDEN.read_text())
@@ -42,10 +43,11 @@ def walked(tmp_path_factory):
         (folder / "result" / "report.html").write_text(report)
         with served(folder) as address:
             page = opened(browser, address)
+            finished(page)
             add(page, "Measurements", [EXAMPLES / "rss.csv", EXAMPLES / "access_points.csv"])
             page.get_by_label("Carrier frequency [Hz]").fill("2.44e9")
             press(page, "Measurements", "Draft the study")
-            page.wait_for_timeout(3000)
+            page.locator("#plan[data-links='84']").wait_for()
             yield folder, page, browser, address
 
 
