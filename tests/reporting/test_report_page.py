@@ -396,8 +396,8 @@ def test_the_map_shows_footprints_at_their_positions(tmp_path, result):
 
 
 def test_faces_that_share_edges_have_one_outline():
-    assert [sorted(loop) for loop in _loops([[0, 1, 2], [0, 2, 3]])] == [[0, 1, 2, 3]]
-    assert sorted(map(len, _loops([[0, 1, 2], [3, 4, 5]]))) == [3, 3]
+    assert [sorted(loop) for loop in _loops(np.array([[0, 1, 2], [0, 2, 3]]))] == [[0, 1, 2, 3]]
+    assert sorted(map(len, _loops(np.array([[0, 1, 2], [3, 4, 5]])))) == [3, 3]
 
 
 def test_objects_that_cannot_be_read_are_listed(tmp_path):

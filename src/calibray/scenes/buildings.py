@@ -85,21 +85,26 @@ def footprints(
     chosen = np.flatnonzero(lying & inside & ~triangles.ground)
     turned = normal[chosen, 2] < 0
     face = np.where(turned[:, None, None], corners[chosen][:, ::-1], corners[chosen])
-    _, index = np.unique(face.reshape(-1, 3).round(3), axis=0, return_inverse=True)
-    point = dict(zip(index.reshape(-1).tolist(), face.reshape(-1, 3)[:, :2].tolist(), strict=True))
-    lines = (np.array([point[each] for each in loop]) for loop in _loops(index.reshape(-1, 3).tolist()))
-    return [each for each in lines if (each.max(axis=0) > least).all() and (each.min(axis=0) < most).all()]
+    points = face.reshape(-1, 3)
+    _, first, index = np.unique(points.round(3), axis=0, return_index=True, return_inverse=True)
+    place = points[first, :2]
+    if not (loops := _loops(index.reshape(-1, 3))):
+        return []
+    corner = place[np.concatenate(loops)]
+    start = np.cumsum([0, *map(len, loops[:-1])])
+    reached = (np.maximum.reduceat(corner, start) > least) & (np.minimum.reduceat(corner, start) < most)
+    lines = np.split(corner, start[1:])
+    return [line for line, kept in zip(lines, reached.all(axis=1), strict=True) if kept]
 
 
-def _loops(faces: list[list[int]]) -> list[list[int]]:
+def _loops(faces: NDArray[np.int64]) -> list[list[int]]:
     """Closed lines around faces that share edges; an edge that two faces share is inside."""
-    edges = {
-        edge for face in faces for edge in zip(face, face[1:] + face[:1], strict=True) if edge[0] != edge[1]
-    }
+    edges = np.unique(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=0)
+    size = int(faces.max(initial=0)) + 1
+    shared = np.isin(edges @ [1, size], edges @ [size, 1]) | (edges[:, 0] == edges[:, 1])
     following: dict[int, list[int]] = defaultdict(list)
-    for start, end in edges:
-        if (end, start) not in edges:
-            following[start].append(end)
+    for start, end in edges[~shared].tolist():
+        following[start].append(end)
     loops = []
     for start in list(following):
         while following[start]:

@@ -74,15 +74,19 @@ def build(desk: Desk) -> None:
 
     def loaded(event: events.GenericEventArguments) -> None:
         data: dict[str, Any] = event.args
-        desk.transmitters, desk.findings = data["transmitters"], data["findings"]
-        measurements.findings.refresh()
+        desk.transmitters = data["transmitters"]
         prediction.show.refresh()
+
+    def examined(event: events.GenericEventArguments) -> None:
+        desk.findings = event.args["findings"]
+        measurements.findings.refresh()
 
     desk.refresh = refresh
     ui.timer(0.1, reload_map, once=True)
     ui.on("picked", picked)
     ui.on("area", area_drawn)
     ui.on("plan", loaded)
+    ui.on("findings", examined)
     watched = {"job": desk.jobs.running()}
 
     def watch() -> None:

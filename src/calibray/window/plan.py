@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from calibray.errors import InputError
 from calibray.reporting.link_map import lay_out
 from calibray.scenes import read_scene, read_triangles
 from calibray.scenes.checks import SceneSurfaces
@@ -24,8 +23,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
 
     Returns:
         `west`, `north` [m] and `scale` [1/m] of the outlines, `buildings` and `walls` as data of SVG paths; `links`,
-        each with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m]; `findings`,
-        sentences.
+        each with x, y [m], path loss [dB] and 1 where it is suspicious; `transmitters`, x, y, z [m].
 
     Raises:
         InputError: The scene or the links cannot be read.
@@ -37,7 +35,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     else:
         study = links = None
         if scene is None or scene not in folder.scenes():
-            return {"links": [], "transmitters": [], "findings": []}
+            return {"links": [], "transmitters": []}
         source = str(folder.path / scene)
     triangles = read_triangles(read_scene(source, 1e9 if study is None else study.scene.frequency))
     corners = triangles.corners.reshape(-1, 3)
@@ -45,7 +43,7 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     layout = lay_out(np.concatenate([corners, *measured]), triangles)
     shown: dict[str, Any] = {
         "west": layout.west, "north": layout.north, "scale": layout.scale, "height": layout.height,
-        "buildings": layout.buildings, "walls": layout.walls, "links": [], "transmitters": [], "findings": [],
+        "buildings": layout.buildings, "walls": layout.walls, "links": [], "transmitters": [],
     }  # fmt: skip
     if study is None or links is None:
         return shown
@@ -56,9 +54,18 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
     shown["transmitters"] = np.unique(links.tx, axis=0).round(2).tolist()
-    try:
-        findings = [*examine(study, links), *count_unknowns(study, links)]
-        shown["findings"] = [f"{each.problem}: {each.remedy}" for each in findings]
-    except InputError as error:
-        shown["findings"] = [str(error)]
     return shown
+
+
+def findings(folder: StudyFolder) -> list[str]:
+    """What looks wrong with the links of a study, as sentences; none without a study.
+
+    Raises:
+        InputError: The scene or the links cannot be read.
+    """
+    if not folder.study_file.is_file():
+        return []
+    study = Study.load(folder.study_file)
+    links = study.measurements()
+    found = [*examine(study, links), *count_unknowns(study, links)]
+    return [f"{each.problem}: {each.remedy}" for each in found]

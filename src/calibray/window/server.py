@@ -17,7 +17,7 @@ from calibray.window.desk import Desk
 from calibray.window.folder import StudyFolder
 from calibray.window.guard import Guard
 from calibray.window.page import build
-from calibray.window.plan import plan
+from calibray.window.plan import findings, plan
 
 ASSETS = Path(__file__).parent / "assets"
 SHOWN = ("report.html", "map.png")
@@ -53,9 +53,17 @@ def application(desk: Desk) -> FastAPI:
     @app.get("/data/plan.json")
     async def data(scene: str | None = None) -> Response:
         try:
-            return JSONResponse(await run.io_bound(plan, desk.folder, scene))
+            return JSONResponse(await run.io_bound(plan, desk.folder, scene or desk.scene))
         except InputError as error:
-            return JSONResponse({"links": [], "transmitters": [], "findings": [str(error)]})
+            return JSONResponse({"links": [], "transmitters": [], "error": str(error)})
+
+    # Apart from the map, which need not wait for it.
+    @app.get("/data/findings.json")
+    async def suspicions() -> Response:
+        try:
+            return JSONResponse(await run.io_bound(findings, desk.folder))
+        except InputError as error:
+            return JSONResponse([str(error)])
 
     @app.get("/result/{name}/{file}")
     async def result_file(name: str, file: str) -> Response:
@@ -77,7 +85,7 @@ def application(desk: Desk) -> FastAPI:
 
     ui.run_with(
         app, root=lambda: build(desk), title=f"{desk.folder.path.name} · Calibray", dark=None, language="en-US",
-        show_welcome_message=False,
+        show_welcome_message=False, tailwind=False,
     )  # fmt: skip
     return app
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -116,11 +117,16 @@ class SceneSurfaces:
         above = height > position[index, 2] + CLEARANCE
         return np.bincount(index, minlength=len(position)), np.bincount(index[above], minlength=len(position))
 
+    @cached_property
+    def _tree(self) -> Any:
+        """An index over the faces that are not walls, in plan."""
+        shapely = library("shapely", "scenes")
+        return shapely.STRtree(shapely.polygons(self.level[:, :, :2]))
+
     def _surfaces(self, position: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """All surfaces at some positions: index of the position, and height of the surface [m]."""
         shapely = library("shapely", "scenes")
-        tree = shapely.STRtree(shapely.polygons(self.level[:, :, :2]))
-        index, face = tree.query(shapely.points(position[:, :2]), predicate="intersects")
+        index, face = self._tree.query(shapely.points(position[:, :2]), predicate="intersects")
         a, b, c = np.moveaxis(self.level[face], 1, 0)
         normal = np.cross(b - a, c - a)
         offset = position[index, :2] - a[:, :2]

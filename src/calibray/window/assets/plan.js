@@ -49,6 +49,7 @@ const plan = (() => {
       const [u, v] = toScreen(area.west, area.north), [s, t] = toScreen(area.east, area.south);
       context.strokeRect(u, v, s - u, t - v);
     }
+    canvas.dataset.links = data.links.length;
     canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
   }
   function ring(u, v, radius) { context.beginPath(); context.arc(u, v, radius, 0, 7); context.stroke(); }
@@ -128,6 +129,9 @@ const plan = (() => {
       event.preventDefault();
     });
   }
+  // Asked for while the page is still being built.
+  const ask = (scene) => fetch("/data/plan.json" + (scene ? "?scene=" + encodeURIComponent(scene) : ""));
+  let early = ask();
   async function load(scene) {
     canvas = document.getElementById("plan");
     if (!context) {
@@ -136,14 +140,16 @@ const plan = (() => {
       new ResizeObserver(size).observe(canvas);
       matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => setTimeout(redraw, 50));
     }
-    const answer = await fetch("/data/plan.json" + (scene ? "?scene=" + encodeURIComponent(scene) : ""));
+    const answer = await (early || ask(scene));
+    early = null;
     if (!answer.ok) return;
     data = await answer.json();
     buildings = data.scale ? new Path2D(data.buildings) : null;
     walls = data.scale ? new Path2D(data.walls) : null;
     size();
-    canvas.dataset.links = data.links.length;
-    emitEvent("plan", { transmitters: data.transmitters, findings: data.findings });
+    emitEvent("plan", { transmitters: data.transmitters });
+    const suspicions = data.error ? [data.error] : await (await fetch("/data/findings.json")).json();
+    emitEvent("findings", { findings: suspicions });
   }
   return {
     load, fit,
