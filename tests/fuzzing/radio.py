@@ -70,7 +70,7 @@ def section(rng: Random, found: World, folder: Path) -> Case:
     notes, bad = [], False
     names = [name for name in SECTIONS if name not in ("links", "parameters")] + ["links.tx_antenna"]
     for _ in range(rng.choice((1, 1, 2))):
-        name = rng.choice(names)
+        name = rng.choice([name for name in names if tree.get(name, True)])
         parent, key = (tree["links"], "tx_antenna") if "." in name else (tree, name)
         parent[key], note, senseless = edited(rng, parent[key])
         notes.append(f"{name}: {note}")
@@ -80,7 +80,7 @@ def section(rng: Random, found: World, folder: Path) -> Case:
         park.write_bytes(damage(rng, park.read_bytes()))
         notes.append("park.geojson: bytes")
     file.write_bytes(toml(tree).encode(errors="surrogatepass"))
-    named = ("study.toml", "park.geojson", "sector.msi", "links.csv", "region", "observables", "antennas")
+    named = ("study.toml", "park.geojson", "sector.msi", "links.", "region", "observables", "antennas")
     if runs:
         arguments = (file, "-o", folder / "out")
         return Case("section", f"run, {notes}", lambda: world.rmse(*arguments), bad, names=named, own=OWN)

@@ -198,6 +198,18 @@ def test_a_parquet_file_whose_rows_share_a_large_text_is_refused(tmp_path, monke
     assert pa.total_allocated_bytes() - before < 2**24
 
 
+def test_a_parquet_table_larger_than_its_limit_in_memory_is_refused(tmp_path, monkeypatch):
+    """160 MB in memory that the file declares as 10 kB, at a limit of 64 MB."""
+    column = pa.DictionaryArray.from_arrays(
+        pa.array(np.zeros(20_000, dtype=np.int32)), pa.array(["x" * 2**13])
+    )
+    path = tmp_path / "links.parquet"
+    pq.write_table(pa.table({"x": column}), path, store_schema=False, compression="zstd")
+    monkeypatch.setattr("calibray.measurements.table_files.LARGEST_TABLE", 2**26)
+    with pytest.raises(InputError, match=r"links\.parquet: takes more memory than it declares"):
+        read_table(path)
+
+
 def test_parquet_without_pyarrow_names_the_extra(tmp_path, monkeypatch):
     path = tmp_path / "links.parquet"
     path.write_bytes(b"")

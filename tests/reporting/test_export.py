@@ -199,8 +199,8 @@ def verify(scene, names, target):
 
 
 def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
-    file = write_scene(tmp_path / "in", {"ground": block((-9, -9, -1), (9, 9, 0))})
-    scene = read_scene(file, 2e9)
+    blocks = {"ground": block((-9, -9, -1), (9, 9, 0)), "wall": block((3, -3, 0), (4, 3, 3))}
+    scene = read_scene(write_scene(tmp_path / "in", blocks), 2e9)
     target = tmp_path / "out.xml"
     export_scene(scene, scene.materials, target)
     verify(scene, {"stone": "stone"}, target)
@@ -218,6 +218,12 @@ def test_an_export_that_sionna_loads_otherwise_is_refused(tmp_path):
             "</shape>",
             '<transform name="to_world"><scale value="2"/></transform></shape>',
             "holds another surface of material 'stone'",
+        ),
+        # The same bounds and area, with the wall on the other side.
+        (
+            "</shape>",
+            '<transform name="to_world"><scale x="-1"/></transform></shape>',
+            "path loss differs",
         ),
     ):
         assert old in sound

@@ -205,7 +205,7 @@ def test_types_become_materials(tmp_path):
     assert {name: material.thickness for name, material in materials.items()} == {
         "brick_wall_120mm": 0.12, "brick_wall_100mm": 0.1, "drywall": 0.09, "floor": 0.2,
     }  # fmt: skip
-    with pytest.raises(InputError, match="type 'brik': has no material; did you mean 'brick'"):
+    with pytest.raises(InputError, match="floor plan: type 'brik' has no material; did you mean 'brick'"):
         make_plan_scene([line(0, 0, 1, 0, "brik")], tmp_path)
 
 

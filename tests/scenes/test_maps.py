@@ -447,8 +447,10 @@ def test_an_undeclared_gap_is_no_height(tmp_path, gap):
         read_terrain(file, Frame.utm(11.5755, 48.1374), (-100, -100, 100, 100))
 
 
-@pytest.mark.parametrize("tiled", [True, False])
-def test_a_height_model_of_enormous_size_is_refused_before_it_is_read(tmp_path, tiled):
+@pytest.mark.parametrize(
+    ("tiled", "reach", "message"), [(True, 400, "more than 25,000,000"), (False, 4, "is stored in blocks of")]
+)
+def test_a_height_model_of_enormous_size_is_refused_before_it_is_read(tmp_path, tiled, reach, message):
     """A file of some kilobytes that declares 10^10 heights."""
     origin = Frame.utm(11.5755, 48.1374)
     with rasterio.open(
@@ -457,8 +459,15 @@ def test_a_height_model_of_enormous_size_is_refused_before_it_is_read(tmp_path, 
         sparse_ok=True, compress="deflate", **({"tiled": True} if tiled else {"blockysize": 100_000}),
     ):  # fmt: skip
         pass
-    with pytest.raises(InputError, match=r"more than 25,000,000|is stored in blocks of"):
-        read_terrain(tmp_path / "dem.tif", origin, (-400, -400, 400, 400))
+    with pytest.raises(InputError, match=message):
+        read_terrain(tmp_path / "dem.tif", origin, (-reach, -reach, reach, reach))
+
+
+def test_a_file_that_another_driver_takes_is_refused(tmp_path):
+    """GDAL chooses its driver by content and by name; this file has the first bytes of another format."""
+    (tmp_path / "town.csv").write_bytes(b"fgb\x03fgb\0" + b"\0" * 100 + b"\nid,h\n1,2\n")
+    with pytest.raises(InputError, match=r"town\.csv: is damaged; give GeoJSON"):
+        read_footprints(tmp_path / "town.csv", 5.0)
 
 
 def test_a_vector_file_that_declares_more_than_fits_into_memory_is_refused(tmp_path, monkeypatch):

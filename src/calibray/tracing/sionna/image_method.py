@@ -220,7 +220,7 @@ class Meshes:
     def triangles(self, shape: NDArray[np.int64], primitive: NDArray[np.int64]) -> NDArray[np.int64]:
         """Numbers within the scene [...] of triangles by their shapes and numbers within the shapes; 0 for no shape."""
         distinct, position = np.unique(shape, return_inverse=True)
-        starts = np.array([self._first.get(key, -1) for key in distinct.tolist()])
+        starts = np.array([self._first.get(key, -1) for key in distinct.tolist()], dtype=np.int64)
         first = starts[position.reshape(shape.shape)]
         return np.where(first >= 0, first + primitive, 0)
 
