@@ -12,7 +12,7 @@ import shapely
 import calibray as cb
 from calibray.errors import InputError
 from calibray.scenes import has_copied_meshes, read_mesh, read_scene
-from calibray.scenes.authoring import Palette, SurfaceMaterial, make_scene
+from calibray.scenes.authoring import Palette, Segment, SurfaceMaterial, make_plan_scene, make_scene
 from calibray.scenes.checks import check_scene
 from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.sionna import Tracer
@@ -24,6 +24,8 @@ OFFSETS = [(10, -10, 0), (10_000, 0, 0), (0, 700_000, 120), (690_000, 5_330_000,
 IDS = ["10 m", "10 km", "700 km", "UTM"]
 GROUND = [[(-60.0, -60.0, 0.0), (60.0, -60.0, 0.0), (60.0, 60.0, 0.0), (-60.0, 60.0, 0.0)]]
 MAST = (-30.0, -28.0, 12.0)
+DESK = (1.3, 1.2, 1.5)
+ROOMS = [(3.1, 5.2, 1.1), (6.3, 2.2, 1.5), (8.9, 6.4, 1.2), (10.7, 1.4, 1.9), (2.2, 7.7, 0.8)]
 STREET = [(-20.0, 3.0, 1.5), (1.5, 7.0, 1.5), (22.0, 3.3, 1.5), (27.0, 31.0, 1.5), (-38.0, 25.0, 1.5)]
 
 
@@ -39,7 +41,10 @@ def town(folder: Path) -> Path:
 
 
 def flat(folder: Path) -> Path:
-    return write_scene(folder, {"ground": GROUND})
+    """Four rooms of 12 m by 9 m, made from a floor plan."""
+    lines = [(0, 0, 12, 0), (12, 0, 12, 9), (12, 9, 0, 9), (0, 9, 0, 0), (5, 0, 5, 9), (0, 4, 12, 4)]
+    walls = [Segment((a, b), (c, d), "brick", 0.0, 2.7, 0.2) for a, b, c, d in lines]
+    return make_plan_scene(walls, folder).path
 
 
 def corner(folder: Path) -> Path:
@@ -48,9 +53,9 @@ def corner(folder: Path) -> Path:
 
 
 SCENES = {
-    "town": (town, {"max_depth": 2, "diffraction": True}),
-    "flat": (flat, {"max_depth": 1}),
-    "corner": (corner, {"max_depth": 2, "diffraction": True}),
+    "town": (town, MAST, STREET, {"max_depth": 2, "diffraction": True}),
+    "flat": (flat, DESK, ROOMS, {"max_depth": 2, "refraction": True}),
+    "corner": (corner, MAST, STREET, {"max_depth": 2, "diffraction": True}),
 }
 
 
@@ -76,27 +81,30 @@ def write_moved(scene: Path, offset: tuple[float, ...], folder: Path, how: str) 
     return folder / "scene.xml"
 
 
-def trace(scene: Path, offset: tuple[float, ...], settings: dict) -> cb.Paths:
-    links = SimpleNamespace(tx=np.tile(MAST, (len(STREET), 1)) + offset, rx=np.array(STREET) + offset)
-    return cb.trace(scene, links, frequency=FREQUENCY, samples=50_000, **settings)
+def trace(case: SimpleNamespace, scene: Path, offset: tuple[float, ...]) -> cb.Paths:
+    links = SimpleNamespace(tx=np.tile(case.tx, (len(case.rx), 1)) + offset, rx=np.array(case.rx) + offset)
+    return cb.trace(scene, links, frequency=FREQUENCY, samples=50_000, **case.settings)
 
 
 @pytest.fixture(scope="module", params=SCENES)
 def original(request, tmp_path_factory) -> SimpleNamespace:
-    make, settings = SCENES[request.param]
-    scene = make(tmp_path_factory.mktemp(request.param))
-    return SimpleNamespace(scene=scene, settings=settings, paths=trace(scene, (0, 0, 0), settings))
+    make, tx, rx, settings = SCENES[request.param]
+    case = SimpleNamespace(
+        scene=make(tmp_path_factory.mktemp(request.param)), tx=tx, rx=rx, settings=settings
+    )
+    case.paths = trace(case, case.scene, (0, 0, 0))
+    return case
 
 
 @pytest.mark.parametrize("offset", OFFSETS, ids=IDS)
 @pytest.mark.parametrize("how", ["vertices", "transform"])
 def test_a_moved_scene_has_the_same_paths_and_path_loss(original, offset, how, tmp_path):
     moved_scene = write_moved(original.scene, offset, tmp_path / "moved", how)
-    moved = trace(moved_scene, offset, original.settings)
+    moved = trace(original, moved_scene, offset)
     assert np.bincount(moved.link).tolist() == np.bincount(original.paths.link).tolist()
     np.testing.assert_allclose(cb.path_loss(moved), cb.path_loss(original.paths), atol=1e-3)
     # Vertices and positions are those of the moved scene.
-    assert (moved.rx_position == np.array(STREET) + offset).all()
+    assert (moved.rx_position == np.array(original.rx) + offset).all()
     lines = [np.lexsort(np.rint(100 * vertex).T) for vertex in (moved.vertex - offset, original.paths.vertex)]
     np.testing.assert_allclose((moved.vertex - offset)[lines[0]], original.paths.vertex[lines[1]], atol=2e-3)
 
