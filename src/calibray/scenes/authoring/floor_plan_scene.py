@@ -133,8 +133,8 @@ def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) 
         else:
             names = sorted({*types, *ITU_NAMES})
             raise InputError(
-                f"floor plan: type {sheet.kind!r} has no material; {did_you_mean(sheet.kind, names)} (or give it one with "
-                "--material)"
+                f"floor plan: type {sheet.kind!r} has no material; {did_you_mean(sheet.kind, names)} (or give it one "
+                "with --material)"
             )
         materials.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
     thicknesses: dict[str, set[float]] = defaultdict(set)
