@@ -63,9 +63,10 @@ def _bars(console: Console) -> Iterator[Progress]:
                 bars.remove_task(tasks.pop(STARTING))
             # Without a total and with nothing done, the stage is a single step.
             shown_total = 1 if total is None and not done else total
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=shown_total, completed=done)
-            bars.update(tasks[stage], completed=done, total=shown_total)
+            name = stage.partition(": ")[0]
+            if name not in tasks:
+                tasks[name] = bars.add_task(stage, total=shown_total, completed=done)
+            bars.update(tasks[name], description=stage, completed=done, total=shown_total)
 
         yield report
 
@@ -82,9 +83,10 @@ class _State:
 
     def report(self, stage: str, done: int, total: int | None) -> None:
         with self.lock:
-            if stage != self.stage or done < self.done:
-                self.stage, self.since = stage, time.monotonic()
-            self.done, self.total = done, total
+            name = stage.partition(": ")[0]
+            if name != self.stage.partition(": ")[0] or done < self.done:
+                self.since = time.monotonic()
+            self.stage, self.done, self.total = stage, done, total
 
     def line(self) -> str:
         with self.lock:
@@ -117,8 +119,11 @@ def line(stage: str, done: int, total: int | None, seconds: float) -> str:
         'tracing 30/120, 25 %, 2/s, 15 s, about 45 s left'
         >>> line("starting", 0, None, 5.0)
         'starting, 5 s'
+        >>> line("calibrating: best RMSE 3.10 dB", 50, 100, 5.0)
+        'calibrating 50/100, 50 %, 10/s, 5 s, about 5 s left, best RMSE 3.10 dB'
     """
-    parts = [stage if total is None and not done else f"{stage} {done}" + (f"/{total}" if total else "")]
+    name, _, detail = stage.partition(": ")
+    parts = [name if total is None and not done else f"{name} {done}" + (f"/{total}" if total else "")]
     if total:
         parts.append(f"{done / total:.0%}".replace("%", " %"))
     rate = done / seconds if seconds > 0 else 0.0
@@ -127,4 +132,4 @@ def line(stage: str, done: int, total: int | None, seconds: float) -> str:
     parts.append(f"{seconds:.0f} s")
     if total and rate and done < total:
         parts.append(f"about {(total - done) / rate:.0f} s left")
-    return ", ".join(parts)
+    return ", ".join([*parts, detail] if detail else parts)

@@ -164,7 +164,8 @@ def search(problem: Problem, optimizer: Optimizer, progress: Progress | None = N
         if not problem.differentiable:
             trail.modelled += list(evaluation.modelled)
         if progress is not None:
-            progress("calibrating", len(trail.rmse_db), optimizer.budget)
+            stage = f"calibrating: best RMSE {trail.best_rmse_db:.2f} dB"
+            progress(stage, len(trail.rmse_db), optimizer.budget)
     trail.ledger_hits = _hits(engine) - hits
     # Calls from the ledger count as well: a restarted run then reports the same cost as an uninterrupted one.
     trail.rt_calls = engine.calls - calls + trail.ledger_hits

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount; None if unknown."""
+"""Called with the stage ("tracing", "calibrating", ...), the amount done, and the total amount; None if unknown.
+
+What a stage has found so far follows its name after a colon: "calibrating: best RMSE 3.10 dB".
+"""
 
 
 def with_stage(progress: Progress | None, stage: str) -> Progress | None:

@@ -8,6 +8,7 @@ from typing import Any, Final
 from nicegui import events, ui
 
 from calibray.window.desk import Desk
+from calibray.window.stages import Stage, stages
 from calibray.window.steps import measurements, parameters, prediction, result, run, scene
 
 STEPS: Final = (
@@ -91,7 +92,8 @@ def build(desk: Desk) -> None:
 
     def watch() -> None:
         job = desk.jobs.running()
-        if job is not None or watched["job"] is not None:
+        # Only after a change: a button that is made again loses the keyboard.
+        if job != watched["job"]:
             activity.refresh()
         ended = watched["job"] is not None and job is None
         watched["job"] = job
@@ -116,9 +118,27 @@ def activity(desk: Desk) -> None:
     job = jobs[0]
     with ui.element("div").classes("activity").props('role=status aria-label="Last command"'):
         ui.label(f"{job.state}: {job.command}").classes("command").mark("activity")
-        lines = [line for line in job.log.splitlines() if line.strip()]
         if job.state == "running":
-            ui.linear_progress(show_value=False).props('indeterminate aria-label="A command runs"')
-        ui.label("\n".join(lines[-6:])).classes("log")
-        if job.state == "running":
+            progress(stages(job.log))
             ui.button("Stop", on_click=lambda: desk.jobs.stop(job)).props("outline dense color=negative")
+        else:
+            lines = [line for line in job.log.splitlines() if line.strip()]
+            ui.label("\n".join(lines[-6:])).classes("log")
+
+
+def progress(shown: list[Stage]) -> None:
+    """The stages of a running command: those of before, how much of the last is done, and the best value so far."""
+    for stage in shown[:-1]:
+        ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.found)))).classes("quiet")
+    last = shown[-1] if shown else None
+    share = None if last is None else last.share
+    bar = ui.linear_progress(share or 0.0, show_value=False)
+    bar.props('aria-label="Progress of the stage"' + (" indeterminate" if share is None else ""))
+    if last is None:
+        ui.label("starting").classes("stage")
+        return
+    done = "" if share is None else f"{100 * share:.0f} %"
+    left = "" if last.left is None else f"about {last.left} s left"
+    ui.label(" · ".join(filter(None, (last.name, done, f"{last.seconds} s", left)))).classes("stage")
+    if last.found:
+        ui.label(last.found).classes("best")

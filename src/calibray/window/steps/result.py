@@ -6,8 +6,9 @@ import json
 from typing import Any
 from urllib.parse import quote
 
-from nicegui import ui
+from nicegui import run, ui
 
+from calibray.window.compared import better, changes
 from calibray.window.desk import Desk
 
 NONE = "-"
@@ -22,6 +23,9 @@ def show(desk: Desk) -> None:
         return
     with desk.messages():
         _table(desk, names)
+    if len(names) > 1:
+        with desk.messages():
+            _comparison(desk, names)
     chosen = ui.select(names, label="Report", value=names[-1]).classes("wide")
     frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="Report"')
 
@@ -39,22 +43,29 @@ def show(desk: Desk) -> None:
 
 
 def _table(desk: Desk, names: list[str]) -> None:
-    """Values and errors, one column a result; what differs from the first result is bold."""
-    columns = [_facts(desk, name) for name in names]
-    rows = list(dict.fromkeys(key for column in columns for key in column))
+    """Values and errors, one column a result."""
+    columns = {name: _facts(desk, name) for name in names}
+    rows = dict.fromkeys(key for column in columns.values() for key in column)
+    _facts_table(
+        names, {row: {name: column.get(row, NONE) for name, column in columns.items()} for row in rows}
+    )
+
+
+def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
+    """Rows of texts, one column a result; what differs from the first result is bold."""
     with ui.element("div").classes("scrolled"), ui.element("table").classes("facts"):
         with ui.element("tr"):
             for text in ("", *names):
                 with ui.element("th").props("scope=col"):
                     ui.label(text)
-        for row in rows:
+        for row, texts in rows.items():
             with ui.element("tr"):
                 with ui.element("th").props("scope=row"):
                     ui.label(row)
-                for column in columns:
+                for name in names:
                     with ui.element("td"):
-                        label = ui.label(column.get(row, NONE))
-                        if column.get(row) != columns[0].get(row):
+                        label = ui.label(texts[name])
+                        if texts[name] != texts[names[0]]:
                             label.classes("differs")
 
 
@@ -72,22 +83,35 @@ def _facts(desk: Desk, name: str) -> dict[str, str]:
         interval = _inside(record, "uncertainty", "intervals", parameter) or {}
         ends = f" ({_number(interval.get('lower'))} to {_number(interval.get('upper'))})" if interval else ""
         facts[parameter] = f"{_number(value)}{ends}, {interval.get('verdict', NONE)}"
-    for key, value in _differences(
-        record.get("study"), desk.folder.result(desk.folder.results()[0]).get("study")
-    ):
-        facts[f"Study: {key}"] = value
     return facts
 
 
-def _differences(study: Any, first: Any) -> list[tuple[str, str]]:
-    """Settings of a study that differ from those of the first one."""
-    if not (isinstance(study, dict) and isinstance(first, dict)):
-        return []
-    return [
-        (key, json.dumps(study.get(key))[:300])
-        for key in study
-        if key != "links" and study.get(key) != first.get(key)
-    ]
+def _comparison(desk: Desk, names: list[str]) -> None:
+    """What differs between the studies, and which result predicts better."""
+    changed = changes([desk.folder.result(name).get("study") or {} for name in names])
+    ui.label("Differences between the studies").classes("title")
+    if changed:
+        rows = [
+            {name: _text(value) for name, value in zip(names, values, strict=True)}
+            for values in changed.values()
+        ]
+        _facts_table(names, dict(zip(changed, rows, strict=True)))
+    else:
+        ui.label("None: the studies have the same settings.").classes("quiet")
+    with ui.row():
+        first = ui.select(names, label="Compare", value=names[0])
+        second = ui.select(names, label="with", value=names[-1])
+
+    async def judge() -> None:
+        with desk.messages():
+            verdict.set_text(await run.io_bound(better, first.value, second.value, desk.folder.path))
+
+    ui.button("Which predicts better?", on_click=judge).props("outline")
+    verdict = ui.label().classes("predicted").props("role=status")
+
+
+def _text(value: Any) -> str:
+    return NONE if value is None else json.dumps(value, ensure_ascii=False)[:300]
 
 
 def _inside(record: Any, *keys: str) -> Any:

@@ -1,0 +1,73 @@
+"""Results side by side: what changed in the study, and which predicts better by blocks."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calibray.result.held_out import HeldOutErrors
+from calibray.window import compared
+
+LINKS, BLOCKS = 200, 4
+
+
+def held_out(spread_db: float, seed: int) -> HeldOutErrors:
+    random = np.random.default_rng(seed)
+    x = np.linspace(0.0, 400.0, LINKS)
+    return HeldOutErrors(
+        labels=tuple("abcd"),
+        block=np.arange(LINKS) // (LINKS // BLOCKS),
+        errors={"calibrated": spread_db * random.standard_normal(LINKS)},
+        position=np.stack([x, 0 * x, 0 * x], axis=1),
+        measured_db=90 + x / 100,
+        level=0.9,
+    )
+
+
+@pytest.fixture
+def results(monkeypatch, tmp_path):
+    """Results with planted held-out errors, by the name of their folder."""
+    planted: dict[str, HeldOutErrors | None] = {}
+
+    def read(folder, *, allow_changed_inputs):
+        model = SimpleNamespace(model=SimpleNamespace(name="calibrated"))
+        return {"held_out": planted[folder.name], "prediction": model}
+
+    monkeypatch.setattr(compared, "read", read)
+    return planted, tmp_path
+
+
+def test_the_result_of_less_error_in_the_blocks_predicts_better_in_either_order(results):
+    planted, folder = results
+    planted.update(old=held_out(6.0, 1), new=held_out(2.0, 2))
+    said = compared.better("old", "new", folder)
+    assert said == compared.better("new", "old", folder)
+    assert said.startswith("new predicts better than old: RMSE ")
+    assert "on 200 held-out links" in said
+    assert said.endswith("lower in 4 of 4 blocks.")
+
+
+def test_equal_errors_are_not_called_better(results):
+    planted, folder = results
+    planted.update(old=held_out(3.0, 1), new=held_out(3.0, 2))
+    assert "predicts not clearly better" in compared.better("old", "new", folder)
+
+
+def test_results_without_the_same_blocks_are_not_compared(results):
+    planted, folder = results
+    planted.update(old=held_out(3.0, 1), new=None)
+    assert compared.better("old", "new", folder).startswith("new: not validated")
+    other = held_out(3.0, 2)
+    planted["new"] = HeldOutErrors(
+        other.labels, other.block[::-1], other.errors, other.position, other.measured_db, other.level
+    )
+    assert "other links or blocks" in compared.better("old", "new", folder)
+
+
+def test_the_changes_of_a_study_are_its_settings_that_differ():
+    first = {"scene": {"frequency": 2e9}, "trace": {"max_depth": 3}, "links": {"tx": [0, 0, 9]}}
+    second = {"scene": {"frequency": 2e9}, "trace": {"max_depth": 5}, "links": {"tx": [0, 0, 9]}, "seed": 1}
+    assert compared.changes([first, second]) == {"trace.max_depth": [3, 5], "seed": [None, 1]}
+    assert compared.changes([first, first]) == {}
