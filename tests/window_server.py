@@ -40,7 +40,9 @@ def launched():
 def opened(browser, address: str, size: str = "desktop", scheme: str = "light"):
     """A page on the window; `page.noted` lists errors and requests that leave the server."""
     width, height = SIZES[size]
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme=scheme, reduced_motion="reduce"
+    )
     page = context.new_page()
     page.noted = []
     origin = address.partition("?")[0]

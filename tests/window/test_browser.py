@@ -6,20 +6,27 @@ on, through a calibration.
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from axe_playwright_python.sync_playwright import Axe
 
+from calibray.scenes import read_scene, read_triangles
+from calibray.window.folder import StudyFolder
+from calibray.window.solid import RADIUS, solid
 from window_server import CHROMIUM, SIZES, add, finished, launched, opened, press, served, step
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium; apt-get install chromium")
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "bring_your_own" / "flat"
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "result" / "result.json"
+RULES = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21aa"]}, "iframes": False}
 HOSTILE = "<img src=x onerror='window.hostile=1'>"
 
 
@@ -73,6 +80,31 @@ def test_the_links_are_on_the_map_with_their_reasons_beside(walked):
     )
 
 
+def test_the_scene_is_shown_in_three_dimensions_by_its_materials(walked):
+    folder, page, _, address = walked
+    page.get_by_role("button", name="Show in 3-D").click()
+    dialog = page.get_by_role("dialog")
+    materials = ["brick_wall", "plasterboard_wall", "floor", "ceiling"]
+    dialog.get_by_role("checkbox", name="ceiling").wait_for()
+    assert [box.inner_text() for box in dialog.get_by_role("checkbox").all()] == materials
+    shown, area = solid(StudyFolder(folder), None), 0.0
+    for number, name in enumerate(materials):
+        answer = page.request.get(f"{address.partition('/?')[0]}/data/solid/{number}.stl")
+        mesh = trimesh.load(io.BytesIO(answer.body()), file_type="stl")
+        assert len(mesh.faces) == len(shown.meshes[name])
+        area += mesh.area
+    # The floor of the flat is 10 m by 7 m and it is 3 m high: its half diagonal becomes the radius.
+    scale = 2 * RADIUS / np.linalg.norm([10.0, 7.0, 3.0])
+    triangles = read_triangles(read_scene(str(folder / "scene" / "scene.xml"), 2.44e9))
+    assert area == pytest.approx(np.linalg.norm(triangles.normal, axis=1).sum() * scale**2, rel=1e-5)
+    assert np.linalg.norm(shown.meshes["floor"].max(axis=(0, 1))) <= RADIUS * 1.001
+    # Before the backdrop of a dialog, axe takes the backdrop for the background of the texts.
+    rules = {**RULES, "rules": {"color-contrast": {"enabled": False}}}
+    assert not Axe().run(page, options=rules).response["violations"]
+    page.keyboard.press("Escape")
+    dialog.wait_for(state="hidden")
+
+
 def test_nothing_is_asked_of_other_machines_and_hostile_names_are_text(walked):
     _, page, _, _ = walked
     assert page.noted == []
@@ -109,8 +141,7 @@ def test_contrast_names_and_roles_meet_wcag_aa(walked, size, scheme):
     page.emulate_media(color_scheme=scheme)
     page.wait_for_timeout(800)
     assert page.evaluate("document.documentElement.scrollWidth") == SIZES[size][0]
-    rules = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21aa"]}, "iframes": False}
-    found = Axe().run(page, options=rules).response["violations"]
+    found = Axe().run(page, options=RULES).response["violations"]
     assert not found, "\n".join(
         f"{each['id']}: {node['html'][:300]}" for each in found for node in each["nodes"]
     )

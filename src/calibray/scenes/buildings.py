@@ -92,9 +92,11 @@ def footprints(
         return []
     corner = place[np.concatenate(loops)]
     start = np.cumsum([0, *map(len, loops[:-1])])
-    reached = (np.maximum.reduceat(corner, start) > least) & (np.minimum.reduceat(corner, start) < most)
+    reached = np.all(
+        (np.maximum.reduceat(corner, start) > least) & (np.minimum.reduceat(corner, start) < most), axis=1
+    )
     lines = np.split(corner, start[1:])
-    return [line for line, kept in zip(lines, reached.all(axis=1), strict=True) if kept]
+    return [lines[number] for number in np.flatnonzero(reached)]
 
 
 def _loops(faces: NDArray[np.int64]) -> list[list[int]]:

@@ -56,12 +56,12 @@ def better(first: str, second: str, folder: Path) -> str:
     if missing := [name for name, each in found.items() if each is None]:
         return f"{' and '.join(missing)}: not validated, so nothing shows which result predicts better. Validate both."
     (model, one), (other_model, other) = (each for each in found.values() if each is not None)
-    same = [(one.block, other.block), (one.position, other.position), (one.measured_db, other.measured_db)]
+    same = [(one.position, other.position), (one.measured_db, other.measured_db)]
     if not all(np.array_equal(*pair) for pair in same):
-        return (
-            f"{first} and {second} were validated on other links or blocks. Validate both by the same blocks."
-        )
-    judged = one.block >= 0
+        return f"{first} and {second} were validated on other links, so nothing shows which predicts better."
+    judged = (one.block >= 0) & (other.block >= 0)
+    if not judged.any():
+        return f"{first} and {second} have no held-out link in common. Validate both by the same blocks."
     errors = {first: one.errors[model][judged], second: other.errors[other_model][judged]}
     best, worst = sorted(errors, key=lambda name: float(np.mean(errors[name] ** 2)))
     judgement = compare(errors[best], {worst: errors[worst]}, one.position[judged])
@@ -70,9 +70,10 @@ def better(first: str, second: str, folder: Path) -> str:
         for rows in (one.block[judged] == block for block in np.unique(one.block[judged]))
     )
     certainty = "" if judgement.error_db is None else f", standard error {judgement.error_db:.2f} dB"
+    blocks = len(np.unique(one.block[judged]))
     clearly = "" if judgement.helped else "not clearly "
     return (
         f"{best} predicts {clearly}better than {worst}: RMSE {judgement.rmse_db:.2f} against "
-        f" {judgement.baseline_rmse_db:.2f} dB on {judgement.links} held-out links (difference "
-        f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {len(np.unique(one.block[judged]))} blocks."
+        f"{judgement.baseline_rmse_db:.2f} dB on {judgement.links} held-out links (difference "
+        f"{judgement.gain_db:.2f} dB{certainty}); lower in {lower} of {blocks} blocks of {first}."
     )

@@ -11,6 +11,7 @@ from nicegui import ui
 from calibray.errors import InputError
 from calibray.window.folder import StudyFolder
 from calibray.window.jobs import Jobs
+from calibray.window.solid import Solid
 
 
 @dataclass
@@ -24,6 +25,7 @@ class Desk:
         area: The chosen area: west, south, east, north [m].
         transmitters: Transmitters of the measured links, x, y, z [m].
         findings: Suspicions about the links.
+        solid: The scene that is shown in 3-D.
         refresh: Shows all steps again.
     """
 
@@ -33,6 +35,7 @@ class Desk:
     area: tuple[float, float, float, float] | None = None
     transmitters: list[list[float]] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
+    solid: Solid | None = None
     refresh: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:

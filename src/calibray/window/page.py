@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from nicegui import events, ui
 
+from calibray.window import view_3d
 from calibray.window.desk import Desk
 from calibray.window.stages import Stage, stages
 from calibray.window.steps import measurements, parameters, prediction, result, run, scene
@@ -42,6 +43,7 @@ def build(desk: Desk) -> None:
                 ui.button("Draw an area", on_click=lambda: ui.run_javascript("plan.drawArea()")).props(
                     "outline dense"
                 )
+                view_3d.button(desk)
             ui.label("Drag to move, wheel to zoom, click to choose a place.").classes("quiet")
             place = ui.label().classes("quiet").mark("place")
             activity(desk)

@@ -28,15 +28,10 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     Raises:
         InputError: The scene or the links cannot be read.
     """
-    if folder.study_file.is_file():
-        study = Study.load(folder.study_file)
-        links = study.measurements()
-        source = study.scene_source
-    else:
-        study = links = None
-        if scene is None or scene not in folder.scenes():
-            return {"links": [], "transmitters": []}
-        source = str(folder.path / scene)
+    source, study = opened(folder, scene)
+    if source is None:
+        return {"links": [], "transmitters": []}
+    links = None if study is None else study.measurements()
     triangles = read_triangles(read_scene(source, 1e9 if study is None else study.scene.frequency))
     corners = triangles.corners.reshape(-1, 3)
     measured = [] if links is None else [links.tx, links.rx]
@@ -55,6 +50,20 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
     shown["transmitters"] = np.unique(links.tx, axis=0).round(2).tolist()
     return shown
+
+
+def opened(folder: StudyFolder, scene: str | None) -> tuple[str | None, Study | None]:
+    """The scene of a folder and its study: the study's scene, or the chosen one as long as there is no study.
+
+    Raises:
+        InputError: The study cannot be read.
+    """
+    if folder.study_file.is_file():
+        study = Study.load(folder.study_file)
+        return study.scene_source, study
+    if scene is None or scene not in folder.scenes():
+        return None, None
+    return str(folder.path / scene), None
 
 
 def findings(folder: StudyFolder) -> list[str]:

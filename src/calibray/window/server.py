@@ -65,6 +65,13 @@ def application(desk: Desk) -> FastAPI:
         except InputError as error:
             return JSONResponse([str(error)])
 
+    @app.get("/data/solid/{number}.stl")
+    async def mesh(number: int) -> Response:
+        shown = desk.solid
+        if shown is None or not 0 <= number < len(shown.meshes):
+            return Response("no such mesh", 404)
+        return Response(shown.stl(list(shown.meshes)[number]), media_type="model/stl")
+
     @app.get("/result/{name}/{file}")
     async def result_file(name: str, file: str) -> Response:
         if name not in desk.folder.results() or file not in SHOWN:

@@ -53,7 +53,7 @@ def _table(desk: Desk, names: list[str]) -> None:
 
 def _facts_table(names: list[str], rows: dict[str, dict[str, str]]) -> None:
     """Rows of texts, one column a result; what differs from the first result is bold."""
-    with ui.element("div").classes("scrolled"), ui.element("table").classes("facts"):
+    with ui.element("div").classes("scrolled").props("tabindex=0"), ui.element("table").classes("facts"):
         with ui.element("tr"):
             for text in ("", *names):
                 with ui.element("th").props("scope=col"):
@@ -104,7 +104,7 @@ def _comparison(desk: Desk, names: list[str]) -> None:
 
     async def judge() -> None:
         with desk.messages():
-            verdict.set_text(await run.io_bound(better, first.value, second.value, desk.folder.path))
+            verdict.text = await run.io_bound(better, first.value, second.value, desk.folder.path) or ""
 
     ui.button("Which predicts better?", on_click=judge).props("outline")
     verdict = ui.label().classes("predicted").props("role=status")

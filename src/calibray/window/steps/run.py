@@ -18,7 +18,7 @@ def show(desk: Desk) -> None:
     """Draw the step."""
     if desk.folder.study_file.is_file():
         with ui.row():
-            out = ui.input("Name of the result", value="result").props("outlined dense")
+            out = ui.input("Name of the result", value="result")
             blocks = ui.number("Blocks to validate by", value=4, min=2, max=100, step=1, format="%d")
 
         def start(words: list[object]) -> None:

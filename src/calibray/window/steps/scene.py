@@ -48,7 +48,7 @@ def show(desk: Desk) -> None:
             kind = ui.select(["osm", "footprints", "plan"], label="Kind", value=_kind(source.value))
             source.on_value_change(lambda event: kind.set_value(_kind(event.value)))
         with ui.expansion("Settings of the scene").classes("wide"), ui.row():
-            height = ui.input("Height: a column, or metres", value="3").props("outlined dense")
+            height = ui.input("Height: a column, or metres", value="3")
             wall = ui.select(ITU, label="Walls (ITU-R P.2040)", value="concrete")
             thickness = ui.number("Thickness of walls [m]", value=0.3, min=0.001, max=10, step=0.01)
             ground = ui.select(ITU, label="Ground", value="concrete")
