@@ -35,17 +35,29 @@ def test_values_are_those_of_the_channel_statistics(replay):
     assert found["round_trip_time"] == pytest.approx(2 * expected.mean_delay)
 
 
-def test_a_receiver_sees_neither_weak_nor_late_paths(replay):
+@pytest.mark.parametrize(
+    "limits",
+    [(25.0, -95.0, 6e-8), (16.0, None, None), (None, -80.0, None), (None, None, 4e-8)],
+    ids=["all", "dynamic range", "floor", "window"],
+)
+def test_a_receiver_sees_neither_weak_nor_late_paths(replay, limits):
+    dynamic_range_db, floor_db, window = limits
     paths = replay.paths
     power = (
         np.abs(fields.path_gains(paths, replay.parameters.materials(truth(replay)[0], paths.materials))) ** 2
     )
-    (found,) = replay.observe(truth(replay), (Statistic("rms_delay_spread", "mean", 25.0, -95.0, 6e-8),))[0]
+    (found,) = replay.observe(truth(replay), (Statistic("rms_delay_spread", "mean", *limits),))[0]
     hard = np.empty(paths.num_links)
     for link in range(paths.num_links):
         mine = paths.link == link
         delay, own = paths.delay[mine], power[mine]
-        seen = (own > own.max() * 10**-2.5) & (10 * np.log10(own) > -95.0) & (delay - delay.min() <= 6e-8)
+        seen = np.ones(len(own), dtype=bool)
+        if dynamic_range_db is not None:
+            seen &= own > own.max() * 10 ** (-dynamic_range_db / 10)
+        if floor_db is not None:
+            seen &= 10 * np.log10(own) > floor_db
+        if window is not None:
+            seen &= delay - delay.min() <= window
         weight = own * seen
         mean = np.sum(weight * delay) / weight.sum()
         hard[link] = np.sqrt(np.sum(weight * (delay - mean) ** 2) / weight.sum())
