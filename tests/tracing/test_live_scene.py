@@ -11,7 +11,9 @@ import pytest
 import sionna.rt as rt
 
 import calibray as cb
+from calibray import engines
 from calibray.errors import InputError
+from calibray.measurements.observables import KINDS, Statistic
 from calibray.tracing.sionna.live_scene import apply_materials
 
 PLANTED = {"marble": 9.2, "concrete": 3.1}
@@ -69,6 +71,44 @@ def test_sionna_and_the_study_agree_and_materials_are_set(study: cb.Study, measu
     np.testing.assert_allclose(cb.path_loss(paths, planted).reshape(measured.shape), measured, atol=0.001)
     with pytest.raises(InputError, match="no material 'walls'"):
         apply_materials(scene, {"walls": planted["marble"]})
+
+
+def test_observables_equal_those_of_sionnas_impulse_responses(study: cb.Study) -> None:
+    scene, engine = street(), engines.make(study, "replay")
+    for name, value in PLANTED.items():
+        scene.radio_materials[name].relative_permittivity = value
+    paths = rt.PathSolver()(scene, max_depth=2, samples_per_src=50_000, refraction=False)
+    response, delays = paths.cir(normalize_delays=False)
+    power = sum(np.array(part, dtype=float) ** 2 for part in response).sum(axis=(1, 3, 5))
+    delay, departure, arrival = (np.array(part, dtype=float) for part in (delays, paths.phi_t, paths.phi_r))
+    weight = power / power.sum(axis=-1, keepdims=True)
+
+    def mean(value: np.ndarray) -> np.ndarray:
+        return (weight * value).sum(axis=-1)
+
+    def spread(angle: np.ndarray) -> np.ndarray:
+        return np.sqrt(-2 * np.log(np.minimum(np.abs(mean(np.exp(1j * angle))), 1.0)))
+
+    strongest = weight.max(axis=-1)
+    expected = {
+        "rms_delay_spread": np.sqrt(mean((delay - mean(delay)[..., None]) ** 2)),
+        "mean_excess_delay": mean(delay) - np.where(delay < 0, np.inf, delay).min(axis=-1),
+        "time_of_flight": mean(delay),
+        "round_trip_time": 2 * mean(delay),
+        "k_factor": 10 * np.log10(strongest / (1 - strongest)),
+        "azimuth_spread_departure": spread(departure),
+        "azimuth_spread_arrival": spread(arrival),
+    }
+    values = np.array([[PLANTED[name.partition(".")[0]] for name in engine.parameters.names]])
+    found = engine.observe(values, tuple(Statistic(kind) for kind in KINDS))[0]
+    assert set(expected) == set(KINDS)
+    for kind, row in zip(KINDS, found, strict=True):
+        wanted = expected[kind].T.ravel()
+        # Sionna computes in single precision: a spread of zero is one of some 1e-7 rad, and the power of paths with two
+        # reflections differs by up to 4e-4 (0.002 dB).
+        absolute = 0.002 if kind == "k_factor" else 1e-6 * np.abs(wanted).max()
+        np.testing.assert_allclose(row, wanted, rtol=4e-4, atol=absolute, err_msg=kind)
+        assert np.isclose(row, wanted, rtol=1e-4, atol=absolute).sum() >= 14
 
 
 def test_a_study_can_be_saved_and_loaded(study: cb.Study) -> None:
