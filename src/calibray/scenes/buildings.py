@@ -101,11 +101,13 @@ def footprints(
 
 def _loops(faces: NDArray[np.int64]) -> list[list[int]]:
     """Closed lines around faces that share edges; an edge that two faces share is inside."""
-    edges = np.unique(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=0)
     size = int(faces.max(initial=0)) + 1
-    shared = np.isin(edges @ [1, size], edges @ [size, 1]) | (edges[:, 0] == edges[:, 1])
+    # An edge as one number, which sorts faster than a pair.
+    edges = np.unique(faces * size + np.roll(faces, -1, axis=1))
+    starts, ends = np.divmod(edges, size)
+    alone = ~np.isin(ends * size + starts, edges) & (starts != ends)
     following: dict[int, list[int]] = defaultdict(list)
-    for start, end in edges[~shared].tolist():
+    for start, end in zip(starts[alone].tolist(), ends[alone].tolist(), strict=True):
         following[start].append(end)
     loops = []
     for start in list(following):

@@ -43,9 +43,8 @@ def plan(folder: StudyFolder, scene: str | None) -> dict[str, Any]:
     if study is None or links is None:
         return shown
     overhead = SceneSurfaces.read(source)
-    indoors = overhead.under_roof(links.rx).mean() > 0.8
-    wrong = overhead.outside(links.rx) | overhead.underground(links.rx)
-    suspicious = wrong if indoors else wrong | overhead.under_roof(links.rx)
+    roofed, wrong = overhead.under_roof(links.rx), overhead.outside(links.rx) | overhead.underground(links.rx)
+    suspicious = wrong if roofed.mean() > 0.8 else wrong | roofed
     rows = zip(links.rx.tolist(), links.path_loss_db.tolist(), suspicious.tolist(), strict=True)
     shown["links"] = [[round(x, 2), round(y, 2), round(loss, 1), int(mark)] for (x, y, _), loss, mark in rows]
     shown["transmitters"] = np.unique(links.tx, axis=0).round(2).tolist()
