@@ -66,7 +66,10 @@ def panning(page) -> float:
     before, start, step = int(canvas.get_attribute("data-drawn")), time.monotonic(), 0
     while time.monotonic() - start < SECONDS:
         step += 1
-        page.mouse.move(x + 60 * np.sin(step / 9), y + 60 * np.cos(step / 9))
+        # So far that the map is painted again on the way.
+        page.mouse.move(
+            x + 0.45 * box["width"] * np.sin(step / 30), y + 0.45 * box["height"] * np.cos(step / 30)
+        )
     seconds = time.monotonic() - start
     page.mouse.up()
     return (int(canvas.get_attribute("data-drawn")) - before) / seconds

@@ -4,35 +4,47 @@ const plan = (() => {
   let canvas, context, data = { links: [], transmitters: [] }, buildings, walls;
   let centre = [0, 0], zoom = 1, point = null, area = null, suggested = [], drawing = false, grip = null, moved = false, whole = true;
   let width = 1, height = 1, queued = false;
+  let layer = null; // what does not change while the map is dragged: an image of twice the size, its centre and zoom
 
   const color = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
   const toScreen = (x, y) => [width / 2 + (x - centre[0]) * zoom, height / 2 - (y - centre[1]) * zoom];
   const toScene = (x, y) => [centre[0] + (x - width / 2) / zoom, centre[1] - (y - height / 2) / zoom];
 
+  function paint(ratio) {
+    const image = new OffscreenCanvas(2 * width * ratio, 2 * height * ratio), ground = image.getContext("2d");
+    layer = { image, centre: [...centre], zoom, ratio };
+    ground.fillStyle = color("--map-ground");
+    ground.fillRect(0, 0, image.width, image.height);
+    if (buildings) {
+      const [x, y] = toScreen(data.west, data.north), size = zoom / data.scale;
+      ground.setTransform(ratio * size, 0, 0, ratio * size, ratio * (x + width / 2), ratio * (y + height / 2));
+      ground.fillStyle = color("--map-building");
+      ground.fill(buildings);
+      ground.strokeStyle = color("--map-wall");
+      ground.lineWidth = 1 / size;
+      ground.stroke(walls);
+    }
+    ground.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const colors = [color("--map-link"), color("--map-warning")];
+    for (const mark of [0, 1]) {
+      ground.fillStyle = colors[mark];
+      for (const [x, y, , flag] of data.links) {
+        const u = width + (x - centre[0]) * zoom, v = height - (y - centre[1]) * zoom;
+        if (flag === mark && u > 0 && v > 0 && u < 2 * width && v < 2 * height) ground.fillRect(u - 2, v - 2, 4 + mark, 4 + mark);
+      }
+    }
+  }
   function draw() {
     queued = false;
     const ratio = devicePixelRatio || 1;
+    let [a, b] = layer ? toScreen(...layer.centre) : [0, 0];
+    if (!layer || layer.zoom !== zoom || layer.ratio !== ratio || a < 0 || a > width || b < 0 || b > height) {
+      paint(ratio);
+      [a, b] = [width / 2, height / 2];
+    }
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.drawImage(layer.image, Math.round((a - width) * ratio), Math.round((b - height) * ratio));
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.fillStyle = color("--map-ground");
-    context.fillRect(0, 0, width, height);
-    if (buildings) {
-      const [x, y] = toScreen(data.west, data.north), size = zoom / data.scale;
-      context.setTransform(ratio * size, 0, 0, ratio * size, ratio * x, ratio * y);
-      context.fillStyle = color("--map-building");
-      context.fill(buildings);
-      context.strokeStyle = color("--map-wall");
-      context.lineWidth = 1 / size;
-      context.stroke(walls);
-      context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    }
-    const colors = [color("--map-link"), color("--map-warning")];
-    for (const mark of [0, 1]) {
-      context.fillStyle = colors[mark];
-      for (const [x, y, , flag] of data.links) {
-        const u = width / 2 + (x - centre[0]) * zoom, v = height / 2 - (y - centre[1]) * zoom;
-        if (flag === mark && u > 0 && v > 0 && u < width && v < height) context.fillRect(u - 2, v - 2, 4 + mark, 4 + mark);
-      }
-    }
     context.strokeStyle = color("--map-ground");
     context.lineWidth = 1;
     for (const [x, y] of data.transmitters) {
@@ -53,12 +65,14 @@ const plan = (() => {
     canvas.dataset.drawn = Number(canvas.dataset.drawn || 0) + 1;
   }
   function ring(u, v, radius) { context.beginPath(); context.arc(u, v, radius, 0, 7); context.stroke(); }
+  function renew() { layer = null; redraw(); }
   function redraw() { if (!queued && context) { queued = true; requestAnimationFrame(draw); } }
 
   function size() {
     const box = canvas.getBoundingClientRect(), ratio = devicePixelRatio || 1;
     [width, height] = [box.width, box.height];
     [canvas.width, canvas.height] = [width * ratio, height * ratio];
+    layer = null;
     if (whole) fit(); else redraw();
   }
   function fit() {
@@ -138,7 +152,7 @@ const plan = (() => {
       context = canvas.getContext("2d");
       listen();
       new ResizeObserver(size).observe(canvas);
-      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => setTimeout(redraw, 50));
+      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => setTimeout(renew, 50));
     }
     const answer = await (early || ask(scene));
     early = null;
