@@ -15,6 +15,8 @@ import two_ray
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable, links_from_frame
+from calibray.result.remark import RemarkKind
+from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.tracing.settings import Antenna
 from two_ray import COLUMNS, TRUTH, TwoRay
@@ -95,6 +97,34 @@ def test_three_transmitters_with_their_own_antennas_and_powers_are_calibrated(pl
     wrong = cb.calibrate(mounted(planted, TX | {"azimuth_deg": 90.0}), tracer=TwoRay)
     assert wrong.rmse_db > 2.0
     assert len(table) == 36
+
+
+@pytest.mark.parametrize("turned", [0.0, 12.0])
+def test_a_sector_that_points_elsewhere_than_stated_is_named(
+    planted: Study, tmp_path: Path, turned: float
+) -> None:
+    """Residuals of 1 dB by which only the sector to the east, 12 degrees off, is suspect; with none off, none is."""
+    folder, random = planted.path.parent, np.random.default_rng(4)
+    table = pd.read_csv(folder / "powers.csv")
+    noisy = table.assign(dbm=table["dbm"] + random.standard_normal(len(table)))
+    noisy.to_csv(folder / "noisy.csv", index=False)
+    sites = pd.read_csv(folder / "sites.csv")
+    east = sites["transmitter"] == "east"
+    sites.assign(bearing=sites["bearing"] - turned * east).to_csv(folder / "turned.csv", index=False)
+    study = mounted(planted, file="noisy.csv", transmitters="turned.csv")
+    remarks = [
+        remark
+        for remark in cb.calibrate(study, tracer=TwoRay).uncertainty.remarks
+        if remark.kind == RemarkKind.ANTENNA_DIRECTIONS
+    ]
+    if not turned:
+        assert not remarks
+        return
+    (remark,) = remarks
+    values = {name: value[0] for name, value in remark.values.items() if isinstance(value, list)}
+    assert remark.values["transmitters"] == ["east"]
+    assert abs(values["azimuth_deg"] - turned) < 3 * values["azimuth_error_deg"] < turned
+    assert "'east': add to its azimuth +1" in remark_text(remark)
 
 
 def test_traces_are_shared_by_all_directions(planted: Study, monkeypatch: pytest.MonkeyPatch) -> None:

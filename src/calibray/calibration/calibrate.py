@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from calibray import engines
+from calibray.calibration.antenna_directions import directions_remark
 from calibray.calibration.make_result import Run, Timing, make_result
 from calibray.calibration.result import Result
 from calibray.calibration.unreached_links import unreached_remark
@@ -118,8 +119,9 @@ def calibrate(
         many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
-    unreached = unreached_remark(problem, progress) if can_trace else ()
-    run = Run(problem, trail, gap_db, cheap, enclosed, unreached, timing)
+    on_links = unreached_remark(problem, progress) if can_trace else ()
+    on_links += directions_remark(problem, trail.best)
+    run = Run(problem, trail, gap_db, cheap, enclosed, on_links, timing)
     result = make_result(run, assessment, validation)
     if out is not None:
         # The folder was checked before the search; a file that appeared since then must not cost the result.

@@ -87,7 +87,7 @@ class Run:
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
         cheap: The cheap model, if the method had one.
         enclosed: Antennas inside closed bodies; None where this was not checked.
-        unreached: A remark on links without a path, if they are many.
+        on_links: Remarks on links without a path and on directions of antennas.
         timing: Time of its parts.
     """
 
@@ -96,7 +96,7 @@ class Run:
     retrace_gap_db: NDArray[np.float64] | None
     cheap: CheapReplay
     enclosed: EnclosedAntennas | None
-    unreached: tuple[Remark, ...]
+    on_links: tuple[Remark, ...]
     timing: Timing
 
 
@@ -185,7 +185,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             undeclared_offset_error_db=certainty.undeclared_offset_error_db,
             remarks=(
                 *([cheap.remark] if cheap.remark else []),
-                *run.unreached,
+                *run.on_links,
                 *certainty.remarks,
                 *_not_judged(study, accuracy),
             ),

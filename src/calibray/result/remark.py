@@ -22,6 +22,9 @@ class RemarkKind(StrEnum):
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"
+    # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,
+    # downtilt_error_deg
+    ANTENNA_DIRECTIONS = "antenna directions"
     UNREACHED_LINKS = (
         "unreached links"  # links, of (all), sample, switches, reached (links of the sample by switch)
     )

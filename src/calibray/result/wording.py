@@ -224,6 +224,23 @@ def _unreached_links(values: dict[str, Any]) -> str:
     return f"{text} Of {values['sample']} that were tried, {reached}: change [trace]."
 
 
+def _antenna_directions(values: dict[str, Any]) -> str:
+    sentences = []
+    for number, name in enumerate(values["transmitters"]):
+        angles = [
+            f"its {angle} {values[f'{angle}_deg'][number]:+.1f} deg (standard error {error:.1f} deg)"
+            for angle in ("azimuth", "downtilt")
+            if (error := values[f"{angle}_error_deg"][number]) > 0
+        ]
+        sentences.append(f"{name!r}: add to {' and to '.join(angles)}")
+    first = values["transmitters"][0]
+    return (
+        "Residuals depend on direction, as if antennas pointed elsewhere than stated. This would explain them: "
+        f"{'; '.join(sentences)}. Check how they are mounted, or calibrate parameters such as "
+        f'"tx:{first}.azimuth".'
+    )
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -248,6 +265,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.UNREACHED_LINKS: _unreached_links,
+    RemarkKind.ANTENNA_DIRECTIONS: _antenna_directions,
     RemarkKind.CONFLICT: _conflict,
 }
 
