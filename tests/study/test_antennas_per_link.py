@@ -15,6 +15,7 @@ import two_ray
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable, links_from_frame
+from calibray.reporting.direction_figure import residuals_by_direction
 from calibray.result.remark import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
@@ -112,11 +113,21 @@ def test_a_sector_that_points_elsewhere_than_stated_is_named(
     east = sites["transmitter"] == "east"
     sites.assign(bearing=sites["bearing"] - turned * east).to_csv(folder / "turned.csv", index=False)
     study = mounted(planted, file="noisy.csv", transmitters="turned.csv")
+    result = cb.calibrate(study, tracer=TwoRay)
     remarks = [
-        remark
-        for remark in cb.calibrate(study, tracer=TwoRay).uncertainty.remarks
-        if remark.kind == RemarkKind.ANTENNA_DIRECTIONS
+        remark for remark in result.uncertainty.remarks if remark.kind == RemarkKind.ANTENNA_DIRECTIONS
     ]
+    figure = residuals_by_direction(result)
+    assert figure is not None
+    for axes, name in zip(figure.axes, sorted(SITES["transmitter"]), strict=True):
+        assert axes.get_title() == f"{name} (12)"
+        points = axes.collections[0].get_offsets()
+        own = result.links[noisy["transmitter"] == name]
+        np.testing.assert_allclose(points[:, 1], own["predicted_db"] - own["measured_db"])
+        angle, level = axes.lines[-1].get_data()
+        if name != "omni":
+            stated = 90.0 - turned if name == "east" else 0.0
+            assert np.degrees(angle[np.argmax(level)]) % 360 == pytest.approx(stated)
     if not turned:
         assert not remarks
         return

@@ -56,8 +56,11 @@ def directions_remark(problem: Problem, best: NDArray[np.float64]) -> tuple[Rema
     study, table = setup.study, setup.links.table
     known = any(name.startswith(POSE) for name in study.parameters)
     compressed = getattr(study.engine, "compress_db", None) is not None
-    testable = "tx" in study.links.mountings and not (known or compressed or problem.observed)
-    if not testable or not isinstance(engine, Replay) or study.links.transmitter not in table.frame:
+    section = study.links.mountings.get("tx")
+    stated = section is not None and section.aim is None
+    if not stated or known or compressed or problem.observed:
+        return ()
+    if not isinstance(engine, Replay) or study.links.transmitter not in table.frame:
         return ()
     labels = table.labels(study.links.transmitter)[problem.objective.weight > 0].tolist()
     tested = [

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from calibray.optimizers import label
+from calibray.reporting.direction_figure import residuals_by_direction
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
 from calibray.reporting.trust_figures import trust_figures
 from calibray.result.record import Record
@@ -262,6 +263,9 @@ def result_figures(result: Record, links: Survey | None) -> dict[str, Figure]:
         figures["residual-over-distance"] = residual_over_distance(links)
         if links.group is not None:
             figures["residual-by-group"] = residual_by_group(links)
+    directions = residuals_by_direction(result)
+    if directions is not None:
+        figures["residual-by-direction"] = directions
     return figures | trust_figures(result)
 
 
