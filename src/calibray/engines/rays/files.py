@@ -81,8 +81,11 @@ def _read_json(path: Path) -> pd.DataFrame:
 
 def _read_hdf5(path: Path) -> pd.DataFrame:
     with h5py.File(path, "r") as file:
-        hard = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
-        columns = {name: file[name] for name in hard if isinstance(file[name], h5py.Dataset)}
+        columns: dict[str, h5py.Dataset] = {}
+        for name in map(str, file):
+            is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)
+            if is_here and isinstance(item := file[name], h5py.Dataset):
+                columns[name] = item
         for name, item in columns.items():
             if item.is_virtual or item.external is not None:
                 raise InputError(
