@@ -143,14 +143,14 @@ def repetition(folder: Path, links: pd.DataFrame, seed: list[int]) -> list[dict[
         stated.loc[here, "azimuth"] -= azimuth
         stated.loc[here, "downtilt"] -= downtilt
         truth |= {f"tx:{sector}.azimuth": azimuth, f"tx:{sector}.downtilt": downtilt}
-    rows = []
+    rows, true_db = [], stated.loc[reached, "true_db"].to_numpy()
     for posed in (True, False):
         started = time.perf_counter()
         result = cb.calibrate(study(folder, stated[reached], posed))
         seconds = time.perf_counter() - started
         table = result.links[result.links["held_out"]]
         error = (table["after_db"] - table["measured_db"]).to_numpy()
-        excess = (table["after_db"] - table["true_db"]).to_numpy()
+        excess = table["after_db"].to_numpy() - true_db[result.links["held_out"].to_numpy(bool)]
         common = {
             "posed": posed,
             "alarm": bool(alarms),
