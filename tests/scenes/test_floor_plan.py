@@ -109,6 +109,20 @@ def test_what_is_left_of_a_longer_face_is_kept():
     assert staggered.length == pytest.approx(14.0)
 
 
+def test_two_walls_near_each_other_stay_two_walls_in_a_plan_of_single_lines():
+    """A house drawn as single lines, with a shaft 0.44 m wide along its outer wall."""
+    shaft = line(0.44, 0, 0.44, 6)
+    merged = merge_faces([*OUTER, line(5, 0, 5, 6), shaft])
+    assert list(merged.sheets) == [*OUTER, line(5, 0, 5, 6), shaft]
+    assert merged.lines == 0
+    assert merged.report == [
+        "brick: 1 not merged with a parallel line, as most lines of this type have no other face, "
+        "0.44 m apart, 6.0 m long"
+    ]
+    # Drawn as single lines of another type, the same two lines are the whole type, and one wall.
+    assert merge_faces([*OUTER, line(2, 0, 2, 6, "glass"), line(2.44, 0, 2.44, 6, "glass")]).lines == 2
+
+
 def outlined() -> str:
     """A flat of 12 m x 8 m as closed outlines of its walls, drawn with errors of millimetres; a door, a window."""
     boxes = [

@@ -22,6 +22,7 @@ THICKEST: Final = 0.6
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
 _TOUCHING: Final = 0.02  # distance of ends that meet [m]
+_FACED: Final = 0.5  # a plan of faces pairs nearly all its length, a plan of single lines only the odd two walls
 _SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall have in common
 
 
@@ -53,6 +54,9 @@ def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> Merg
     close the outline of a wall are left out. All walls of a type without a given thickness get the median of the
     distances of their faces, weighted with their lengths.
 
+    Where less than half the length of a type's lines has another face, that type is drawn as single lines: two of them
+    that lie close together are two walls, and are kept.
+
     Args:
         segments: Lines of a plan.
         thickest: Largest thickness of a wall [m].
@@ -61,6 +65,9 @@ def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> Merg
         The sheets, followed by the lines without another face.
     """
     pairs = _face_pairs(segments, thickest)
+    faced = _types_drawn_as_faces(segments, pairs)
+    separate = [pair for pair in pairs if segments[pair[0]].kind not in faced]
+    pairs = [pair for pair in pairs if segments[pair[0]].kind in faced]
     paired = {index for pair in pairs for index in pair}
     merged = [_merge_pair(segments[one], segments[other], thickest) for one, other in pairs]
     distances = [abs(_offset(segments[one], segments[other])) for one, other in pairs]
@@ -73,6 +80,11 @@ def merge_faces(segments: Sequence[Segment], thickest: float = THICKEST) -> Merg
         *_described("merged from two faces", merged, distances),
         *_described("kept of a face that is longer than the other", rest),
         *_described("ends of outlined walls left out", [segments[index] for index in sorted(closing)]),
+        *_described(
+            "not merged with a parallel line, as most lines of this type have no other face",
+            [segments[one] for one, _ in separate],
+            [abs(_offset(segments[one], segments[other])) for one, other in separate],
+        ),
         *(f"{kind}: walls without a thickness get {value:g} m" for kind, value in thickness.items()),
     ]
     return MergedPlan(
@@ -103,6 +115,18 @@ def _face_pairs(segments: Sequence[Segment], thickest: float) -> list[tuple[int,
     return [
         pair for pair, distance in sorted(distances.items()) if (distance <= nearest[list(pair)] + 0.01).all()
     ]
+
+
+def _types_drawn_as_faces(segments: Sequence[Segment], pairs: Sequence[tuple[int, int]]) -> set[str]:
+    """The types of which lines have another face along at least half of their length."""
+    length: dict[str, float] = defaultdict(float)
+    faced: dict[str, float] = defaultdict(float)
+    for segment in segments:
+        length[segment.kind] += segment.length
+    for one, other in pairs:
+        low, high = _span(segments[one], segments[other])
+        faced[segments[one].kind] += 2 * (high - low)
+    return {kind for kind in length if faced[kind] >= _FACED * length[kind]}
 
 
 def _face_distance(one: Segment, other: Segment, thickest: float) -> float | None:

@@ -1,0 +1,187 @@
+"""From raw files to a page by commands alone: the three example walks and both campaigns, in one table.
+
+    python benchmarks/walks.py [--walks town flat hill boulder auckland] [--folder FOLDER] [--samples N]
+
+Each walk runs `scene`, `init`, `run`, `predict` on the links of the result, `export`, and the exported script in plain
+Sionna RT. The campaigns begin at `run` with the study in `examples`; CALIBRAY_DATA names the folder of their data. The
+table has the links without a path, the error of the fit and in held-out blocks, which model predicts, and the largest
+difference [dB] between prediction and exported scene over all links. To compare with another version of Calibray, set
+PYTHONPATH to its `src`: a step that fails there is shown with its message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+TOWN = (
+    "scene osm town.osm --out scene",
+    "init scene/scene.xml rsrp.csv --transmitters cells.csv --frequency 3.6e9 --out study.toml",
+)
+FLAT = (
+    "scene plan plan.csv --height 2.6 --out scene",
+    "init scene/scene.xml rss.csv --transmitters access_points.csv --frequency 2.44e9 --out study.toml",
+)
+HILL = (
+    "scene footprints houses.geojson --height height_m --terrain ground.tif --out scene",
+    "init scene/scene.xml power.csv --transmitters masts.csv --track walk.gpx --frequency 2.1e9 --out study.toml",
+)
+WALKS = {
+    "town": (EXAMPLES / "bring_your_own", TOWN),
+    "flat": (EXAMPLES / "bring_your_own" / "flat", FLAT),
+    "hill": (EXAMPLES / "bring_your_own" / "hill", HILL),
+    "boulder": (EXAMPLES / "nist_boulder.toml", ()),
+    "auckland": (EXAMPLES / "auckland_tower.toml", ()),
+}
+FINISH = (
+    "run study.toml --out result",
+    "predict result result/result-links.csv --out predicted.csv",
+    "export result --out exported --copy",
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command: its words, exit status, seconds and output."""
+
+    command: str
+    status: int
+    seconds: float
+    output: str
+    messages: str
+
+
+@dataclass
+class Walk:
+    """A walk in its folder: the steps taken."""
+
+    folder: Path
+    steps: list[Step] = field(default_factory=list)
+
+    def take(self, command: str, *words: str) -> bool:
+        """Run a command in the folder, and say whether it succeeded."""
+        started = time.monotonic()
+        done = subprocess.run(words, cwd=self.folder, capture_output=True, text=True, check=False)
+        seconds = time.monotonic() - started
+        self.steps.append(Step(command, done.returncode, seconds, done.stdout, done.stderr))
+        print(f"  {command}: exit {done.returncode}, {seconds:.0f} s", file=sys.stderr, flush=True)
+        return done.returncode == 0
+
+
+def take(source: Path, commands: tuple[str, ...], folder: Path, samples: int | None) -> Walk:
+    """Walk from the files of a folder, or from a study, to the exported scene."""
+    walk = Walk(folder)
+    if source.is_dir():
+        for file in source.iterdir():
+            if file.is_file():
+                shutil.copy(file, folder)
+    else:
+        study = source.read_text(encoding="utf-8")
+        if samples:
+            study = re.sub(r"samples = [\d_]+", f"samples = {samples}", study)
+        (folder / "study.toml").write_text(study, encoding="utf-8")
+    for command in (*commands, *FINISH):
+        if not walk.take(command, sys.executable, "-m", "calibray", *command.split()):
+            return walk
+    walk.take("load_scene.py", sys.executable, "exported/load_scene.py")
+    return walk
+
+
+def found(record: Any, key: str) -> Any:
+    """The first value of a key anywhere in a record; None if there is none."""
+    if isinstance(record, dict):
+        if key in record:
+            return record[key]
+        values = (found(value, key) for value in record.values())
+        return next((value for value in values if value is not None), None)
+    return None
+
+
+def difference(walk: Walk) -> float | None:
+    """Largest difference [dB] between predicted path loss and that of the exported scene, over the links."""
+    script = walk.steps[-1]
+    if script.status or script.command != "load_scene.py":
+        return None
+    loaded = pd.read_csv(StringIO(script.output)).set_index("row").iloc[:, -1]
+    predicted = pd.read_csv(walk.folder / "predicted.csv")
+    rows = pd.read_csv(walk.folder / "result" / "result-links.csv")["row"]
+    gap = predicted["path_loss_db"].set_axis(rows) - loaded
+    return float(gap.abs().max())
+
+
+def line(name: str, walk: Walk) -> str:
+    """The table's line of a walk."""
+    last = walk.steps[-1]
+    seconds = sum(step.seconds for step in walk.steps)
+    if last.status:
+        message = (last.messages.strip().splitlines() or ["no message"])[-1]
+        return f"| {name} | {last.command} failed: {message} |"
+    record = json.loads((walk.folder / "result" / "result.json").read_text(encoding="utf-8"))
+    links = pd.read_csv(walk.folder / "result" / "result-links.csv")
+    predicted = pd.read_csv(walk.folder / "predicted.csv")
+    gap = difference(walk)
+    texts = [
+        name,
+        len(walk.steps),
+        f"{len(links)} ({int((~links['has_path']).sum())} without)",
+        int(predicted["path_loss_db"].isna().sum()),
+        number(found(record, "rmse_db")),
+        number(found(record, "holdout_rmse_db")),
+        number(found(record, "log_distance_holdout_rmse_db")),
+        (found(record, "model") or {}).get("name", "-"),
+        "not comparable" if gap is None else f"{gap:.4f}",
+        f"{seconds:.0f}",
+    ]
+    return "| " + " | ".join(str(text) for text in texts) + " |"
+
+
+def number(value: float | None) -> str:
+    """A decibel value with two digits; a dash if there is none."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def main() -> None:
+    """Take the walks and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--walks", nargs="+", choices=WALKS, default=list(WALKS))
+    parser.add_argument("--folder", type=Path, help="keep what is written in this folder")
+    parser.add_argument("--samples", type=int, help="launch so many rays in the campaigns")
+    options = parser.parse_args()
+    base = options.folder or Path(tempfile.mkdtemp(prefix="walks-"))
+    lines = []
+    for name in options.walks:
+        source, commands = WALKS[name]
+        if not source.is_dir() and "CALIBRAY_DATA" not in os.environ:
+            print(f"{name}: left out, CALIBRAY_DATA is not set", file=sys.stderr)
+            continue
+        print(name, file=sys.stderr)
+        folder = base / name
+        folder.mkdir(parents=True)
+        lines.append(line(name, take(source, commands, folder, options.samples)))
+    print(
+        "| walk | commands | links (without a path) | links without a prediction | fit [dB] | held out [dB]"
+        " | log-distance, held out [dB] | predicts | prediction - exported scene [dB] | seconds |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("\n".join(lines))
+    if not options.folder:
+        shutil.rmtree(base)
+
+
+if __name__ == "__main__":
+    main()
