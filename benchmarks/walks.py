@@ -134,7 +134,7 @@ def line(name: str, walk: Walk) -> str:
     record = json.loads((walk.folder / "result" / "result.json").read_text(encoding="utf-8"))
     links = pd.read_csv(walk.folder / "result" / "result-links.csv")
     predicted = pd.read_csv(walk.folder / "predicted.csv")
-    gap = difference(walk)
+    gap, model = difference(walk), found(record.get("prediction", record), "model")
     texts = [
         name,
         len(walk.steps),
@@ -143,7 +143,7 @@ def line(name: str, walk: Walk) -> str:
         number(found(record, "rmse_db")),
         number(found(record, "holdout_rmse_db")),
         number(found(record, "log_distance_holdout_rmse_db")),
-        (found(record, "model") or {}).get("name", "-"),
+        model.get("name", "-") if isinstance(model, dict) else "-",
         "not comparable" if gap is None else f"{gap:.4f}",
         f"{seconds:.0f}",
     ]

@@ -179,6 +179,8 @@ def test_links_are_shown_in_the_quantity_that_was_measured(result):
     assert residuals[reached] == pytest.approx((power + links.measured_db.to_numpy())[reached])
     headings = [column.heading for column in reports._worst(received, survey(received)).columns]
     assert "measured [dBm]" in headings
+    leverage = [every.diagnostics["leverage"].residual_db.to_numpy() for every in (received, result)]
+    assert leverage[0] == pytest.approx(-leverage[1])
     assert path_loss_by_receiver({"auto": received}).axes[0].get_ylabel() == "RSRP [dBm]"
 
 

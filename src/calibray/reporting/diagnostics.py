@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from calibray.reporting.link_survey import POSITION_COLUMNS, residual
+from calibray.reporting.link_survey import POSITION_COLUMNS, measured_quantity, residual
 from calibray.result.record import Record
 from calibray.support.messages import percent
 from calibray.tables import Column, Table
@@ -46,11 +46,11 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
-        and standard deviation of the residuals [dB] on the calibration links. "leverage": leverage and residual of
-        every calibration link. "power": share of the links' power by material and type of interaction. "trade_offs":
-        correlation of the draws of every two unknowns. "neighbours": semivariance of the residuals over the distance
-        between links, both ends counted. "moved": value of every parameter before and after, the change and the 95 %
-        interval as shares of its range.
+        and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
+        the measured quantity. "leverage": leverage and residual of every calibration link. "power": share of the
+        links' power by material and type of interaction. "trade_offs": correlation of the draws of every two unknowns.
+        "neighbours": semivariance of the residuals over the distance between links, both ends counted. "moved": value
+        of every parameter before and after, the change and the 95 % interval as shares of its range.
     """
     tables = {
         "distance": _by_distance(result),
@@ -90,8 +90,8 @@ def diagnostics_table(result: Record) -> Table:
 
 
 def _calibration_links(result: Record) -> tuple[pd.DataFrame, NDArray[np.float64]]:
-    """The calibration links with a path, and their residuals [dB]."""
-    residuals, links = residual(result.links), result.links
+    """The calibration links with a path, and their residuals in the measured quantity [dB]."""
+    residuals, links = residual(result.links, measured_quantity(result).sign), result.links
     used = links["has_path"].to_numpy(bool) | (result.study.objective.no_path == "censor")
     mask = used & np.isfinite(residuals) & ~links["held_out"].to_numpy(bool)
     return links[mask], residuals[mask]

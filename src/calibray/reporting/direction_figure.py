@@ -45,7 +45,7 @@ def residuals_by_direction(result: Record) -> Figure | None:
     if links.row.tolist() != result.links["row"].tolist():
         return None
     # Predicted minus measured path loss, so that an outer point received more than was predicted.
-    residuals = residual(result.links)
+    residuals = residual(result.links, sign=1)
     shown = np.isfinite(residuals) & result.links["has_path"].to_numpy(bool)
     has_names = study.links.transmitter in links.table.frame
     labels = links.table.labels(study.links.transmitter) if has_names else np.full(len(links), "all")

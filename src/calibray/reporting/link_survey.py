@@ -41,7 +41,7 @@ class Survey:
     @property
     def residual_db(self) -> NDArray[np.float64]:
         """Predicted minus measured, in the measured quantity [L], [dB]; NaN without a prediction."""
-        return self.sign * residual(self.table)
+        return residual(self.table, self.sign)
 
     @property
     def has_path(self) -> NDArray[np.bool_]:
@@ -106,17 +106,18 @@ def _column(result: Record) -> str:
     return f"measured_{quantity}_{'dbm' if quantity == 'received_power' else 'db'}"
 
 
-def residual(table: pd.DataFrame) -> NDArray[np.float64]:
-    """Predicted minus measured path loss.
+def residual(table: pd.DataFrame, sign: int) -> NDArray[np.float64]:
+    """Predicted minus measured value, in the measured quantity.
 
     Args:
         table: A result's links.
+        sign: 1 if the quantity rises with path loss, else -1.
 
     Returns:
         Residuals [L], [dB]; those of the fallback for links without a path, NaN without a prediction.
     """
     difference = table["predicted_db"].to_numpy(float) - table["measured_db"].to_numpy(float)
-    return np.where(np.isfinite(difference), difference, np.nan)
+    return sign * np.where(np.isfinite(difference), difference, np.nan)
 
 
 def survey(result: Record) -> Survey | None:

@@ -306,7 +306,7 @@ def _worst(result: Record, links: Survey | None) -> Table:
         Column("path"),
     )
     quantity = measured_quantity(result)
-    residuals = quantity.sign * residual(result.links)
+    residuals = residual(result.links, quantity.sign)
     measured, predicted = (in_measured_quantity(result, name) for name in ("measured", "predicted"))
     order = np.argsort(-np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")[:WORST]
     rows = []

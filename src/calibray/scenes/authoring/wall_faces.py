@@ -22,7 +22,8 @@ THICKEST: Final = 0.6
 
 _PARALLEL: Final = np.cos(np.radians(2.0))
 _TOUCHING: Final = 0.02  # distance of ends that meet [m]
-_FACED: Final = 0.5  # a plan of faces pairs nearly all its length, a plan of single lines only the odd two walls
+# A plan of faces pairs nearly all its length, a plan of single lines only the odd two walls.
+_FACED: Final = 0.5
 _SAME: Final = ("kind", "bottom", "top", "thickness")  # what sheets of one wall have in common
 
 
