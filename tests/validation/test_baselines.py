@@ -13,7 +13,10 @@ from calibray.errors import EngineError
 from calibray.fitting.nuisance import Nuisance, make_term
 from calibray.fitting.objective import make_objective
 from calibray.measurements import Measurements, SourceTable
-from calibray.result.prediction_model import FittedTerm
+from calibray.prediction.fallback import fill_missing
+from calibray.result.held_out import Model
+from calibray.result.prediction_model import FittedTerm, PredictionModel
+from calibray.result.record import Prediction
 from calibray.study import Study
 from calibray.validation.baselines import (
     OUT_OF_SIGHT_DB,
@@ -21,11 +24,16 @@ from calibray.validation.baselines import (
     log_distance,
     obstructed,
     obstructed_objective,
+    without_scene,
 )
 from calibray.validation.choice import with_prior_mean
 
 DISTANCE = np.geomspace(5, 500, 20)
 LOSS = 38.5 + 27.0 * np.log10(DISTANCE)
+
+
+NOTHING = np.zeros(20)
+"""No carriers and no antennas are known."""
 
 
 def measured(path_loss_db, **columns):
@@ -44,17 +52,17 @@ def objective(links, *terms, calibrated=None):
 
 def test_a_log_distance_law_is_recovered_exactly():
     links = measured(LOSS)
-    assert log_distance(links, objective(links), 3.5e9) == pytest.approx(LOSS)
+    assert log_distance(links, objective(links), NOTHING) == pytest.approx(LOSS)
     outlier = measured(np.where(np.arange(20) == 4, LOSS + 30, LOSS))
     left_out = objective(outlier, calibrated=np.arange(20) != 4)
-    assert log_distance(outlier, left_out, 3.5e9) == pytest.approx(LOSS)
+    assert log_distance(outlier, left_out, NOTHING) == pytest.approx(LOSS)
 
 
 def test_the_law_is_fitted_by_weighted_least_squares():
     weight = np.random.default_rng(0).uniform(0.1, 2, 20)
     links = measured(np.where(np.arange(20) == 4, LOSS + 30, LOSS), weight=weight)
     reference = np.polyfit(np.log10(DISTANCE), links.path_loss_db, 1, w=np.sqrt(weight))
-    law = log_distance(links, objective(links), 3.5e9)
+    law = log_distance(links, objective(links), NOTHING)
     assert law == pytest.approx(np.polyval(reference, np.log10(DISTANCE)))
     assert abs(law - LOSS).max() > 0.1
 
@@ -63,16 +71,68 @@ def test_a_log_distance_law_needs_two_links():
     links = measured(LOSS)
     one = replace(objective(links), weight=np.where(np.arange(20) == 0, 1.0, 0.0))
     with pytest.raises(EngineError, match="at least two calibration links"):
-        log_distance(links, one, 3.5e9)
+        log_distance(links, one, NOTHING)
+
+
+@pytest.fixture
+def sectors():
+    """Links around two sectors, one tilted, the study that states them, and the gains of the upright ones [dBi]."""
+    random = np.random.default_rng(3)
+    frame = pd.DataFrame({"azimuth": np.repeat([30.0, 200.0], 20), "tilt": np.repeat([4.0, 0.0], 20)})
+    bearing = frame["azimuth"] + random.uniform(-100, 100, 40)
+    flat, height = random.uniform(20, 400, 40), 28.5
+    rx = [flat * np.sin(np.radians(bearing)), flat * np.cos(np.radians(bearing)), np.full(40, 1.5)]
+    links = Measurements(
+        tx=np.tile([0.0, 0.0, 30.0], (40, 1)), rx=np.stack(rx, axis=1), path_loss_db=np.zeros(40),
+        table=SourceTable(frame),
+    )  # fmt: skip
+    # Without tilt: 3GPP TR 38.901, Table 7.3-1.
+    off, down = (bearing - frame["azimuth"]).to_numpy(), np.degrees(np.arctan2(height, flat))
+    loss = np.minimum(12 * (off / 65) ** 2, 30) + np.minimum(12 * (down / 65) ** 2, 30)
+    mounted = {"azimuth_deg": "azimuth", "downtilt_deg": "tilt"}
+    content = planted.content("links.csv", antennas={"tx": {"pattern": "tr38901"}})
+    content["links"] |= {"tx_antenna": mounted}
+    return links, content, 8 - np.minimum(loss, 30)
+
+
+def test_the_law_knows_the_gain_of_the_stated_antennas(sectors):
+    links, content, gain = sectors
+    study = Study.from_content(content)
+    known = without_scene(study, links)
+    assert known[20:] == pytest.approx(-gain[20:], abs=1e-9)
+    assert 0.1 < abs(known + gain)[:20].max() < 3
+    law = 38.5 + 27.0 * np.log10(links.distance)
+    links = replace(links, path_loss_db=law + known)
+    assert log_distance(links, objective(links), known) == pytest.approx(law + known)
+    assert abs(log_distance(links, objective(links), 0 * known) - law - known).max() > 5
+    # One antenna in one direction for all links.
+    content["antennas"]["tx"]["orientation"] = [np.pi / 2 - np.radians(200.0), 0.0, 0.0]
+    del content["links"]["tx_antenna"]
+    assert without_scene(Study.from_content(content), links)[20:] == pytest.approx(-gain[20:], abs=1e-9)
+    content["antennas"]["tx"]["pattern"] = "dipole"
+    assert (without_scene(Study.from_content(content), links) == 0).all()
+
+
+def test_predictions_without_a_path_know_the_antennas(sectors):
+    links, content, _ = sectors
+    study = Study.from_content(content)
+    fallback = PredictionModel(
+        Model.LOG_DISTANCE, None, (FittedTerm("constant", "constant", "", {"": 70.0}),), 5.0, "", 9, (5.0,)
+    )
+    prediction = Prediction(fallback, None, None, fallback)
+    table = pd.DataFrame({"path_loss_db": np.full(40, np.inf), "basis": "", "lower_db": 0.0, "upper_db": 0.0})
+    filled = fill_missing(prediction, study, links, table, 0.9)
+    assert filled["path_loss_db"].to_numpy() == pytest.approx(70.0 + without_scene(study, links))
 
 
 def test_over_carriers_the_law_rises_as_in_free_space():
     frequency = np.where(np.arange(20) % 2, 28e9, 3.5e9)
     loss = LOSS + 20 * np.log10(frequency / 3.5e9)
     links = measured(loss, frequency=frequency)
-    assert log_distance(links, objective(links), 3.5e9) == pytest.approx(loss)
+    study = Study.from_content(planted.content("links.csv"))
+    assert log_distance(links, objective(links), without_scene(study, links)) == pytest.approx(loss)
     one_carrier = measured(loss)
-    assert abs(log_distance(one_carrier, objective(one_carrier), 3.5e9) - loss).max() > 5
+    assert abs(log_distance(one_carrier, objective(one_carrier), NOTHING) - loss).max() > 5
 
 
 def test_the_law_has_the_nuisances_of_the_study():
@@ -80,27 +140,27 @@ def test_the_law_has_the_nuisances_of_the_study():
     loss = LOSS + 15.0 * (labels == "a")
     links = measured(loss)
     bounded = make_term(links, "offset", labels=labels, bounds=(-10, 10))
-    assert log_distance(links, objective(links, bounded), 3.5e9) == pytest.approx(loss)
-    assert abs(log_distance(links, objective(links), 3.5e9) - loss).max() > 5
+    assert log_distance(links, objective(links, bounded), NOTHING) == pytest.approx(loss)
+    assert abs(log_distance(links, objective(links), NOTHING) - loss).max() > 5
     slope = make_term(links, "log_distance", "log_distance", labels=labels)
-    assert log_distance(links, objective(links, bounded, slope), 3.5e9) == pytest.approx(loss)
+    assert log_distance(links, objective(links, bounded, slope), NOTHING) == pytest.approx(loss)
     # A group without calibration links gets the mean of the others.
     only_a = objective(links, bounded, calibrated=labels == "a")
-    assert log_distance(links, only_a, 3.5e9) == pytest.approx(loss + 15.0 * (labels == "b"))
+    assert log_distance(links, only_a, NOTHING) == pytest.approx(loss + 15.0 * (labels == "b"))
 
 
 def test_losses_out_of_sight_and_per_wall_are_recovered():
     walls = np.arange(20) % 4
     links = measured(LOSS + 12.0 * (walls > 0) + 3.0 * walls, table=blocked(walls))
-    assert obstructed(links, objective(links), 3.5e9) == pytest.approx(links.path_loss_db, abs=0.6)
-    assert abs(log_distance(links, objective(links), 3.5e9) - links.path_loss_db).max() > 6.0
+    assert obstructed(links, objective(links), NOTHING) == pytest.approx(links.path_loss_db, abs=0.6)
+    assert abs(log_distance(links, objective(links), NOTHING) - links.path_loss_db).max() > 6.0
 
 
 def test_links_in_sight_say_nothing_of_those_out_of_sight():
     """Where none was measured, the loss out of sight is that of the prior."""
     walls = np.where(np.arange(20) < 15, 0, 1)
     links = measured(LOSS, table=blocked(walls))
-    law = obstructed(links, objective(links, calibrated=walls == 0), 3.5e9)
+    law = obstructed(links, objective(links, calibrated=walls == 0), NOTHING)
     assert law == pytest.approx(LOSS + OUT_OF_SIGHT_DB[0] * walls, abs=1e-6)
     assert has_obstruction(links)
     assert not has_obstruction(links.select(walls == 0))
@@ -117,7 +177,7 @@ def test_a_nuisance_of_the_study_keeps_its_name_and_has_no_prior_mean():
     links = measured(LOSS + 12.0 * (walls > 0), table=blocked(walls))
     own = make_term(links, "out of sight", "out_of_sight")
     taken = make_term(links, "walls crossed")
-    model, known_db = obstructed_objective(links, objective(links, own, taken), 3.5e9)
+    model, known_db = obstructed_objective(links, objective(links, own, taken), NOTHING)
     assert [term.name for term in model.nuisance.terms][:2] == ["out of sight", "walls crossed"]
     assert "walls crossed of all" in [term.name for term in model.nuisance.terms]
     assert (known_db == 0).all()

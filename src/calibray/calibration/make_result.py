@@ -32,7 +32,7 @@ from calibray.uncertainty.assessment import Certainty
 from calibray.uncertainty.link_diagnostics import diagnose_links
 from calibray.uncertainty.noise_models import HEAVY
 from calibray.uncertainty.residual_correlation import shared_errors
-from calibray.validation.baselines import has_obstruction, log_distance, obstructed
+from calibray.validation.baselines import has_obstruction, log_distance, obstructed, without_scene
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.fallback import fit_fallback
 from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
@@ -121,7 +121,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         objective.capped(problem.before),
         nuisance_only,
         with_nuisance,
-        log_distance(links, objective, study.scene.frequency),
+        log_distance(links, objective, without_scene(study, links)),
     )
     paths = _replayed_paths(problem)
     diagnostics = diagnose_links(problem, trail.best, paths)
@@ -265,7 +265,8 @@ def _choice_on_held_out_links(
         Model.LOG_DISTANCE: models.log_distance,
     }
     if has_obstruction(setup.links):
-        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, setup.study.scene.frequency)
+        known_db = without_scene(setup.study, setup.links)
+        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db)
     errors: dict[str, NDArray[np.float64]] = {
         name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
     }

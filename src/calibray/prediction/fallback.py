@@ -11,21 +11,8 @@ from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.result.prediction_model import NO_PATH
 from calibray.result.record import Prediction
 from calibray.study import Study
+from calibray.validation.baselines import without_scene
 from calibray.validation.held_out_statistics import interval_half_width
-
-
-def without_scene(study: Study, links: Measurements) -> NDArray[np.float64]:
-    """Path loss of the log-distance model without its nuisances: the free-space rise over carriers.
-
-    Args:
-        study: The study.
-        links: The links.
-
-    Returns:
-        Path loss [links], [dB]; 0 at the study's carrier.
-    """
-    carrier = study.scene.frequency if links.frequency is None else links.frequency
-    return 20 * np.log10(np.full(len(links), carrier) / study.scene.frequency)
 
 
 def fill_missing(

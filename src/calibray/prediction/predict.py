@@ -18,7 +18,7 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
-from calibray.prediction.fallback import fill_missing, without_scene
+from calibray.prediction.fallback import fill_missing
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
@@ -28,6 +28,7 @@ from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup, Study
 from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
+from calibray.validation.baselines import without_scene
 
 NEAR_SHARE: Final = 0.1
 """Share of the residual field's variance that measured links explain, above which a link is near measured links."""

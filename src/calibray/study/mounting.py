@@ -12,11 +12,12 @@ from calibray.errors import InputError
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Paths
+from calibray.paths.chains import zenith_azimuth
 from calibray.study.model import StudyModel
 from calibray.study.sections import MountingSection
 from calibray.support.messages import did_you_mean
 from calibray.tracing.antennas import AntennaPattern
-from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose
+from calibray.tracing.mounting import EVERY, POSE, Mounting, Pose, stated_jones
 from calibray.tracing.settings import Antenna
 
 if TYPE_CHECKING:
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 
 PORT_POWER: Final = "tx_port_power_dbm"
 """Column of the links: the power that their transmitters feed into the antenna [dBm]."""
+
+LEAST_GAIN: Final = 1e-3
+"""Least gain along the straight line. In nulls, paths in other directions carry the power; the patterns of 3GPP TR
+38.901 end 30 dB below their largest gain."""
 
 
 def mounting_columns(study: StudyModel) -> tuple[str, ...]:
@@ -56,6 +61,26 @@ def _mounting(study: StudyModel, end: str, section: MountingSection, links: Meas
     elif section.azimuth_deg is not None and section.azimuth_from == "north":
         yaw = np.pi / 2 - yaw
     return Mounting(antennas, index, Pose(yaw, downtilt, electrical))
+
+
+def direct_gain(study: StudyModel, links: Measurements) -> NDArray[np.float64]:
+    """Gain of the stated antennas of both ends along the straight line of each link [L], [dBi].
+
+    An end with one of Sionna's patterns without a main direction for all links counts 0.
+
+    Raises:
+        InputError: A column is missing or malformed, or names an unknown antenna.
+    """
+    gain_db = np.zeros(len(links))
+    away = (links.rx - links.tx) / links.distance[:, None]
+    mountings = link_mountings(study, links)
+    for end, antenna in study.stated_antennas.items():
+        if end not in mountings and antenna.pattern in ("iso", "dipole", "hw_dipole"):
+            continue
+        one = Mounting((antenna,), np.zeros(len(links), dtype=np.int64), Pose(*np.zeros((3, len(links)))))
+        jones = stated_jones(mountings.get(end, one), zenith_azimuth(away if end == "tx" else -away))
+        gain_db += 10 * np.log10(np.maximum((jones[:, 0] ** 2).sum(axis=-1), LEAST_GAIN))
+    return gain_db
 
 
 def pose_effects(

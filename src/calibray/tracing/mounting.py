@@ -77,7 +77,8 @@ def mount(paths: Paths, mountings: Mapping[str, Mounting]) -> Paths:
     """
     fields = {}
     for end, mounting in mountings.items():
-        jones = _stated(paths, mounting, paths.departure if end == "tx" else paths.arrival)
+        angles = paths.departure if end == "tx" else paths.arrival
+        jones = stated_jones(mounting.of_paths(paths.link), angles)
         axis = getattr(paths, f"{end}_field").real[:, 0]
         fields[f"{end}_field"] = in_frame(jones, axis, arriving=end == "rx").astype(complex)
     return replace(paths, **fields)
@@ -88,7 +89,7 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
 
     A path that leaves in a perfect null of its antenna has none, and gets zeros: it stays without power.
     """
-    theta, phi = _stated(paths, mounting, paths.departure)[:, 0].T
+    theta, phi = stated_jones(mounting.of_paths(paths.link), paths.departure)[:, 0].T
     field = paths.tx_field[:, 0].real
     # As complex numbers, the field is the axis times the Jones vector (`in_frame`).
     jones = theta + 1j * phi
@@ -96,13 +97,12 @@ def theta_axis(paths: Paths, mounting: Mounting) -> NDArray[np.float64]:
     return np.stack([np.real(axis), np.imag(axis)], axis=-1)
 
 
-def _stated(paths: Paths, mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jones vectors of the stated antennas in the directions of paths [P, ports, 2]."""
-    on_paths = mounting.of_paths(paths.link)
-    jones = np.zeros((paths.num_paths, mounting.antennas[0].ports, 2))
+def stated_jones(mounting: Mounting, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Jones vectors [P, ports, 2] of mounted antennas, each in one direction: zenith and azimuth [P, 2], [rad]."""
+    jones = np.zeros((len(angles), mounting.antennas[0].ports, 2))
     for number, antenna in enumerate(mounting.antennas):
-        chosen = on_paths.index == number
-        pose = Pose(*(angle[chosen] for angle in on_paths.pose))
+        chosen = mounting.index == number
+        pose = Pose(*(angle[chosen] for angle in mounting.pose))
         jones[chosen] = jones_vectors(AntennaPattern.of(antenna), angles[chosen], pose)
     return jones
 

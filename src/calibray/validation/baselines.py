@@ -15,6 +15,8 @@ from calibray.fitting.nuisance import CONSTANT, LOG_DISTANCE, UNBOUNDED, Nuisanc
 from calibray.fitting.objective import Objective
 from calibray.measurements import Measurements
 from calibray.scenes.obstruction import OUT_OF_SIGHT, WALLS
+from calibray.study import Study
+from calibray.study.mounting import direct_gain
 from calibray.uncertainty.residual_correlation import fit_correlation
 
 OUT_OF_SIGHT_DB: Final = (10.0, 10.0)
@@ -35,16 +37,39 @@ MOST_KRIGED: Final = 1000
 """Most links to krige from: fitting the correlation factors their covariance some hundred times."""
 
 
-def log_distance(links: Measurements, objective: Objective, frequency: float) -> NDArray[np.float64]:
+def without_scene(study: Study, links: Measurements) -> NDArray[np.float64]:
+    """What a model without a scene knows of path loss: the free-space rise over carriers, minus the antennas' gain.
+
+    Path loss rises by 20 log10(f / f0) from the study's carrier f0. The gain is that of the stated antennas along the
+    straight line.
+
+    Args:
+        study: The study.
+        links: The links, with the columns of their antennas.
+
+    Returns:
+        This part of path loss [links], [dB]; 0 at the study's carrier without antennas.
+
+    Raises:
+        InputError: A column of the antennas is missing or malformed.
+    """
+    carrier = study.scene.frequency if links.frequency is None else links.frequency
+    rise_db = 20 * np.log10(np.full(len(links), carrier) / study.scene.frequency)
+    return rise_db - direct_gain(study, links)
+
+
+def log_distance(
+    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Path loss of a log-distance model with the study's nuisances, fitted to the calibration links.
 
     Where the study has an offset per group, this model has an intercept per group. A group without calibration links
-    gets the mean intercept of the others. Over carriers, path loss rises as in free space, by 20 log10(f / f0).
+    gets the mean intercept of the others.
 
     Args:
         links: All links.
         objective: The study's objective; its weights say which links are fitted.
-        frequency: Carrier f0 of the study [Hz].
+        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
         Path loss at all links [links], [dB].
@@ -52,31 +77,27 @@ def log_distance(links: Measurements, objective: Objective, frequency: float) ->
     Raises:
         EngineError: Fewer than two links have a weight.
     """
-    model, frequency_term = log_distance_objective(links, objective, frequency)
-    coefficients = model.coefficients(frequency_term[None])
-    filled, _ = model.nuisance.filled(coefficients, objective.weight > 0)
-    return model.nuisance.contribution(filled)[0] + frequency_term
+    model, known_db = log_distance_objective(links, objective, known_db)
+    filled, _ = model.nuisance.filled(model.coefficients(known_db[None]), objective.weight > 0)
+    return model.nuisance.contribution(filled)[0] + known_db
 
 
 def log_distance_objective(
-    links: Measurements, objective: Objective, frequency: float
+    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
 ) -> tuple[Objective, NDArray[np.float64]]:
     """The log-distance model as an objective: all its unknowns are nuisance coefficients.
 
     Args:
         links: All links.
         objective: The study's objective.
-        frequency: Carrier of the study [Hz].
+        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
-        The objective, and the known part of its path loss: the free-space rise over carriers [links], [dB].
+        The objective, and the known part of its path loss [links], [dB].
 
     Raises:
         EngineError: Fewer than two links have a weight.
     """
-    frequency_term = (
-        np.zeros(len(links)) if links.frequency is None else 20 * np.log10(links.frequency / frequency)
-    )
     if np.count_nonzero(objective.weight) < 2:
         raise EngineError("the log-distance model needs at least two calibration links")
     # An intercept is no offset, so the bounds of the study's offset do not apply to it.
@@ -86,7 +107,7 @@ def log_distance_objective(
         if (by, ("",)) not in present:
             terms.append(make_term(links, _free_name(by, terms), by))
     nuisance = Nuisance(len(links), tuple(terms))
-    return replace(objective, nuisance=nuisance, ceiling_db=None), frequency_term
+    return replace(objective, nuisance=nuisance, ceiling_db=None), known_db
 
 
 def has_obstruction(links: Measurements) -> bool:
@@ -94,13 +115,15 @@ def has_obstruction(links: Measurements) -> bool:
     return OUT_OF_SIGHT in links.frame and bool(links.table.numbers(OUT_OF_SIGHT).any())
 
 
-def obstructed(links: Measurements, objective: Objective, frequency: float) -> NDArray[np.float64]:
+def obstructed(
+    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Path loss of the log-distance model with a loss out of sight and a loss per wall, fitted likewise.
 
     Args:
         links: All links, with the columns that the scene gives.
         objective: The study's objective; its weights say which links are fitted.
-        frequency: Carrier of the study [Hz].
+        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
         Path loss at all links [links], [dB].
@@ -108,13 +131,13 @@ def obstructed(links: Measurements, objective: Objective, frequency: float) -> N
     Raises:
         EngineError: Fewer than two links have a weight.
     """
-    model, known_db = obstructed_objective(links, objective, frequency)
+    model, known_db = obstructed_objective(links, objective, known_db)
     filled, _ = model.nuisance.filled(model.coefficients(known_db[None]), objective.weight > 0)
     return model.nuisance.contribution(filled)[0] + known_db
 
 
 def obstructed_objective(
-    links: Measurements, objective: Objective, frequency: float
+    links: Measurements, objective: Objective, known_db: NDArray[np.float64]
 ) -> tuple[Objective, NDArray[np.float64]]:
     """The log-distance model with obstruction as an objective, like `log_distance_objective`.
 
@@ -123,7 +146,7 @@ def obstructed_objective(
     Args:
         links: All links, with the columns that the scene gives.
         objective: The study's objective.
-        frequency: Carrier of the study [Hz].
+        known_db: Known part of their path loss [links], [dB]; see `without_scene`.
 
     Returns:
         The objective, and the known part of its path loss [links], [dB].
@@ -131,7 +154,7 @@ def obstructed_objective(
     Raises:
         EngineError: Fewer than two links have a weight.
     """
-    model, known_db = log_distance_objective(links, objective, frequency)
+    model, known_db = log_distance_objective(links, objective, known_db)
     terms, present = list(model.nuisance.terms), {term.by for term in model.nuisance.terms}
     for by, prior_db in ((OUT_OF_SIGHT, OUT_OF_SIGHT_DB[1]), (WALLS, WALL_DB)):
         if by not in present:

@@ -21,7 +21,12 @@ from calibray.result.held_out import WITHOUT_MATERIALS, Model
 from calibray.result.prediction_model import BlockErrors, FittedTerm, PredictionModel
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Study
-from calibray.validation.baselines import OUT_OF_SIGHT_DB, log_distance_objective, obstructed_objective
+from calibray.validation.baselines import (
+    OUT_OF_SIGHT_DB,
+    log_distance_objective,
+    obstructed_objective,
+    without_scene,
+)
 from calibray.validation.variants import (
     TX_OFFSET,
     add_nuisance,
@@ -92,7 +97,7 @@ def fit_prediction_model(
     objective, modelled = problem.objective, scene_db
     if name in WITHOUT_MATERIALS:
         make = log_distance_objective if name == Model.LOG_DISTANCE else obstructed_objective
-        objective, modelled = make(setup.links, problem.objective, setup.study.scene.frequency)
+        objective, modelled = make(setup.links, problem.objective, without_scene(setup.study, setup.links))
     elif name == Model.INITIAL:
         candidate, scene_db = parameters.start, problem.before
         objective, modelled = initial_objective(problem.objective, setup), scene_db

@@ -16,7 +16,7 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.result.held_out import Model
 from calibray.result.prediction_model import FittedTerm, PredictionModel
-from calibray.validation.baselines import log_distance_objective
+from calibray.validation.baselines import log_distance_objective, without_scene
 from calibray.validation.choice import fitted_terms, quantiles
 from calibray.validation.variants import add_nuisance
 
@@ -43,9 +43,9 @@ def fit_fallback(
         the calibration links if there are too few of these as well.
     """
     setup, links = problem.setup, problem.setup.links
-    objective, carrier_db = log_distance_objective(links, problem.objective, setup.study.scene.frequency)
-    terms = fitted_terms(objective, carrier_db, setup.study)
-    residuals = objective.measured - add_nuisance(objective, carrier_db)
+    objective, known_db = log_distance_objective(links, problem.objective, without_scene(setup.study, links))
+    terms = fitted_terms(objective, known_db, setup.study)
+    residuals = objective.measured - add_nuisance(objective, known_db)
     usable = without_path & ~setup.held_out
     for excluded in (links.censored, problem.faint):
         usable = usable if excluded is None else usable & ~excluded

@@ -19,7 +19,7 @@ from calibray.study import Setup, Study
 from calibray.support.progress import Progress
 from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
-from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed
+from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed, without_scene
 from calibray.validation.held_out_statistics import spatial_blocks
 from calibray.validation.validation import Validation
 from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
@@ -175,10 +175,10 @@ def fit_models(
         name: add_nuisance(variant.objective, variant.modelled(minima[:1])[0])
         for name, (variant, minima) in fit_variants(part, known_minima).items()
     }
-    frequency = setup.study.scene.frequency
-    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, frequency)
+    known_db = without_scene(setup.study, setup.links)
+    path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db)
     if has_obstruction(setup.links):
-        path_loss_db[Model.OBSTRUCTION] = obstructed(setup.links, objective, frequency)
+        path_loss_db[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db)
     for name, trend in ((Model.KRIGING, Model.LOG_DISTANCE), (Model.RESIDUAL_FIELD, Model.CALIBRATED)):
         try:
             path_loss_db[name] = kriging(setup.links, objective, path_loss_db[trend])
