@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calibray import fields
 from calibray.engines.protocol import check_candidates
-from calibray.fields.observables import link_statistics
 from calibray.materials import Material
 from calibray.measurements.observables import Statistic
 from calibray.parameters import Parameters
@@ -76,7 +74,6 @@ class Replay:
         effects: fields.Effects = (),
     ) -> None:
         self.paths, self.parameters, self.materials, self.calls = paths, parameters, dict(paths.materials), 0
-        self._observing: dict[tuple[tuple[Statistic, ...], bool], Callable] = {}
         self.effects, self._options = effects, (combining, bandwidth)
         if dtype is None:
             dtype = np.float32 if self.large and combining == "power" else np.float64
@@ -121,59 +118,46 @@ class Replay:
 
     def observe(self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]) -> NDArray[np.float64]:
         """Statistics of every link for candidates [n, K, L]; NaN where a link has no path."""
-        return self._observed(candidates, wanted, False)[0]
+        channel = replace(self._channel, wanted=wanted)
+        batches = self._observed_batches(candidates)
+        return np.concatenate([fields.link_statistics(channel, *batch) for batch in batches])
 
     def observe_and_jacobian(
         self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The same with derivatives by the parameters [n, K, L, d]."""
-        values, jacobian = self._observed(candidates, wanted, True)
-        return values, jacobian
+        channel, values, jacobians = replace(self._channel, wanted=wanted), [], []
+        for batch in self._observed_batches(candidates):
+            found, *slopes = fields.link_statistics_and_slopes(channel, *batch, self._used_columns)
+            values.append(found)
+            jacobians.append(self._by_parameter(*slopes))
+        return np.concatenate(values), np.concatenate(jacobians)
 
-    @fields.jax_settings()
-    def _observed(
-        self, candidates: NDArray[np.float64], wanted: tuple[Statistic, ...], derivatives: bool
-    ) -> tuple[NDArray[np.float64], ...]:
-        values = check_candidates(candidates, len(self.parameters))
-        if (wanted, derivatives) not in self._observing:
-            self._observing[wanted, derivatives] = self._compile_statistics(wanted, derivatives)
-        function, batches = self._observing[wanted, derivatives], []
+    def _observed_batches(
+        self, candidates: NDArray[np.float64]
+    ) -> Iterator[tuple[NDArray[np.floating], NDArray[np.floating], int]]:
+        values, base = check_candidates(candidates, len(self.parameters)), self.paths.material_table()
+        self.calls += len(values)
         for start in range(0, len(values), OBSERVED_SIZE):
             batch = values[start : start + OBSERVED_SIZE]
-            padded = np.resize(batch, (OBSERVED_SIZE, values.shape[1]))
-            answers = function(jnp.asarray(padded), len(batch))
-            batches.append([np.asarray(answer)[: len(batch)] for answer in answers])
-        self.calls += len(values)
-        return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
+            yield *self._arguments(base, batch, OBSERVED_SIZE), len(batch)
 
-    def _compile_statistics(self, wanted: tuple[Statistic, ...], derivatives: bool) -> Callable:
+    @cached_property
+    def _channel(self) -> fields.Channel:
+        """The paths as further observables see them."""
         plan = fields.layout(self.paths)
         effects = tuple(effect.ordered(plan.order) for effect in self.effects)
         departure, arrival = self.paths.departure[plan.order, 1], self.paths.arrival[plan.order, 1]
-        azimuths = jnp.asarray(departure), jnp.asarray(arrival)
-        base, parameters = jnp.asarray(self.paths.material_table()), self.parameters
+        return fields.Channel(plan.program, effects, departure, arrival, ())
 
-        def evaluate(candidate: jax.Array) -> jax.Array:
-            table = base.at[self._rows, self._columns].set(candidate[parameters.of_materials])
-            of_effects = candidate[parameters.of_effects]
-            return link_statistics(plan.program, table, effects, of_effects, azimuths, wanted)
-
-        def with_jacobian(candidate: jax.Array) -> tuple[jax.Array, ...]:
-            return (evaluate(candidate), *([jax.jacfwd(evaluate)(candidate)] if derivatives else []))
-
-        @jax.jit
-        def first(values: jax.Array, count: int) -> tuple[jax.Array, ...]:
-            """The answers for the first candidates; those for the rest are 0."""
-            shapes = jax.eval_shape(with_jacobian, values[0])
-            blank = tuple(jnp.zeros((len(values), *shape.shape), shape.dtype) for shape in shapes)
-
-            def step(index: jax.Array, answers: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-                pairs = zip(answers, with_jacobian(values[index]), strict=True)
-                return tuple(array.at[index].set(answer) for array, answer in pairs)
-
-            return jax.lax.fori_loop(0, count, step, blank)
-
-        return first
+    def _by_parameter(
+        self, by_material: NDArray[np.floating], by_effect: NDArray[np.floating]
+    ) -> NDArray[np.floating]:
+        """Derivatives by the parameters [..., d] from those by material constants and by effects."""
+        jacobian = np.empty((*by_effect.shape[:-1], len(self.parameters)), by_effect.dtype)
+        jacobian[..., self.parameters.of_materials] = by_material[..., self._rows, self._used_column]
+        jacobian[..., self.parameters.of_effects] = by_effect
+        return jacobian
 
     def _path_losses(
         self, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
@@ -191,10 +175,7 @@ class Replay:
             loss, slope, by_effect = fields.path_losses_and_slopes_with_effects(
                 self._program, tables, self._effects, values, self._used_columns, self._combining, count
             )
-            jacobian = np.empty((*loss.shape, len(self.parameters)), loss.dtype)
-            jacobian[..., self.parameters.of_materials] = slope[:, :, self._rows, self._used_column]
-            jacobian[..., self.parameters.of_effects] = by_effect
-            return loss, jacobian, 0.0
+            return loss, self._by_parameter(slope, by_effect), 0.0
         loss, slope, error = fields.path_losses_and_slopes(
             self._program, tables, self._used_columns, self._combining, count
         )
@@ -206,13 +187,7 @@ class Replay:
         while start < len(values):
             size = self._batch_size()
             batch = values[start : start + size]
-            # The program is compiled for `size` candidates: the rest of the tables keep the base values.
-            tables = np.repeat(self._base[None], size, axis=0)
-            tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
-            of_effects = np.resize(
-                batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects))
-            )
-            *answers, table_error = function(tables, of_effects, len(batch))
+            *answers, table_error = function(*self._arguments(self._base, batch, size), len(batch))
             if table_error > TABLE_TOLERANCE:
                 self._refine_tables()
                 continue
@@ -220,6 +195,18 @@ class Replay:
             start += len(batch)
         self.calls += len(values)
         return tuple(np.concatenate(column) for column in zip(*batches, strict=True))
+
+    def _arguments(
+        self, base: NDArray[np.floating], batch: NDArray[np.floating], size: int
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Material constants [size, M, 8] and values of effects [size, e] of a batch.
+
+        The program is compiled for `size` candidates: the rest of the tables keep the base values.
+        """
+        tables = np.repeat(base[None], size, axis=0)
+        tables[: len(batch), self._rows, self._columns] = batch[:, self.parameters.of_materials]
+        of_effects = np.resize(batch[:, self.parameters.of_effects], (size, len(self.parameters.of_effects)))
+        return tables, of_effects
 
     def _table_intervals(self, force: bool) -> NDArray[np.int64] | None:
         """Intervals of the tables by material and mode; None if evaluating every coefficient is faster."""

@@ -21,11 +21,13 @@ from calibray.fields.evaluation import (
     program_path_loss,
 )
 from calibray.fields.jax_context import jax_settings
+from calibray.fields.observables import Channel, link_statistics, link_statistics_and_slopes
 from calibray.fields.program import GroupedProgram, Layout, layout
 
 __all__ = [
     "COMBINING",
     "FINEST",
+    "Channel",
     "Combining",
     "Effect",
     "Effects",
@@ -34,6 +36,8 @@ __all__ = [
     "Layout",
     "jax_settings",
     "layout",
+    "link_statistics",
+    "link_statistics_and_slopes",
     "path_gains",
     "path_loss",
     "path_loss_of_gains",

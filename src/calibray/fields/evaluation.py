@@ -42,7 +42,7 @@ from calibray.fields.propagation import path_fields
 from calibray.materials import Material
 from calibray.paths import Paths
 
-_WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
+WIDE: Final = {"xla_cpu_prefer_vector_width": 512}
 """Compile for vectors of 512 bits. XLA prefers 256 even on processors with wider instructions; on others the option has
 no effect. The numbers are the same."""
 
@@ -230,17 +230,22 @@ def _slope(
     return power, slope
 
 
-def _contract(
+def contract(
     program: GroupedProgram,
-    power: jax.Array,
     slope: tuple[GroupResponse, ...],
     derivatives: tuple[MaterialResponse, ...],
     num_materials: int,
 ) -> jax.Array:
-    """Derivatives of path loss [L, M, columns]: those of the power by the response times those of the response.
+    """Derivatives of a quantity of every link by material constants [L, M, columns].
 
     Every interaction belongs to one material, so one tangent per column serves all materials at once: the cost does not
     grow with their number.
+
+    Args:
+        program: The program.
+        slope: Derivatives of the quantity by the response at every step.
+        derivatives: Derivatives of the response by the constants of each column.
+        num_materials: Number of materials M.
     """
     by_column = []
     for derivative in derivatives:
@@ -254,10 +259,20 @@ def _contract(
             for segments, product in zip(program.by_material, products, strict=True)
             if product
         ]
-        by_column.append(sum(sums, jnp.zeros(program.num_links * num_materials, power.dtype)))
+        by_column.append(sum(sums, jnp.zeros(program.num_links * num_materials, program.wavelength.dtype)))
+    return jnp.stack(by_column, axis=-1).reshape(program.num_links, num_materials, len(derivatives))
+
+
+def _contract(
+    program: GroupedProgram,
+    power: jax.Array,
+    slope: tuple[GroupResponse, ...],
+    derivatives: tuple[MaterialResponse, ...],
+    num_materials: int,
+) -> jax.Array:
+    """Derivatives of path loss [L, M, columns] from those of the power by the response."""
     inverse = jnp.where(power > 0, 1 / jnp.where(power > 0, power, 1.0), 0.0)
-    by_material = jnp.stack(by_column, axis=-1).reshape(program.num_links, num_materials, len(derivatives))
-    return -10 / np.log(10) * inverse[:, None, None] * by_material
+    return -10 / np.log(10) * inverse[:, None, None] * contract(program, slope, derivatives, num_materials)
 
 
 def _dot(a: object, b: object) -> jax.Array:
@@ -269,13 +284,13 @@ _decibel = jax.jit(decibel)
 _material_response = jax.jit(material_response)
 # The functions of `path_powers` have no compiler options, because a user may compile them as part of another function.
 _split_by_step = jax.jit(split_by_step)
-_split_by_step_wide = jax.jit(split_by_step, compiler_options=_WIDE)
+_split_by_step_wide = jax.jit(split_by_step, compiler_options=WIDE)
 _response_and_derivatives = jax.jit(response_and_derivatives, static_argnums=2)
 _gains = jax.jit(lambda program, response: path_fields(program, split_by_step(program, response)))
 _path_powers = jax.jit(lambda program, responses: path_power(path_fields(program, responses)))
-_link_power_of_steps = jax.jit(_power, compiler_options=_WIDE)
-_power_and_slope = jax.jit(_slope, compiler_options=_WIDE)
-_path_loss_slope = jax.jit(_contract, static_argnums=4, compiler_options=_WIDE)
+_link_power_of_steps = jax.jit(_power, compiler_options=WIDE)
+_power_and_slope = jax.jit(_slope, compiler_options=WIDE)
+_path_loss_slope = jax.jit(_contract, static_argnums=4, compiler_options=WIDE)
 
 
 @jax.jit
@@ -284,12 +299,12 @@ def _table_error(program: GroupedProgram, response: MaterialResponse) -> jax.Arr
     return coefficient_tables.table_error(tables, cast(TableLayout, program.coefficients))
 
 
-@partial(jax.jit, compiler_options=_WIDE)
+@partial(jax.jit, compiler_options=WIDE)
 def _link_power(program: GroupedProgram, response: MaterialResponse, combining: Combining) -> jax.Array:
     return _power(program, split_by_step(program, response), combining)
 
 
-@partial(jax.jit, compiler_options=_WIDE)
+@partial(jax.jit, compiler_options=WIDE)
 def _losses_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, combining: Combining
 ) -> jax.Array:
@@ -302,7 +317,7 @@ def _losses_by_formula(
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=3, compiler_options=_WIDE)
+@partial(jax.jit, static_argnums=3, compiler_options=WIDE)
 def _slopes_by_formula(
     program: GroupedProgram, tables: jax.Array, count: int, columns: tuple[int, ...], combining: Combining
 ) -> tuple[jax.Array, jax.Array]:
@@ -324,7 +339,7 @@ def _slopes_by_formula(
     return jax.lax.fori_loop(0, count, evaluate, (losses, slopes))
 
 
-@partial(jax.jit, compiler_options=_WIDE)
+@partial(jax.jit, compiler_options=WIDE)
 def _losses_with_effects(
     program: GroupedProgram,
     tables: jax.Array,
@@ -342,7 +357,7 @@ def _losses_with_effects(
     return jax.lax.fori_loop(0, count, evaluate, jnp.zeros((len(tables), program.num_links), tables.dtype))
 
 
-@partial(jax.jit, static_argnums=5, compiler_options=_WIDE)
+@partial(jax.jit, static_argnums=5, compiler_options=WIDE)
 def _slopes_with_effects(
     program: GroupedProgram,
     tables: jax.Array,
