@@ -65,7 +65,7 @@ class Channel:
 
 @jax_settings()
 def link_statistics(
-    channel: Channel, tables: NDArray[np.float64], values: NDArray[np.floating], count: int
+    channel: Channel, tables: NDArray[np.floating], values: NDArray[np.floating], count: int
 ) -> NDArray[np.float64]:
     """Statistics of every link [count, K, L]; NaN where a link has no path.
 
