@@ -14,12 +14,14 @@ from calibray.calibration.result import Result
 from calibray.calibration.unreached_links import unreached_remark
 from calibray.engines.cluster.workers import Workers
 from calibray.engines.ledger.ledger import LEDGER_FILE
-from calibray.engines.protocol import Engine
-from calibray.fitting.cheap_replay import make_cheap_replay
+from calibray.engines.protocol import Answering, Engine
+from calibray.engines.rays.export import Exporting
+from calibray.fitting.cheap_replay import CheapReplay, make_cheap_replay
 from calibray.fitting.fidelity_loop import retrace
 from calibray.fitting.methods import check_fit, check_method, choose
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_search import maps_rays, search_rays
 from calibray.fitting.search import search
 from calibray.result.files import FILES
 from calibray.result.held_out import Model
@@ -99,6 +101,9 @@ def calibrate(
         ledger = None if out is None else Path(out) / LEDGER_FILE
         engine = engines.make(setup, None, progress, ledger, workers)
         can_trace = True
+    exporting = None
+    if maps_rays(setup) and isinstance(engine, Answering):
+        engine = exporting = Exporting(engine, setup)
     problem = Problem.of(setup, engine)
     # With a given engine, this machine may have no ray tracer, which the check for enclosed antennas needs.
     enclosed = setup.enclosed if can_trace else None
@@ -106,10 +111,16 @@ def calibrate(
     problem = estimate_noise(leave_out_near_floor(problem, progress), progress)
     # Making the cheap model does not count as time of the search.
     paused = time.perf_counter()
-    cheap = make_cheap_replay(problem, progress, None if cheap_model is None else cheap_model.opened())
+    cheap, of_rays = CheapReplay(), ()
+    if exporting is None:
+        cheap = make_cheap_replay(problem, progress, None if cheap_model is None else cheap_model.opened())
     traced += time.perf_counter() - paused
-    trail = search(problem, choose(problem, cheap.model), progress)
-    problem, trail, gap_db = retrace(problem, trail, progress)
+    if exporting is None:
+        trail = search(problem, choose(problem, cheap.model), progress)
+        problem, trail, gap_db = retrace(problem, trail, progress)
+    else:
+        problem, trail, *of_rays = search_rays(problem, exporting, progress)
+        gap_db = None
     timing = Timing(search=time.perf_counter() - traced, trace=traced - started)
     assessment = certainty(problem, trail, progress, cheap.model)
     if plan.holdout is not None:
@@ -119,9 +130,9 @@ def calibrate(
         many = len(trail.minima) > MINIMA_WITHOUT_MULTISTART
         starts = {Model.CALIBRATED: trail.minima} if many else NO_MINIMA
         validation = validate_problem(problem, progress=progress, known_minima=starts)
-    on_links = unreached_remark(problem, progress) if can_trace else ()
+    on_links = unreached_remark(problem, progress) if can_trace and exporting is None else ()
     on_links += directions_remark(problem, trail.best)
-    run = Run(problem, trail, gap_db, cheap, enclosed, on_links, timing)
+    run = Run(problem, trail, gap_db, cheap, enclosed, (*of_rays, *on_links), timing)
     result = make_result(run, assessment, validation)
     if out is not None:
         # The folder was checked before the search; a file that appeared since then must not cost the result.

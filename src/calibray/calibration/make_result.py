@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from calibray.calibration.observable_fits import observable_fits
 from calibray.calibration.result import Result
-from calibray.engines.kinds.replay import ReplaySection
 from calibray.engines.replay import Replay
 from calibray.fitting.cheap_replay import CheapReplay
 from calibray.fitting.fidelity_loop import largest_gap
@@ -87,7 +86,7 @@ class Run:
         retrace_gap_db: Change of every link's path loss when traced again [links], [dB]; None if not traced again.
         cheap: The cheap model, if the method had one.
         enclosed: Antennas inside closed bodies; None where this was not checked.
-        on_links: Remarks on links without a path and on directions of antennas.
+        on_links: Remarks on ray mapping, on links without a path and on directions of antennas.
         timing: Time of its parts.
     """
 
@@ -327,7 +326,7 @@ def _on_blocks(
 
 def _not_judged(study: Study, accuracy: Accuracy) -> tuple[Remark, ...]:
     """A remark if no link was held out, although replay could hold blocks out at little cost."""
-    if accuracy.judgement is None and study.engine.name == "replay":
+    if accuracy.judgement is None and (not study.engine.expensive or study.engine.exports_rays):
         return (Remark(RemarkKind.NOT_JUDGED),)
     return ()
 
@@ -407,5 +406,5 @@ def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict
 def _replayed_paths(problem: Problem) -> Paths | None:
     """The replayed paths, if they are in memory and uncompressed."""
     section = problem.setup.study.engine
-    uncompressed = isinstance(section, ReplaySection) and section.compress_db is None
+    uncompressed = getattr(section, "compress_db", None) is None
     return problem.engine.paths if uncompressed and isinstance(problem.engine, Replay) else None

@@ -107,12 +107,14 @@ class Answer:
         path_loss_db: Path loss [L], [dB]; +inf where a link has no path, and for all links of a failed call.
         seconds: Time of the call [s].
         failure: Error message with engine and candidate; empty if the call succeeded.
+        rays: The response with the rays, as the program wrote it; empty from an engine without rays.
     """
 
     index: int
     path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
+    rays: bytes = b""
 
 
 @runtime_checkable

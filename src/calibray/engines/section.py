@@ -73,6 +73,11 @@ class OpenedStudy(Protocol):
         ...
 
     @property
+    def known_antennas(self) -> tuple[Antenna, Antenna] | None:
+        """Transmit and receive antenna, if the study states them."""
+        ...
+
+    @property
     def trace_settings(self) -> TraceSettings:
         """Settings of the ray tracer."""
         ...
@@ -146,6 +151,11 @@ class EngineSection(Section, ABC):
     expensive: ClassVar[bool]
     external: ClassVar[bool]
     chunked: ClassVar[bool] = False
+
+    @property
+    def exports_rays(self) -> bool:
+        """Whether an external program answers with rays, so that a replay can stand for it."""
+        return self.external and getattr(self, "rays", False) is True
 
     @abstractmethod
     def answers_by(self, study: OpenedStudy) -> list[str] | None:

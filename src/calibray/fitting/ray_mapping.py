@@ -14,42 +14,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise, product
 from typing import Any, Final, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.engines.rays.compile import RaySetting, compile_rays, powers
+from calibray.engines.rays.export import Export
 from calibray.engines.rays.surfaces import TOLERANCE
-from calibray.engines.rays.table import RayTable
 from calibray.engines.replay import Replay
-from calibray.fields import GroupedProgram, Layout, jax_settings, layout, path_powers
-from calibray.fitting.cheap_replay import METAL
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_model import BATCH, Assumption, Call, RayModel
 from calibray.fitting.search import least_squares
-from calibray.materials import Material
 from calibray.optimizers.descent import Residuals, descend_all
 from calibray.optimizers.sampling import design
-from calibray.parameters import Parameter, Parameters
-from calibray.parameters.laws import PARAMETER_BOUNDS
 from calibray.paths import Paths
-from calibray.tracing.settings import Antenna
 
-Ask = Callable[[NDArray[np.float64]], RayTable]
+Ask = Callable[[NDArray[np.float64]], Export]
 """Calls the engine for a candidate [d]; returns its rays."""
-
-Antennas = tuple[Antenna, Antenna] | None
-"""Transmit and receive antenna of an engine; None if they are unknown."""
-
-FACTOR: Final = {"thickness": 10.0, "conductivity": 30.0, "relative_permittivity": 2.0}
-"""Largest factor between a constant of the study and that of the engine."""
-
-HALF_SPACE: Final = 1e4
-"""Thickness that no wave crosses [m]: it decays there unless the conductivity is below 1e-6 S/m."""
 
 STARTS: Final = (4, 32)
 """Local searches for every assumption, and for the two best ones."""
@@ -75,144 +57,6 @@ UNDERSTOOD_DB: Final = 0.05
 MOST_CALLS: Final = 10
 """Calls after which ray mapping ends, whatever the gap."""
 
-FAINT: Final = 0.1
-"""Weight of a path without power in its link, relative to the only path of a link."""
-
-BATCH: Final = 8
-"""Sets of constants evaluated at once, for which the program is compiled; the information is averaged over as many."""
-
-
-@dataclass(frozen=True, eq=False)
-class Export:
-    """The rays of one call.
-
-    Attributes:
-        candidate: Its candidate [d].
-        paths: Its rays as a program, whose powers at the scene's constants are those of the engine.
-        level_db: Power of every path [P], [dB].
-    """
-
-    candidate: NDArray[np.float64]
-    paths: Paths
-    level_db: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls, problem: Problem, candidate: NDArray[np.float64], table: RayTable, antennas: Antennas
-    ) -> Export:
-        """Compile the rays of a call.
-
-        Raises:
-            InputError: The rays do not agree with the scene or the links.
-        """
-        setup = problem.setup
-        paths = compile_rays(table, RaySetting(setup.scene, setup.radio.frequency, antennas, setup.links))
-        return cls(candidate, paths, 10 * np.log10(powers(paths)))
-
-    @property
-    def path_loss_db(self) -> NDArray[np.float64]:
-        """The engine's path loss [L]; +inf without a path."""
-        power = np.bincount(self.paths.link, 10 ** (self.level_db / 10), self.paths.num_links)
-        with np.errstate(divide="ignore"):
-            return -10 * np.log10(power)
-
-    @property
-    def weight(self) -> NDArray[np.float64]:
-        """Weight of every path [P]: its share of the link's power, and a little more."""
-        power = 10 ** (self.level_db / 10)
-        return power / np.bincount(self.paths.link, power)[self.paths.link] + FAINT
-
-
-class Assumption(NamedTuple):
-    """What an engine may assume besides constants.
-
-    Attributes:
-        ports: Which ports of the program's antennas count, at the transmitter and at the receiver.
-        half_space: Whether surfaces are half-spaces, else slabs.
-    """
-
-    ports: tuple[tuple[float, ...], tuple[float, ...]]
-    half_space: bool
-
-
-@dataclass(frozen=True, eq=False)
-class RayModel:
-    """The powers of an export's paths as a function of the parameters and the assumed constants.
-
-    Attributes:
-        paths: The program, without correction.
-        parameters: The study's parameters, and then the assumed constants.
-        count: Number of the study's parameters.
-        assumption: What it is computed with.
-    """
-
-    paths: Paths
-    parameters: Parameters
-    count: int
-    assumption: Assumption
-
-    @classmethod
-    def of(cls, problem: Problem, export: Export, assumption: Assumption) -> RayModel:
-        """The model of the paths of an export."""
-        paths, (tx, rx) = export.paths, (np.array(ports)[:, None] for ports in assumption.ports)
-        paths = replace(paths, correction=None, tx_field=paths.tx_field * tx, rx_field=paths.rx_field * rx)
-        parameters = _with_assumed(problem.parameters, _used(paths))
-        return cls(paths, parameters, len(problem.parameters), assumption)
-
-    def level_and_slope(
-        self, candidate: NDArray[np.float64], constants: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Power of every path [n, P], [dB], and its derivatives by the constants [n, P, k], for constants [n, k]."""
-        rows, columns = self.parameters.matrix_indices(list(self.paths.materials))
-        base, count = self.paths.material_table(), self.count
-        base[rows[:count], columns[:count]] = candidate
-        assumed, levels, slopes = self._thick(constants), [], []
-        order = np.argsort(self._layout.order)
-        with jax_settings():
-            for start in range(0, len(constants), BATCH):
-                batch = assumed[start : start + BATCH]
-                filled = np.concatenate([batch, np.repeat(batch[:1], BATCH - len(batch), axis=0)])
-                level, slope = _levels_and_slopes(
-                    self._layout.program, base, rows[count:], columns[count:], filled
-                )
-                levels.append(np.asarray(level)[: len(batch), order])
-                slopes.append(np.asarray(slope)[: len(batch), order])
-        slope = np.concatenate(slopes)
-        return np.concatenate(levels), slope * ~self._is_thickness if self.assumption.half_space else slope
-
-    def materials(
-        self, candidate: NDArray[np.float64], constants: NDArray[np.float64]
-    ) -> dict[str, Material]:
-        """The materials with parameters [d] and constants [k]."""
-        values = np.concatenate([candidate, self._thick(constants)])
-        return self.parameters.materials(values, self.paths.materials)
-
-    def _thick(self, constants: NDArray[np.float64]) -> NDArray[np.float64]:
-        return (
-            np.where(self._is_thickness, HALF_SPACE, constants) if self.assumption.half_space else constants
-        )
-
-    @cached_property
-    def _is_thickness(self) -> NDArray[np.bool_]:
-        return np.array([item.constant == "thickness" for item in self.parameters], dtype=bool)[self.count :]
-
-    @cached_property
-    def _layout(self) -> Layout:
-        return layout(self.paths)
-
-
-@jax.jit
-def _levels_and_slopes(
-    program: GroupedProgram, base: jax.Array, rows: jax.Array, columns: jax.Array, values: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Powers [n, P], [dB], and derivatives [n, P, k], in the order of the program."""
-
-    def level(constants: jax.Array) -> jax.Array:
-        power = path_powers(program, base.at[rows, columns].set(constants))
-        return 10 * jnp.log10(jnp.maximum(power, 1e-30))
-
-    return jax.vmap(lambda constants: (level(constants), jax.jacfwd(level)(constants)))(values)
-
 
 @dataclass(frozen=True, eq=False)
 class Understanding:
@@ -228,14 +72,16 @@ class Understanding:
     constants: NDArray[np.float64]
     misfit_db: float
 
-    def replay(self, problem: Problem, last: Export) -> Replay:
-        """The replay of the last export's paths, corrected so that it agrees with it."""
+    def replay(self, problem: Problem, last: Call) -> Replay:
+        """The replay of a call's paths, corrected so that it agrees with it."""
         level, _ = self.model.level_and_slope(last.candidate, self.constants[None])
-        correction = 10 ** ((last.level_db - level[0]) / 10)
+        correction = 10 ** ((last.export.level_db - level[0]) / 10)
         materials = self.model.materials(last.candidate, self.constants)
         paths = replace(self.model.paths, materials=materials, correction=correction)
-        radio = problem.setup.radio
-        return Replay(paths, problem.parameters, radio.combining, radio.bandwidth)
+        replay = Replay(paths, problem.parameters)
+        # Results state the constants of the scene, not those that the engine assumes.
+        replay.materials = dict(problem.setup.scene.materials)
+        return replay
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,16 +89,18 @@ class RayMap:
     """A finished ray mapping.
 
     Attributes:
-        engine: Replay that agrees with the engine at the last call.
-        exports: The calls; the last one is at the minimum of the program that the others corrected.
+        engine: Replay that agrees with the engine at the best call.
+        calls: The calls; from the third on, each is at the minimum of the program that the others corrected.
+        best: The call of least objective.
         understanding: What explains the engine.
         gap_db: Root mean square over the links of the answered minus the predicted path loss at the last call [dB].
-        changed: Number of paths of the last call that another call lacks.
+        changed: Number of paths of the best call that another call lacks.
         changed_db: Largest change of a link's path loss without them [dB].
     """
 
     engine: Replay
-    exports: tuple[Export, ...]
+    calls: tuple[Call, ...]
+    best: Call
     understanding: Understanding
     gap_db: float
     changed: int
@@ -260,25 +108,18 @@ class RayMap:
 
     @property
     def understood(self) -> bool:
-        """Whether the assumed constants explain all calls."""
-        return self.understanding.misfit_db <= UNDERSTOOD_DB
+        """Whether the assumed constants explain all calls, and predicted the last one."""
+        return max(self.understanding.misfit_db, self.gap_db) <= UNDERSTOOD_DB
 
 
 def map_rays(
-    problem: Problem,
-    ask: Ask,
-    *,
-    antennas: Antennas = None,
-    tolerance_db: float = 0.01,
-    most_calls: int = MOST_CALLS,
-    seed: int = 0,
+    problem: Problem, ask: Ask, *, tolerance_db: float = 0.01, most_calls: int = MOST_CALLS, seed: int = 0
 ) -> RayMap:
     """Call an engine until its path loss at the minimum is predicted.
 
     Args:
         problem: The problem; its engine is not called.
         ask: Calls the engine.
-        antennas: The engine's antennas, if they are known.
         tolerance_db: Gap at which it ends [dB].
         most_calls: Calls after which it ends.
         seed: Seed of the random numbers.
@@ -288,36 +129,57 @@ def map_rays(
     """
     parameters = problem.parameters
 
-    def call(candidate: NDArray[np.float64]) -> Export:
-        return Export.of(problem, candidate, ask(candidate), antennas)
+    def call(candidate: NDArray[np.float64]) -> Call:
+        return Call(candidate, ask(candidate))
 
-    exports = [call(parameters.start)]
-    exports.append(call(_most_informative(problem, exports[0], np.random.default_rng(seed))))
+    calls = [call(parameters.start)]
+    calls.append(call(_most_informative(problem, calls[0], np.random.default_rng(seed))))
     while True:
-        understanding = _understand(problem, exports, antennas is not None, seed)
-        replay = understanding.replay(problem, exports[-1])
-        starts = parameters.to_search(np.array([export.candidate for export in exports]))
-        minimum = least_squares(replace(problem, engine=replay), SEARCHES, starts).best.x
-        exports.append(call(parameters.from_search(minimum)))
-        predicted, answered = replay.path_loss(exports[-1].candidate[None])[0], exports[-1].path_loss_db
-        reached = np.isfinite(answered) & np.isfinite(predicted)
-        gap = float(np.sqrt(np.mean((answered - predicted)[reached] ** 2)))
-        if gap <= tolerance_db or len(exports) >= most_calls:
+        understanding = _understand(problem, calls, seed)
+        replay = understanding.replay(problem, calls[-1])
+        starts = parameters.to_search(np.array([candidate for candidate, _ in calls]))
+        minimum = least_squares(with_engine(problem, replay), SEARCHES, starts).best.x
+        calls.append(call(parameters.from_search(minimum)))
+        gap = _gap(replay, calls[-1])
+        if gap <= tolerance_db or len(calls) >= most_calls:
             break
-    model = RayModel.of(problem, exports[-1], understanding.model.assumption)
-    final = _fit(model, exports, STARTS[1], seed, understanding.constants)
-    changed, changed_db = _changes(exports)
-    return RayMap(final.replay(problem, exports[-1]), tuple(exports), final, gap, changed, changed_db)
+    best = min(calls, key=lambda each: _objective(problem, each))
+    ordered = [*(each for each in calls if each is not best), best]
+    model = RayModel.of(parameters, best.export, understanding.model.assumption)
+    final = _fit(model, ordered, STARTS[1], seed, understanding.constants)
+    changed, changed_db = _changes(ordered)
+    return RayMap(final.replay(problem, best), tuple(calls), best, final, gap, changed, changed_db)
 
 
-def _most_informative(problem: Problem, export: Export, random: np.random.Generator) -> NDArray[np.float64]:
+def with_engine(problem: Problem, replay: Replay) -> Problem:
+    """The problem on a replay; links without a path there are left out unless they are censored."""
+    objective = problem.objective
+    if objective.ceiling_db is None:
+        reached = np.isfinite(replay.path_loss(problem.parameters.start[None])[0])
+        objective = replace(objective, weight=np.where(reached, objective.weight, 0.0))
+    return replace(problem, engine=replay, objective=objective)
+
+
+def _objective(problem: Problem, call: Call) -> float:
+    residuals = problem.residuals(call.candidate[None], call.export.path_loss_db[None])
+    return float(np.sqrt(np.mean(residuals**2)))
+
+
+def _gap(replay: Replay, call: Call) -> float:
+    """Root mean square over the links of the answered minus the predicted path loss [dB]."""
+    change = call.export.path_loss_db - replay.path_loss(call.candidate[None])[0]
+    return float(np.sqrt(np.mean(change[np.isfinite(change)] ** 2)))
+
+
+def _most_informative(problem: Problem, call: Call, random: np.random.Generator) -> NDArray[np.float64]:
     """The candidate whose ratios to the first call say most about the assumed constants [d]."""
-    model = RayModel.of(problem, export, Assumption(_all_ports(export), half_space=False))
+    export = call.export
+    model = RayModel.of(problem.parameters, export, Assumption(_all_ports(export), half_space=False))
     probes = problem.parameters.from_unit(design("sobol", PROBES, model.count, random))
     assumed = model.parameters.from_unit(random.random((BATCH, len(model.parameters))))
     scale = model.parameters.search_slope(assumed)[:, None, model.count :]
     constants, weight = assumed[:, model.count :], np.sqrt(export.weight)[:, None] / SIGMA_DB
-    _, first = model.level_and_slope(export.candidate, constants)
+    _, first = model.level_and_slope(call.candidate, constants)
     information = []
     for probe in probes:
         slope = (model.level_and_slope(probe, constants)[1] - first) * scale * weight
@@ -338,32 +200,36 @@ def _assumptions(export: Export, known: bool) -> Iterator[Assumption]:
         yield Assumption(ports, half_space)
 
 
-def _understand(problem: Problem, exports: list[Export], known: bool, seed: int) -> Understanding:
+def _understand(problem: Problem, calls: list[Call], seed: int) -> Understanding:
     """Fit every assumption with few searches, and the two best ones with many."""
-    models = [RayModel.of(problem, exports[-1], item) for item in _assumptions(exports[-1], known)]
-    first = [_fit(model, exports, STARTS[0], seed) for model in models]
+    last, known = calls[-1].export, problem.setup.known_antennas is not None
+    models = [RayModel.of(problem.parameters, last, item) for item in _assumptions(last, known)]
+    first = [_fit(model, calls, STARTS[0], seed) for model in models]
     best = sorted(first, key=lambda fit: fit.misfit_db)[:2]
-    refined = [_fit(fit.model, exports, STARTS[1], seed, fit.constants) for fit in best]
+    refined = [_fit(fit.model, calls, STARTS[1], seed, fit.constants) for fit in best]
     return min(refined, key=lambda fit: fit.misfit_db)
 
 
 class _Ratios(NamedTuple):
     """Paths that the last call shares with an earlier one: their indices in both, and their weights [m]."""
 
-    export: Export
+    call: Call
     last: NDArray[np.int64]
     earlier: NDArray[np.int64]
     weight: NDArray[np.float64]
 
 
 def _fit(
-    model: RayModel, exports: list[Export], starts: int, seed: int, x0: NDArray[np.float64] | None = None
+    model: RayModel, calls: list[Call], starts: int, seed: int, x0: NDArray[np.float64] | None = None
 ) -> Understanding:
     """Least squares of the ratios to the last export, over the assumed constants."""
-    last, count, parameters = exports[-1], model.count, model.parameters
-    shared = [(export, *_common(last.paths, export.paths)) for export in exports[:-1]]
-    total = sum(last.weight[here].sum() for _, here, _ in shared)
-    ratios = [_Ratios(export, a, b, np.sqrt(last.weight[a] / total)) for export, a, b in shared]
+    last, count, parameters = calls[-1], model.count, model.parameters
+    shared = [(call, *_common(last.export.paths, call.export.paths)) for call in calls[:-1]]
+    weight = last.export.weight
+    total = sum(weight[here].sum() for _, here, _ in shared)
+    if not total:  # no two calls share a path
+        return Understanding(model, parameters.start[count:], np.inf)
+    ratios = [_Ratios(call, a, b, np.sqrt(weight[a] / total)) for call, a, b in shared]
     if len(parameters) == count:
         residuals, _ = _errors(model, ratios, last, np.zeros((1, 0)))
         return Understanding(model, np.zeros(0), float(np.linalg.norm(residuals)))
@@ -388,14 +254,14 @@ def _fit(
 
 
 def _errors(
-    model: RayModel, ratios: list[_Ratios], last: Export, constants: NDArray[np.float64]
+    model: RayModel, ratios: list[_Ratios], last: Call, constants: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted errors of the ratios [n, m], [dB], and their derivatives by the constants [n, m, k]."""
     level, slope = model.level_and_slope(last.candidate, constants)
     residuals, slopes = [], []
-    for export, here, there, weight in ratios:
-        other, other_slope = model.level_and_slope(export.candidate, constants)
-        observed = last.level_db[here] - export.level_db[there]
+    for call, here, there, weight in ratios:
+        other, other_slope = model.level_and_slope(call.candidate, constants)
+        observed = last.export.level_db[here] - call.export.level_db[there]
         residuals.append(weight * ((level - other)[:, here] - observed))
         slopes.append(weight[:, None] * (slope - other_slope)[:, here])
     return np.concatenate(residuals, axis=1), np.concatenate(slopes, axis=1)
@@ -424,34 +290,12 @@ def _by_kinds(paths: Paths) -> dict[tuple[int, ...], list[tuple[int, Any]]]:
     return groups
 
 
-def _changes(exports: list[Export]) -> tuple[int, float]:
+def _changes(calls: list[Call]) -> tuple[int, float]:
     """Paths of the last call that another one lacks, and the largest change of path loss without them [dB]."""
-    last = exports[-1]
+    last = calls[-1].export
     kept = np.ones(last.paths.num_paths, dtype=bool)
-    for export in exports[:-1]:
-        kept &= np.isin(np.arange(len(kept)), _common(last.paths, export.paths)[0])
+    for call in calls[:-1]:
+        kept &= np.isin(np.arange(len(kept)), _common(last.paths, call.export.paths)[0])
     power, link = 10 ** (last.level_db / 10), last.paths.link
     share = np.bincount(link, power * ~kept) / np.maximum(np.bincount(link, power), 1e-300)
     return int((~kept).sum()), float(-10 * np.log10(max(1 - share.max(initial=0.0), 1e-12)))
-
-
-def _used(paths: Paths) -> dict[str, Material]:
-    """The materials that a path meets, except metal."""
-    met = np.unique(paths.material)
-    return {
-        name: item
-        for index, (name, item) in enumerate(paths.materials.items())
-        if index in met and item.conductivity < METAL
-    }
-
-
-def _with_assumed(parameters: Parameters, materials: dict[str, Material]) -> Parameters:
-    """The parameters, and then the constants that the engine may assume otherwise."""
-    calibrated = {f"{parameter.material}.{parameter.constant}" for parameter in parameters}
-    assumed = []
-    for name, field in product(materials, FACTOR):
-        value, bound = getattr(materials[name], field), PARAMETER_BOUNDS[field]
-        if f"{name}.{field}" not in calibrated and value > 0:
-            lower, upper = max(value / FACTOR[field], bound.lower), min(value * FACTOR[field], bound.upper)
-            assumed.append(Parameter(f"{name}.{field}", lower, upper, value, "log"))
-    return replace(parameters, items=(*parameters.items, *assumed))

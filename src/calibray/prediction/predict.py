@@ -146,10 +146,10 @@ def traced_materials(result: Record, materials: dict[str, Material] | None) -> d
 
     Returns:
         None if the paths do not depend on the materials, so that one cached trace serves for all of them: the tracer
-        samples only refraction and diffuse reflection by the materials.
+        samples only refraction and diffuse reflection by the materials. The powers of a program's rays depend on them.
     """
-    trace = result.study.trace
-    return materials if trace.refraction or trace.diffuse_reflection else None
+    trace, rays = result.study.trace, result.study.engine.exports_rays
+    return materials if trace.refraction or trace.diffuse_reflection or rays else None
 
 
 def check_groups(result: Record, links: Measurements) -> None:

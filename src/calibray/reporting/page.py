@@ -161,8 +161,8 @@ def collect(result: Record, progress: Progress | None = None) -> PageData:
             missing.append(f"Scene: {error}.")
     triangles = None if scene is None else read_triangles(scene)
     drawn = None
-    if study.engine.external:
-        missing.append(f"Paths: the engine {study.engine.name} returns path loss only.")
+    if study.engine.external and result.paths is None:
+        missing.append(f"Paths: those of the engine {study.engine.name} are not stored.")
     else:
         try:
             drawn = rays(result, progress)

@@ -20,6 +20,8 @@ class RemarkKind(StrEnum):
     )
     FEW_DRAWS = "few draws"
     APPROXIMATE_INTERVALS = "approximate intervals"  # engine, calls, error_db, replay
+    # understood, misfit_db, gap_db, calls, changed (paths) and changed_db, half_space; names and values of constants
+    RAY_MAPPING = "ray mapping"
     NO_CHEAP_MODEL = "no cheap model"  # cause
     NOT_JUDGED = "not judged"
     # transmitters; azimuth_deg and downtilt_deg, what to add to their stated angles, and azimuth_error_deg,

@@ -241,6 +241,30 @@ def _antenna_directions(values: dict[str, Any]) -> str:
     )
 
 
+def _ray_mapping(values: dict[str, Any]) -> str:
+    assumed = zip(values["names"], values["values"], strict=True)
+    constants = ", ".join(f"{name} {value:.3g}" for name, value in assumed)
+    surfaces = "half-spaces" if values["half_space"] else "slabs"
+    text = (
+        f"In {values['calls']} calls, ratios of the powers of the program's rays are explained with a misfit of "
+        f"{values['misfit_db']:.3f} dB, and path loss at the last call was predicted within {values['gap_db']:.3f} dB"
+    )
+    if values["understood"]:
+        text = f"The program is understood. {text}. Its surfaces are {surfaces}"
+        text += f" with {constants}." if constants else "."
+    else:
+        text = (
+            f"The program is not understood. {text}. A replay that agrees with it at the best call stands for it: the "
+            "optimum may be missed, and intervals are approximate."
+        )
+    if values["changed"]:
+        text += (
+            f" {values['changed']} paths of the best call are absent from another call; without them, the path loss of "
+            f"a link changes by up to {values['changed_db']:.2f} dB."
+        )
+    return text
+
+
 _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
     RemarkKind.CORRELATED_NOISE: _noise_remark("Neighbouring links share part of their noise"),
     RemarkKind.HEAVY_TAILS: _noise_remark("The noise has heavy tails, as with outliers"),
@@ -262,6 +286,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
         "Calibrate fewer parameters, or give them priors."
     ),
     RemarkKind.APPROXIMATE_INTERVALS: _approximate_intervals,
+    RemarkKind.RAY_MAPPING: _ray_mapping,
     RemarkKind.NO_CHEAP_MODEL: lambda values: f"No cheap model is used: {values['cause']}.",
     RemarkKind.NOT_JUDGED: lambda values: NOT_JUDGED,
     RemarkKind.UNREACHED_LINKS: _unreached_links,

@@ -102,12 +102,13 @@ class StudyModel(Section, ABC):
                 f"links.below_floor = 'censor' with noise.range_m = {self.noise.range_m:g}: censored links are "
                 "counted as if their errors were independent; leave one of them out"
             )
+        self._check_rays()
         self._check_regions()
         self._check_poses()
         self._check_position_errors()
         if OFFSET in self.nuisance:
             raise InputError("nuisance.offset: [offset] has this name; choose another")
-        if getattr(self.engine, "rays", None) is not None and (
+        if getattr(self.engine, "rays", None) and (
             self.links.mountings or self.links.position_error_m is not None
         ):
             raise InputError(
@@ -123,6 +124,20 @@ class StudyModel(Section, ABC):
         self._check_materials()
         self._check_parameters()
         return self
+
+    def _check_rays(self) -> None:
+        refused = {
+            f"objective.combining = {self.objective.combining!r}": self.objective.combining != "power",
+            "links.frequency": self.links.frequency is not None,
+            "[observables]": bool(self.observables),
+            "coefficients of laws": any(".itu_" in name for name in self.parameters),
+        }
+        for key, stated in refused.items():
+            if self.engine.exports_rays and stated:
+                raise InputError(
+                    "engine.rays = true: powers of rays are compared at one carrier and add up, so it does not go with "
+                    f"{key}; remove one of them"
+                )
 
     def _check_regions(self) -> None:
         for name in self.parameters:

@@ -10,12 +10,13 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Any, Final, final
+from typing import TYPE_CHECKING, Any, Final, cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from calibray.engines.protocol import Answering
 from calibray.engines.section import EngineSection, RadioSettings
 from calibray.errors import InputError
 from calibray.materials import Material
@@ -54,7 +55,7 @@ from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.mounting import Mounting, mount
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.tracing.protocol import Tracer, TracerFactory
-from calibray.tracing.settings import TraceSettings
+from calibray.tracing.settings import Antenna, TraceSettings
 from calibray.tracing.trace_plan import LONG_TRACE_SECONDS
 
 if TYPE_CHECKING:
@@ -351,6 +352,11 @@ class Setup:
         )
 
     @property
+    def known_antennas(self) -> tuple[Antenna, Antenna] | None:
+        """Transmit and receive antenna, if the study states them; else those of an engine are unknown."""
+        return self.radio.antennas if self.study.antennas != AntennasSection() else None
+
+    @property
     def trace_settings(self) -> TraceSettings:
         """Settings of the ray tracer."""
         return self.study.trace
@@ -425,7 +431,7 @@ class Setup:
     ) -> Paths:
         """The paths of the links, from the cache if they were traced before; or from the ray table of the study.
 
-        Links that differ only in their carrier are traced once.
+        A program that answers with rays is called once. Links that differ only in their carrier are traced once.
 
         Args:
             materials: Constants in place of the scene's, by material name.
@@ -441,7 +447,9 @@ class Setup:
         for name in materials or {}:
             check_material_name(name, self.scene.materials, "materials")
         if self.study.rays_path is not None:
-            return self._paths_of_table(self.study.rays_path, materials or {})
+            return _paths_of_table(self, self.study.rays_path, materials or {})
+        if self.study.engine.exports_rays:
+            return _paths_of_program(self, materials or {}, progress)
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
             return self._mounted(self._trace_links(scene, progress))
@@ -523,18 +531,6 @@ class Setup:
             cache.store_trace(digest, paths)
         return paths
 
-    def _paths_of_table(self, file: Path, materials: Mapping[str, Material]) -> Paths:
-        """The paths of the study's ray table, whose powers are those at the start values."""
-        from calibray.engines.rays.compile import RaySetting, compile_rays
-        from calibray.engines.rays.files import read_ray_file
-        from calibray.engines.rays.table import RayTable
-
-        # Antennas that the study does not state are those of the engine, which are unknown.
-        stated = self.radio.antennas if self.study.antennas != AntennasSection() else None
-        setting = RaySetting(self.scene, self.study.scene.frequency, stated, self.links)
-        paths = compile_rays(RayTable.of(read_ray_file(file)), setting)
-        return replace(paths, materials={**paths.materials, **materials})
-
     def _with_tracer(self, changed: Setup) -> Setup:
         """A changed setup with the same tracer, which depends neither on links nor on methods."""
         changed.__dict__["_loaded"] = self._loaded
@@ -548,3 +544,23 @@ class Setup:
 
     def _open_tracer(self, scene: Scene, frequency: float) -> Tracer:
         return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
+
+
+def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:
+    """The paths of the study's ray table, whose powers are those at the start values."""
+    from calibray.engines.rays.compile import RaySetting, compile_rays
+    from calibray.engines.rays.files import read_ray_file
+    from calibray.engines.rays.table import RayTable
+
+    paths = compile_rays(RayTable.of(read_ray_file(file)), RaySetting.of(setup))
+    return replace(paths, materials={**paths.materials, **materials})
+
+
+def _paths_of_program(setup: Setup, materials: Mapping[str, Material], progress: Progress | None) -> Paths:
+    """The paths that the study's program answers with, whose powers are those at these materials."""
+    from calibray.engines.rays.export import Exporting
+
+    scene = replace(setup.scene, materials={**setup.scene.materials, **materials})
+    candidate = [getattr(scene.materials[item.material], item.constant) for item in setup.parameters]
+    program = cast(Answering, setup.study.engine.open(setup, None, progress, None))
+    return Exporting(program, replace(setup, scene=scene)).export(np.array(candidate)).paths

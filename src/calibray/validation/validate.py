@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray import engines
 from calibray.engines.cluster.workers import Workers
+from calibray.engines.protocol import Answering
+from calibray.engines.rays.export import Exporting
 from calibray.errors import EngineError, InputError
+from calibray.fitting.methods import AUTO
 from calibray.fitting.preliminary_fits import estimate_noise, leave_out_near_floor
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_search import maps_rays, search_rays
 from calibray.result.held_out import Model
 from calibray.study import Setup, Study
 from calibray.support.progress import Progress
@@ -70,7 +74,12 @@ def validate(
     # Links that the study holds out are held out in turn like all others.
     setup = replace(setup, held_out=np.zeros(len(setup.links), dtype=bool))
     check_engine(setup.study)
-    problem = Problem.of(setup, engines.make(setup, progress=progress, workers=workers))
+    engine = engines.make(setup, progress=progress, workers=workers)
+    if maps_rays(setup):
+        exporting = Exporting(cast(Answering, engine), setup)
+        problem, *_ = search_rays(Problem.of(setup, exporting), exporting, progress)
+    else:
+        problem = Problem.of(setup, engine)
     return validate_problem(estimate_noise(leave_out_near_floor(problem)), blocks, by, progress)
 
 
@@ -83,7 +92,8 @@ def check_engine(study: Study) -> None:
     Raises:
         InputError: The engine is not "replay".
     """
-    if study.engine.name != "replay":
+    by_rays = study.engine.exports_rays and study.method.name == AUTO
+    if study.engine.name != "replay" and not by_rays:
         raise InputError(
             f"{study.path}: each block that is held out takes a calibration, which is too expensive on the engine "
             f"{study.engine.name!r}; set engine.name to 'replay', or hold links out by [holdout] where"

@@ -27,6 +27,7 @@ VERSION: Final = 1
 ANSWER: Final = "path_loss_db"
 PATH_LOSS_DB: Final = (20.0, 300.0)  # range of a plausible answer
 RESPONSE_BYTES: Final = (16 << 20, 4 << 10)  # largest response: fixed part, and per link
+RAYS_BYTES: Final = (16 << 20, 64 << 10)  # the same with rays: some hundred paths per link
 _WITHOUT_PATH: Final = (None, "inf", "Infinity")
 
 
@@ -125,7 +126,7 @@ def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.floa
     Raises:
         Unusable: The file is missing or malformed, or does not hold one path loss per link.
     """
-    response = _read_bytes(path, num_links)
+    response = _read_bytes(path, RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links)
     values = _read_json(response) if file_format == "json" else _read_hdf5(response, num_links)
     _check_shape(values.shape, num_links)
     lower, upper = PATH_LOSS_DB
@@ -140,12 +141,21 @@ def read_answer(path: Path, file_format: str, num_links: int) -> NDArray[np.floa
     return values
 
 
+def read_rays(path: Path, num_links: int) -> bytes:
+    """The response of a program that answers with a ray table.
+
+    Raises:
+        Unusable: The file is missing, no regular file, or too large.
+    """
+    return _read_bytes(path, RAYS_BYTES[0] + RAYS_BYTES[1] * num_links)
+
+
 def _check_shape(shape: tuple[int, ...], num_links: int) -> None:
     if shape != (num_links,):
         raise Unusable(f"its response holds {ANSWER} of shape {shape}, must be ({num_links},): one per link")
 
 
-def _read_bytes(path: Path, num_links: int) -> bytes:
+def _read_bytes(path: Path, limit: int) -> bytes:
     """The bytes of a response. Only a regular file is read, because a program may leave anything there."""
     try:
         # O_NOFOLLOW does not follow a link; O_NONBLOCK does not wait for the writer of a FIFO.
@@ -156,7 +166,7 @@ def _read_bytes(path: Path, num_links: int) -> bytes:
         raise Unusable(
             f"its response cannot be read ({error.strerror}); it must be a file, not a link to one"
         ) from None
-    status, limit = os.fstat(handle), RESPONSE_BYTES[0] + RESPONSE_BYTES[1] * num_links
+    status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
         raise Unusable("its response is not a file but a folder, a FIFO or a device")

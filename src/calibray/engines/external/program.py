@@ -28,7 +28,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from calibray.engines.external.exchange import Request, Unusable, read_answer
+from calibray.engines.external.exchange import Request, Unusable, read_answer, read_rays
 from calibray.engines.process_owner import ProcessOwner
 from calibray.engines.protocol import Answer, check_candidates, gather
 from calibray.engines.section import OpenedStudy
@@ -67,11 +67,13 @@ class Outcome:
         path_loss_db: Path loss [L], [dB]; +inf without a path, and for all links if the attempts failed.
         seconds: Time of all attempts together [s].
         failure: Error of the last attempt; empty if it succeeded.
+        rays: The response of a program that answers with rays, from which path loss follows; else empty.
     """
 
     path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
+    rays: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class ExternalProgram:
         timeout: Time limit of one attempt [s].
         retries: How often to try again after a failure.
         file_format: "json" or "hdf5".
+        rays: Whether it answers with a ray table in place of path loss.
 
     Raises:
         InputError: A word contains a NUL character, which the system does not pass to programs.
@@ -95,6 +98,7 @@ class ExternalProgram:
     timeout: float
     retries: int
     file_format: str
+    rays: bool = False
 
     def __post_init__(self) -> None:
         for index, word in enumerate(self.words):
@@ -116,24 +120,27 @@ class ExternalProgram:
         """
         num_links = len(request.tx)
         started, failure, attempt = time.perf_counter(), "", 0
+        no_path = np.full(num_links, np.inf)
         while attempt <= self.retries:
             if stop is not None and stop.is_set():
                 raise Stopped
             attempt += 1
             try:
-                loss = self._attempt(request, num_links, stop)
+                response = self._attempt(request, num_links, stop)
             except Unstartable as error:
                 failure = str(error)
                 break
             except Unusable as error:
                 failure = str(error)
             else:
-                return Outcome(loss, time.perf_counter() - started)
+                seconds = time.perf_counter() - started
+                if isinstance(response, bytes):
+                    return Outcome(no_path, seconds, rays=response)
+                return Outcome(response, seconds)
         attempts = "" if attempt < 2 else f" (attempt {attempt} of {self.retries + 1})"
-        no_path = np.full(num_links, np.inf)
         return Outcome(no_path, time.perf_counter() - started, failure + attempts)
 
-    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> NDArray[np.float64]:
+    def _attempt(self, request: Request, num_links: int, stop: Event | None) -> NDArray[np.float64] | bytes:
         ending = "json" if self.file_format == "json" else "h5"
         with _call_folder() as folder:
             request_file, response_file = folder / f"request.{ending}", folder / f"response.{ending}"
@@ -153,6 +160,8 @@ class ExternalProgram:
                     raise Unusable(f"gave no answer within timeout = {self.timeout:g} s and was killed")
                 if report["status"]:
                     raise Unusable(f"ended with {_describe_status(report['status'])}")
+                if self.rays:
+                    return read_rays(response_file, num_links)
                 return read_answer(response_file, self.file_format, num_links)
             except Unusable as error:
                 output = report["output"]
@@ -293,6 +302,7 @@ class Command:
         self.parameters, self.materials, self.calls = study.parameters, dict(study.scene.materials), 0
         self.num_links = len(links)
         self._program, self._carriers, self._source = program, study.carriers, study.source
+        self._study = study
         self._blank_request = Request(study.radio, links.tx, links.rx, link_frequency=links.frequency)
         self._executor, self._progress = executor, progress
         self._successive_failures, self._give_up_after = 0, give_up_after
@@ -317,12 +327,13 @@ class Command:
         outcomes = (
             self._sequential(requests, stop) if executor is None else self._parallel(requests, stop, executor)
         )
-        for done, (index, outcome) in enumerate(outcomes, start=1):
+        for done, (index, raw) in enumerate(outcomes, start=1):
+            outcome = self._with_path_loss(raw) if raw.rays else raw
             self.calls += 1
             if self._progress is not None:
                 self._progress("running", done, len(requests))
             failure = self._describe(requests[index], outcome.failure) if outcome.failure else ""
-            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure)
+            yield Answer(index, outcome.path_loss_db, outcome.seconds, failure, outcome.rays)
             self._successive_failures = self._successive_failures + 1 if failure else 0
             if self._successive_failures >= self._give_up_after:
                 raise EngineError(
@@ -330,6 +341,15 @@ class Command:
                     "ledger: correct the program, remove the failures with `calibray ledger DIR --forget-failed`, and "
                     "start again"
                 )
+
+    def _with_path_loss(self, outcome: Outcome) -> Outcome:
+        """The outcome with the path loss of its rays, or with what is wrong with them."""
+        from calibray.engines.rays.export import Export
+
+        try:
+            return replace(outcome, path_loss_db=Export.of(self._study, outcome.rays).path_loss_db)
+        except InputError as error:
+            return replace(outcome, failure=str(error), rays=b"")
 
     def _sequential(self, requests: list[Request], stop: Event) -> Iterator[tuple[int, Outcome]]:
         for index, request in enumerate(requests):

@@ -28,6 +28,7 @@ class CommandSection(EngineSection):
         retries: How often the program is tried again after a failure.
         format: Format of the files exchanged with the program: "json" or "hdf5".
         give_up_after: Number of successive failed calls that ends the run.
+        rays: Whether the program answers with a ray table in place of path loss.
     """
 
     expensive: ClassVar[bool] = True
@@ -40,6 +41,7 @@ class CommandSection(EngineSection):
     retries: Annotated[int, Field(ge=0)] = 2
     format: Literal["json", "hdf5"] = "json"
     give_up_after: Annotated[int, Field(ge=1)] = 10
+    rays: bool = False
 
     @model_validator(mode="after")
     def _has_command(self) -> Self:
@@ -50,8 +52,8 @@ class CommandSection(EngineSection):
         return self
 
     def answers_by(self, study: OpenedStudy) -> list[str]:
-        """The program and its arguments; its version is unknown."""
-        return list(self.command)
+        """The program, its arguments, and whether it answers with rays; its version is unknown."""
+        return [*self.command, *(["rays"] if self.rays else [])]
 
     def open(
         self,
@@ -64,6 +66,6 @@ class CommandSection(EngineSection):
         from calibray.engines.external.program import Command, ExternalProgram
 
         folder = study.source.resolve().parent
-        program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format)
+        program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format, self.rays)
         executor = None if workers is None else workers.executor()
         return Command(program, study, self.give_up_after, executor, progress)

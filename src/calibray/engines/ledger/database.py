@@ -32,11 +32,13 @@ class LedgerEntry:
         path_loss_db: Path loss [L], [dB]; +inf where a link has no path.
         seconds: Time of the call [s].
         failure: Error message; empty if the call succeeded.
+        rays: The response with its rays, as the program wrote it; empty without rays.
     """
 
     path_loss_db: NDArray[np.float64]
     seconds: float
     failure: str = ""
+    rays: bytes = b""
 
     @property
     def blob(self) -> bytes:
@@ -46,8 +48,8 @@ class LedgerEntry:
     def digest(self, problem: str, candidate: bytes) -> bytes:
         """SHA-256 of the entry, its problem and its candidate."""
         digest = hashlib.sha256()
-        parts = (problem.encode(), candidate, self.blob, repr(self.seconds).encode(), self.failure.encode())
-        for part in parts:
+        parts = [problem.encode(), candidate, self.blob, repr(self.seconds).encode(), self.failure.encode()]
+        for part in [*parts, self.rays] if self.rays else parts:
             digest.update(len(part).to_bytes(8, "little"))
             digest.update(part)
         return digest.digest()
@@ -67,15 +69,15 @@ class LedgerEntry:
 def read_entry(
     problem: str, candidate: bytes, columns: tuple[object, ...], num_links: int | None = None
 ) -> LedgerEntry | str:
-    """Read an entry from a row of a ledger: path loss as bytes, seconds, failure and digest; or its damage."""
-    blob, seconds, failure, digest = columns
+    """Read an entry from a row of a ledger: path loss as bytes, seconds, failure, digest and rays; or its damage."""
+    blob, seconds, failure, digest, rays = columns
     if not (isinstance(problem, str) and isinstance(candidate, bytes) and isinstance(blob, bytes)):
         return "a value of another type"
-    if not (isinstance(seconds, float) and isinstance(failure, str)):
+    if not (isinstance(seconds, float) and isinstance(failure, str) and isinstance(rays, bytes | None)):
         return "a value of another type"
     if len(blob) % 8 or (num_links is not None and len(blob) != 8 * num_links):
         return f"{len(blob)} bytes of path loss" + ("" if num_links is None else f" for {num_links} links")
-    entry = LedgerEntry(np.frombuffer(blob, "<f8").copy(), seconds, failure)
+    entry = LedgerEntry(np.frombuffer(blob, "<f8").copy(), seconds, failure, rays or b"")
     if digest != entry.digest(problem, candidate):
         return "another checksum"
     return entry.fault or entry
@@ -95,9 +97,12 @@ _ANSWERS: Final = """CREATE TABLE IF NOT EXISTS answers (
     id INTEGER PRIMARY KEY, problem TEXT NOT NULL REFERENCES problems, candidate BLOB NOT NULL,
     path_loss_db BLOB NOT NULL, seconds REAL NOT NULL, failure TEXT NOT NULL, time TEXT NOT NULL,
     digest BLOB, UNIQUE (problem, candidate))"""
+_RAYS: Final = """CREATE TABLE IF NOT EXISTS rays (
+    problem TEXT NOT NULL, candidate BLOB NOT NULL, rays BLOB NOT NULL, PRIMARY KEY (problem, candidate))"""
 _COLUMNS: Final = {
     "problems": ["problem", "engine", "parameters"],
     "answers": ["id", "problem", "candidate", "path_loss_db", "seconds", "failure", "time", "digest"],
+    "rays": ["problem", "candidate", "rays"],
     "claims": ["problem", "candidate", "run", "owner", "expires"],
 }
 
@@ -169,7 +174,7 @@ def _set_up(connection: sqlite3.Connection, path: Path) -> None:
     run("PRAGMA journal_mode = WAL")
     run("PRAGMA synchronous = FULL")  # committed answers survive a power failure
     with transaction(connection):
-        for table in (_PROBLEMS, _ANSWERS, claims.TABLE):
+        for table in (_PROBLEMS, _ANSWERS, _RAYS, claims.TABLE):
             run(table)
         for table, columns in _COLUMNS.items():
             names = [row[1] for row in run(f"PRAGMA table_info({table})")]
@@ -199,6 +204,8 @@ def insert_answer(connection: sqlite3.Connection, problem: str, candidate: bytes
         "INSERT OR IGNORE INTO answers VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)",
         (problem, candidate, entry.blob, entry.seconds, entry.failure, now, digest),
     )
+    if entry.rays:
+        connection.execute("INSERT OR IGNORE INTO rays VALUES (?, ?, ?)", (problem, candidate, entry.rays))
 
 
 @contextmanager

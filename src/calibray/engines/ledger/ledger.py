@@ -38,7 +38,8 @@ from calibray.errors import EngineError, InputError
 
 LEDGER_FILE: Final = "ledger.sqlite"
 COLUMNS: Final = ("problem", "engine", "time", "seconds", "status", "message")
-ENTRY: Final = "path_loss_db, seconds, failure, digest"
+ENTRY: Final = "path_loss_db, seconds, failure, digest, rays"
+ANSWERS: Final = "answers LEFT JOIN rays USING (problem, candidate)"
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -103,6 +104,7 @@ class Ledger:
                         answers = run(
                             f"INSERT OR IGNORE INTO answers ({columns}) SELECT {columns} FROM rescue.answers"
                         ).rowcount
+                        run("INSERT OR IGNORE INTO rays SELECT * FROM rescue.rays")
                 finally:
                     run("DETACH rescue")
             with suppress(OSError):
@@ -132,7 +134,7 @@ class Ledger:
         """
         with self._errors():
             row = self._connection.execute(
-                f"SELECT id, {ENTRY} FROM answers WHERE problem = ? AND candidate = ?", (problem, candidate)
+                f"SELECT id, {ENTRY} FROM {ANSWERS} WHERE problem = ? AND candidate = ?", (problem, candidate)
             ).fetchone()
             if row is None:
                 return None
@@ -141,6 +143,9 @@ class Ledger:
                 return entry
             _LOG.warning("%s: call %d is damaged (%s); deleted, and run again", self.path, row[0], entry)
             self._connection.execute("DELETE FROM answers WHERE id = ?", (row[0],))
+            self._connection.execute(
+                "DELETE FROM rays WHERE problem = ? AND candidate = ?", (problem, candidate)
+            )
         return None
 
     def claim(self, problem: str, candidates: Sequence[bytes], num_links: int) -> list[bytes]:
@@ -233,7 +238,7 @@ class Ledger:
         with self._errors():
             rows = self._connection.execute(
                 f"""SELECT id, problem, engine, time, parameters, candidate, {ENTRY}
-                FROM answers JOIN problems USING (problem) ORDER BY id"""
+                FROM {ANSWERS} JOIN problems USING (problem) ORDER BY id"""
             ).fetchall()
         records = []
         for number, problem, engine, when, parameters, candidate, *columns in rows:

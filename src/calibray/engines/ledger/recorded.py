@@ -52,6 +52,11 @@ class Recorded:
         return self._engine.calls
 
     @property
+    def num_links(self) -> int:
+        """Number of links L."""
+        return self._engine.num_links
+
+    @property
     def parameters(self) -> Parameters:
         """The parameters that a candidate gives values to."""
         return self._engine.parameters
@@ -65,23 +70,25 @@ class Recorded:
         """Path loss of every link for candidates, from the ledger or else the engine; see `Answering`."""
         values = check_candidates(candidates, len(self.parameters))
         first = self.calls + self.hits == 0
-        answers = list(self._answers(values))
+        answers = list(self.answers(values))
         if first and all(answer.failure for answer in answers) and not self._ledger.read_only:
             self._ledger.forget_failures(self._problem)
         return gather(answers, (len(values), self._engine.num_links), first)
 
-    def _answers(self, values: NDArray[np.float64]) -> Iterator[Answer]:
+    def answers(self, candidates: NDArray[np.float64], stop: Event | None = None) -> Iterator[Answer]:
+        """Answer candidates from the ledger or else the engine, until `stop` is set; see `Answering.answers`."""
+        values, stop = candidates, stop or Event()
         # The same candidate may occur several times in one batch, and is run once.
         missing: dict[bytes, list[int]] = {}
         for index, value in enumerate(values):
             missing.setdefault(key(value), []).append(index)
         yield from self._from_ledger(missing)
         pause, awaited = SHORTEST_WAIT, 0
-        while missing:
+        while missing and not stop.is_set():
             self._describe()
             if claimed := self._ledger.claim(self._problem, list(missing), self._engine.num_links):
                 yield from self._from_engine(
-                    values, {candidate: missing.pop(candidate) for candidate in claimed}
+                    values, {candidate: missing.pop(candidate) for candidate in claimed}, stop
                 )
                 pause, awaited = SHORTEST_WAIT, len(missing)
             before = len(missing)
@@ -107,9 +114,11 @@ class Recorded:
                 self.hits += len(indices)
                 yield from (_answer(index, entry) for index in indices)
 
-    def _from_engine(self, values: NDArray[np.float64], indices: dict[bytes, list[int]]) -> Iterator[Answer]:
+    def _from_engine(
+        self, values: NDArray[np.float64], indices: dict[bytes, list[int]], stop: Event
+    ) -> Iterator[Answer]:
         """The engine's answers to candidates that this run has claimed, given by their indices in the batch."""
-        keys, stop = list(indices), Event()
+        keys = list(indices)
         with self._ledger.working():
             answers = self._engine.answers(values[[indices[candidate][0] for candidate in keys]], stop)
             for answer in answers:
@@ -133,8 +142,8 @@ class Recorded:
 
 
 def _entry(answer: Answer) -> LedgerEntry:
-    return LedgerEntry(answer.path_loss_db, float(answer.seconds), answer.failure)
+    return LedgerEntry(answer.path_loss_db, float(answer.seconds), answer.failure, answer.rays)
 
 
 def _answer(index: int, entry: LedgerEntry) -> Answer:
-    return Answer(index, entry.path_loss_db, entry.seconds, entry.failure)
+    return Answer(index, entry.path_loss_db, entry.seconds, entry.failure, entry.rays)

@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from calibray.engines.rays.surfaces import TOLERANCE, Hits, Surfaces, find_edge, match
 from calibray.engines.rays.table import RayTable
+from calibray.engines.section import OpenedStudy
 from calibray.errors import InputError
 from calibray.fields import path_gains
 from calibray.paths import Kind, Paths, take_links
@@ -54,6 +55,11 @@ class RaySetting:
     frequency: float
     antennas: tuple[Antenna, Antenna] | None = None
     links: Links | None = None
+
+    @classmethod
+    def of(cls, study: OpenedStudy) -> RaySetting:
+        """The links of a study at its start values; antennas that it does not state are unknown."""
+        return cls(study.scene, study.radio.frequency, study.known_antennas, study.links)
 
 
 def compile_rays(table: RayTable, setting: RaySetting) -> Paths:

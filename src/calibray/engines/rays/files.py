@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from io import BytesIO
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,9 @@ from calibray.support.output_files import check_file, exists, replacing, write_t
 
 LARGEST_JSON: Final = 2**26
 """Largest JSON file [bytes]; in memory, its numbers take some twenty times as much."""
+
+HDF5: Final = b"\x89HDF"
+"""First bytes of an HDF5 file."""
 
 LARGEST_HDF5: Final = 2**30
 """Largest size of the datasets in memory [bytes]; kilobytes may decompress to gigabytes."""
@@ -34,17 +38,39 @@ def read_ray_file(file: str | Path) -> SourceTable:
         return read_table(path)
     if not exists(path):
         raise InputError(f"{path}: no such file")
+    if suffix != ".json":
+        return _parsed(path, str(path))
+    if (size := path.stat().st_size) > LARGEST_JSON:
+        raise InputError(
+            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20}; write .parquet or .h5"
+        )
+    return parse_rays(path.read_bytes(), str(path))
+
+
+def parse_rays(content: bytes, source: str) -> SourceTable:
+    """Read the rows of a table in memory, in JSON or HDF5.
+
+    Raises:
+        InputError: The content is malformed.
+    """
+    return _parsed(
+        BytesIO(content) if content.startswith(HDF5) else content.decode("utf-8", "replace"), source
+    )
+
+
+def _parsed(content: Path | BytesIO | str, source: str) -> SourceTable:
     try:
-        frame = _read_json(path) if suffix == ".json" else _read_hdf5(path)
+        is_json = isinstance(content, str)
+        frame = pd.DataFrame(json.loads(content)) if is_json else _read_hdf5(content, source)
     except InputError:
         raise
     # A text nested too deeply is a RuntimeError.
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         fault = shortened(str(error))
-        raise InputError(f"{path}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
+        raise InputError(f"{source}: not a ray table ({fault}); see docs/reference/ray-table.md") from None
     if frame.empty:
-        raise InputError(f"{path}: holds no rows; a ray table needs at least one path")
-    return SourceTable(frame, source=str(path))
+        raise InputError(f"{source}: holds no rows; a ray table needs at least one path")
+    return SourceTable(frame, source=source)
 
 
 def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = False) -> None:
@@ -71,16 +97,8 @@ def write_ray_file(file: str | Path, frame: pd.DataFrame, overwrite: bool = Fals
             )
 
 
-def _read_json(path: Path) -> pd.DataFrame:
-    if (size := path.stat().st_size) > LARGEST_JSON:
-        raise InputError(
-            f"{path}: {size / 2**20:,.0f} MiB of JSON, must be at most {LARGEST_JSON // 2**20}; write .parquet or .h5"
-        )
-    return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
-
-
-def _read_hdf5(path: Path) -> pd.DataFrame:
-    with h5py.File(path, "r") as file:
+def _read_hdf5(content: Path | BytesIO, source: str) -> pd.DataFrame:
+    with h5py.File(content, "r") as file:
         columns: dict[str, h5py.Dataset] = {}
         for name in map(str, file):
             is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)
@@ -89,11 +107,11 @@ def _read_hdf5(path: Path) -> pd.DataFrame:
         for name, item in columns.items():
             if item.is_virtual or item.external is not None:
                 raise InputError(
-                    f"{path}: {shortened(name)!r} is stored in another file; store it in this one"
+                    f"{source}: {shortened(name)!r} is stored in another file; store it in this one"
                 )
         if (size := sum(item.nbytes for item in columns.values())) > LARGEST_HDF5:
             raise InputError(
-                f"{path}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_HDF5 // 2**20}; export fewer links"
+                f"{source}: {size / 2**20:,.0f} MiB, must be at most {LARGEST_HDF5 // 2**20}; export fewer links"
             )
         # MATLAB writes a vector as a matrix with one row or column.
         return pd.DataFrame(

@@ -1,0 +1,124 @@
+"""The rays of one call, and an engine that answers with rays and keeps them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.engines.ledger.database import key
+from calibray.engines.ledger.recorded import Recorded
+from calibray.engines.protocol import Answering, check_candidates
+from calibray.engines.rays.compile import RaySetting, compile_rays, powers
+from calibray.engines.rays.files import parse_rays
+from calibray.engines.rays.table import RayTable
+from calibray.engines.section import OpenedStudy
+from calibray.errors import EngineError, InputError
+from calibray.materials import Material
+from calibray.parameters import Parameters
+from calibray.paths import Paths
+
+RESPONSE: Final = "its response"
+"""Name of a response in messages."""
+
+FAINT: Final = 0.1
+"""Weight of a path without power in its link, relative to the only path of a link."""
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """The rays of one call.
+
+    Attributes:
+        paths: Its rays as a program, whose powers at the scene's constants are those of the engine.
+        level_db: Power of every path [P], [dB].
+    """
+
+    paths: Paths
+    level_db: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, study: OpenedStudy, response: bytes) -> Export:
+        """Read and check the response of a program.
+
+        Raises:
+            InputError: It is no ray table, states no power, or does not agree with the scene or the links.
+        """
+        return cls.of_table(RayTable.of(parse_rays(response, RESPONSE)), RaySetting.of(study))
+
+    @classmethod
+    def of_table(cls, table: RayTable, setting: RaySetting) -> Export:
+        """Compile the rays of a call.
+
+        Raises:
+            InputError: The rays state no power, or do not agree with the scene or the links.
+        """
+        if table.power is None:
+            raise InputError(f"{table.source}: states no power of its paths; add power_db")
+        paths = compile_rays(table, setting)
+        return cls(paths, 10 * np.log10(powers(paths)))
+
+    @property
+    def path_loss_db(self) -> NDArray[np.float64]:
+        """The engine's path loss [L]; +inf without a path."""
+        power = np.bincount(self.paths.link, 10 ** (self.level_db / 10), self.paths.num_links)
+        with np.errstate(divide="ignore"):
+            return -10 * np.log10(power)
+
+    @property
+    def weight(self) -> NDArray[np.float64]:
+        """Weight of every path [P]: its share of the link's power, and a little more."""
+        power = 10 ** (self.level_db / 10)
+        return power / np.bincount(self.paths.link, power)[self.paths.link] + FAINT
+
+
+@final
+class Exporting:
+    """An engine that answers with rays, whose rays are kept: it is called once for each candidate.
+
+    Args:
+        engine: The engine.
+        study: The opened study.
+
+    Attributes:
+        parameters: The parameters that a candidate gives values to.
+        materials: The scene's materials before calibration.
+    """
+
+    def __init__(self, engine: Answering, study: OpenedStudy) -> None:
+        self.parameters: Parameters = engine.parameters
+        self.materials: dict[str, Material] = engine.materials
+        self._engine, self._study = engine, study
+        self._exports: dict[bytes, Export] = {}
+
+    @property
+    def calls(self) -> int:
+        """Number of RT calls so far: candidates that the engine itself has run."""
+        return self._engine.calls
+
+    @property
+    def hits(self) -> int:
+        """Number of candidates answered by a ledger so far."""
+        return self._engine.hits if isinstance(self._engine, Recorded) else 0
+
+    def path_loss(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Path loss of every link for candidates; see `Engine.path_loss`."""
+        return np.stack([self.export(candidate).path_loss_db for candidate in candidates])
+
+    def export(self, candidate: NDArray[np.float64]) -> Export:
+        """The rays for a candidate [d].
+
+        Raises:
+            EngineError: The call failed.
+        """
+        if (name := key(candidate)) not in self._exports:
+            (answer,) = self._engine.answers(check_candidates(candidate[None], len(self.parameters)))
+            if answer.failure:
+                raise EngineError(
+                    f"{answer.failure}. Ray mapping needs this call: correct the program, remove the failure with "
+                    "`calibray ledger DIR --forget-failed`, and start again"
+                )
+            self._exports[name] = Export.of(self._study, answer.rays)
+        return self._exports[name]

@@ -1,0 +1,165 @@
+"""`calibray run` on a program that answers with rays: three calls, and then everything as on replay."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calibray as cb
+import two_ray
+from calibray.calibration.result import Result
+from calibray.errors import EngineError, InputError
+from calibray.study.live_study import write_study_file
+from commands import run
+
+TRUTH = 7.7
+PROGRAM = """
+import cmath, json, math, sys
+with open(sys.argv[1]) as file:
+    request = json.load(file)
+open("calls.log", "a").write("x")
+permittivity = {entry["name"]: entry["relative_permittivity"] for entry in request["materials"]}["ground"]
+rows, wavelength = [], 299792458 / request["frequency"]
+eta = permittivity - 17.98j * 0.02 / (request["frequency"] / 1e9)  # ITU-R P.2040-3, a half-space of 0.02 S/m
+def add(number, points, gain):
+    length = sum(math.dist(a, b) for a, b in zip(points, points[1:]))
+    level = 20 * math.log10(wavelength / (4 * math.pi * length)) + gain + DBI
+    types = ["transmitter", "reflection", "receiver"] if len(points) == 3 else ["transmitter", "receiver"]
+    for place, (point, kind) in enumerate(zip(points, types)):
+        rows.append([number, place, kind, *point, level])
+for number, (tx, rx) in enumerate(zip(request["links"]["tx"], request["links"]["rx"])):
+    share = tx[2] / (tx[2] + rx[2])
+    ground = [a + share * (b - a) for a, b in zip(tx[:2], rx[:2])] + [0.0]
+    cosine = tx[2] / math.dist(tx, ground)
+    root = cmath.sqrt(eta - 1 + cosine**2)
+    gain = 20 * math.log10(abs((cosine - root) / (cosine + root)))  # horizontal polarization, P.2040-3 (31a)
+    RIPPLE
+    add(2 * number, [tx, rx], 0.0)
+    add(2 * number + 1, [tx, ground, rx], gain)
+names = ["path", "point", "type", "x", "y", "z", "power_db"]
+with open(sys.argv[2], "w") as file:
+    json.dump({name: [row[k] for row in rows] for k, name in enumerate(names)}, file)
+"""
+RIPPLE = "gain += math.sin(3 * permittivity + number)"
+
+
+ISOTROPIC = {"pattern": "iso", "polarization": "H"}
+
+
+def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None) -> Path:
+    """A study whose program differs from replay in thickness, conductivity, polarization and antenna gain."""
+    folder.mkdir()
+    (folder / "program.py").write_text(
+        PROGRAM.replace("RIPPLE", ripple).replace("DBI", "0.0" if antennas else "3.5")
+    )
+    command = [sys.executable, "-I", "-S", "program.py"]
+    content = two_ray.study(
+        folder, links=16, antennas=antennas or {}, objective={"combining": "power"}, holdout={"blocks": 2},
+        engine={"name": "command", "command": command, "rays": True, "retries": 0},
+    ).content()  # fmt: skip
+    write_study_file(folder, content)
+    study = cb.Study.load(folder / "study.toml")
+    links = pd.read_csv(folder / "links.csv")
+    loss = cb.engines.make(study).path_loss(np.array([[TRUTH]]))[0]
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(loss))
+    links.assign(path_loss_db=loss + noise).to_csv(folder / "links.csv", index=False)
+    (folder / "calls.log").unlink()
+    return folder / "study.toml"
+
+
+def calls(folder: Path) -> int:
+    return len((folder / "calls.log").read_text())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A finished run, and what it printed."""
+    study = write_study(tmp_path_factory.mktemp("run") / "study")
+    ran = run("run", study, "--out", study.parent / "out")
+    assert ran.exit_code == 0, ran.output
+    return study.parent, ran.output
+
+
+def test_three_calls_find_the_truth_and_the_result_has_what_replay_gives(finished: tuple[Path, str]) -> None:
+    folder, printed = finished
+    result = Result.load(folder / "out")
+    assert calls(folder) == result.rt_calls == 3
+    assert result.parameters["ground.relative_permittivity"] == pytest.approx(TRUTH, abs=0.1)
+    interval = result.intervals["ground.relative_permittivity"]
+    assert interval.lower < TRUTH < interval.upper
+    assert interval.verdict == "identified"
+    assert not interval.approximate
+    assert result.held_out is not None
+    # The thickness of a half-space is no constant of the scene.
+    assert result.materials["ground"].thickness == 1.0
+    (remark,) = (each for each in result.uncertainty.remarks if each.kind == "ray mapping")
+    assert remark.values["understood"]
+    assert remark.values["misfit_db"] < 0.01
+    assert remark.values["half_space"]
+    assert remark.values["values"] == [pytest.approx(0.02, rel=0.2)]
+    assert "The program is understood" in " ".join(printed.split())
+
+
+def test_a_second_run_pays_for_no_call(finished: tuple[Path, str]) -> None:
+    folder, _ = finished
+    before = calls(folder)
+    again = run("run", folder / "study.toml", "--out", folder / "out")
+    assert again.exit_code == 0, again.output
+    assert calls(folder) == before
+    assert Result.load(folder / "out").cost.ledger_hits == 3
+
+
+def test_predictions_and_the_page_show_the_rays_of_the_program(
+    finished: tuple[Path, str], tmp_path: Path
+) -> None:
+    """One call gives the rays of new links; its path loss is that of the program."""
+    folder, _ = finished
+    before, result = calls(folder), Result.load(folder / "out")
+    new = pd.DataFrame([[0.0, 0.0, 10.0, 20.0, 30.0, 2.0]], columns=list(two_ray.COLUMNS))
+    predicted = result.predict(new)
+    assert calls(folder) == before + 1
+    setup = cb.Setup.open(result.study, links=result.study.places(_rows(new)))
+    answered = cb.engines.make(setup).path_loss(np.array([list(result.parameters.values())]))[0]
+    np.testing.assert_allclose(predicted, answered, atol=1e-6)
+    before = calls(folder)
+    assert run("report", folder / "out", "-o", tmp_path / "report.html").exit_code == 0
+    assert "The program is understood" in (tmp_path / "report.html").read_text()
+    assert calls(folder) == before
+
+
+def test_a_program_of_other_physics_is_not_understood(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study", RIPPLE, {"tx": ISOTROPIC, "rx": ISOTROPIC})
+    ran = run("run", study, "--out", tmp_path / "out")
+    (remark,) = (
+        each for each in Result.load(tmp_path / "out").uncertainty.remarks if each.kind == "ray mapping"
+    )
+    assert not remark.values["understood"]
+    assert remark.values["misfit_db"] > 0.2
+    assert "The program is not understood" in " ".join(ran.output.split())
+
+
+def test_rays_that_do_not_fit_the_scene_are_refused_with_the_reason(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study")
+    program = study.parent / "program.py"
+    correct = program.read_text()
+    for wrong, right, message in (
+        ("+ [0.5]", "+ [0.0]", "from the nearest surface"),
+        ('"watts"]', '"power_db"]', "states no power"),
+        ("[1, 2]", "{name: [row[k] for row in rows] for k, name in enumerate(names)}", "'path'"),
+    ):
+        program.write_text(correct.replace(right, wrong))
+        with pytest.raises(EngineError, match=message):
+            cb.calibrate(cb.Study.load(study))
+    content = cb.Study.load(study).content()
+    with pytest.raises(InputError, match=r"engine\.rays = true.*combining = 'coherent'"):
+        cb.Study.from_content(content | {"objective": {"combining": "coherent"}}, study)
+
+
+def _rows(frame: pd.DataFrame) -> object:
+    from calibray.measurements import SourceTable
+
+    return SourceTable(frame, source="links")
