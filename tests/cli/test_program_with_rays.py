@@ -65,7 +65,7 @@ def write_study(folder: Path, ripple: str = "pass", antennas: dict | None = None
     study = cb.Study.load(folder / "study.toml")
     links = pd.read_csv(folder / "links.csv")
     loss = cb.engines.make(study).path_loss(np.array([[TRUTH]]))[0]
-    noise = 0.05 * np.random.default_rng(1).standard_normal(len(loss))
+    noise = 0.02 * np.random.default_rng(1).standard_normal(len(loss))
     links.assign(path_loss_db=loss + noise).to_csv(folder / "links.csv", index=False)
     (folder / "calls.log").unlink()
     return folder / "study.toml"

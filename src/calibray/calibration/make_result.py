@@ -164,7 +164,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         fit=Fit(
             parameters=parameters.named(trail.best),
             initial_parameters=parameters.named(parameters.start),
-            materials=parameters.materials(trail.best, problem.engine.materials),
+            materials=parameters.materials(trail.best, setup.scene.materials),
             rmse_db=trail.best_rmse_db,
             initial_rmse_db=_rmse(problem, models.initial, counted),
             nuisance_only_rmse_db=_rmse(problem, nuisance_only, counted) if fitted else None,

@@ -78,10 +78,7 @@ class Understanding:
         correction = 10 ** ((last.export.level_db - level[0]) / 10)
         materials = self.model.materials(last.candidate, self.constants)
         paths = replace(self.model.paths, materials=materials, correction=correction)
-        replay = Replay(paths, problem.parameters)
-        # Results state the constants of the scene, not those that the engine assumes.
-        replay.materials = dict(problem.setup.scene.materials)
-        return replay
+        return Replay(paths, problem.parameters)
 
 
 @dataclass(frozen=True, eq=False)

@@ -266,8 +266,11 @@ def with_constants(result: Record, setup: Setup) -> Setup:
         setup: Its study, opened.
 
     Returns:
-        The study with these parameters, after its own.
+        The study with these parameters, after its own; without them for a program that answers with rays, whose own
+        constants vary in the draws.
     """
+    if result.study.engine.exports_rays:
+        return setup
     spread, materials = result.study.noise.constants_spread, setup.scene.materials
     items = []
     for name in (name for name in result.uncertainty.constants_db if name in result.uncertainty.draws):

@@ -119,7 +119,7 @@ def fit_prediction_model(
         quantiles(np.sort(np.abs(residuals.errors_db))),
         residuals.blocks,
     )
-    materials = parameters.materials(candidate, problem.engine.materials) if uses_scene else None
+    materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     if isinstance(problem.engine, Replay) and problem.engine.effects:
         scene_db = problem.engine.without_effects().path_loss(candidate[None])[0]
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
