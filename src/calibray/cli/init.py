@@ -33,6 +33,9 @@ def init(
     track: Annotated[
         Path | None, typer.Option(metavar="FILE", help="GPX track with the position of each row over time.")
     ] = None,
+    antennas: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of MSI files, named like the antennas.")
+    ] = None,
     tx: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Transmitter position in the scene frame [m].")
     ] = None,
@@ -62,7 +65,7 @@ def init(
 
         progress("reading scene and links", 0, None)
         draft = draft_study(
-            scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track
+            scene, links, out, transmitters, frequency, None if tx is None else _position(tx), track, antennas
         )
         measured = draft.study.measurements()
     echo(render(assumptions(draft)))

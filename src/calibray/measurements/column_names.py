@@ -26,7 +26,8 @@ PATTERNS: Final = {
     "y": r"y|north|northing",
     "longitude": r"lon|lng|long|longitude",
     "latitude": r"lat|latitude",
-    "height": r"z|h|height|hgt",
+    "height": r"z|h|height|hgt|agl|hba",
+    "another height": r"ground|terrain|amsl|asl|building|tower|clutter|mast",
     "altitude or floor": r"alt|altitude|level",
     "path loss": r"pl|loss|pathloss",
     "path gain": r"gain|pathgain",
@@ -38,6 +39,13 @@ PATTERNS: Final = {
     "transmitted": r"tx|transmit|transmitted",
     "power": r"power|dbm",
     "decibel": r"db|dbm",
+    "antenna": r"antennas?|ant|aerial",
+    "azimuth": r"azimuths?|azimut|azi|bearing|boresight",
+    "downtilt": r"[em]?(down)?tilt|[em]dt|ret",
+    "mechanical": r"m|mech.*|m(down)?tilt|mdt",
+    "electrical": r"e|elec.*|e(down)?tilt|edt|ret|remote",
+    "additional": r"add.*|extra",
+    "sum of both tilts": r"total|tot|sum|combined|effective",
     "frequency": r"freq|frequency|carrier|fc",
     "time": r"time|timestamp|date|datetime|utc|epoch",
     "distance": r"dist.*",
@@ -133,7 +141,9 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
     if unnamed:
         candidates.append([name for name in columns if not matches(name, this, other)])
     for names in candidates:
-        height = _first(names, "height")
+        height = _height(names)
+        if height is None and unnamed:
+            height = _height([name for name in columns if not matches(name, other)]) if end == "tx" else None
         x, y = _first(names, "x"), _first(names, "y")
         if x is not None and y is not None:
             return PositionColumns("scene", x, y, height)
@@ -141,6 +151,12 @@ def find_position(frame: pd.DataFrame, end: Literal["tx", "rx"], unnamed: bool) 
         if longitude is not None and latitude is not None and _are_degrees(frame[longitude], frame[latitude]):
             return PositionColumns("geographic", longitude, latitude, height)
     return None
+
+
+def _height(names: Iterable[str]) -> str | None:
+    """The first column of heights of an antenna, or else of heights, but not of the ground or a building."""
+    heights = [name for name in names if matches(name, "height") and not matches(name, "another height")]
+    return min(heights, key=lambda name: not matches(name, "antenna"), default=None)
 
 
 def find_transmitter_height(frame: pd.DataFrame) -> str | None:

@@ -16,6 +16,7 @@ import numpy as np
 from calibray.errors import InputError
 from calibray.scenes import read_scene
 from calibray.scenes.checks import count_crossings
+from calibray.study.draft_antennas import add_antennas
 from calibray.study.draft_links import Assumption, LinksDraft
 from calibray.study.model import VERSION
 from calibray.study.study import Study
@@ -54,6 +55,7 @@ def draft(
     frequency: float | None = None,
     tx: Sequence[float] | None = None,
     track: str | Path | None = None,
+    antennas: str | Path | None = None,
 ) -> Draft:
     """Draft a study; nothing is written.
 
@@ -65,6 +67,7 @@ def draft(
         frequency: Carrier frequency [Hz], unless the links have it.
         tx: Transmitter position (x, y, z) [m] in the scene's frame, unless a table has it.
         track: GPX track with the position of each row, unless the links have it.
+        antennas: Folder of MSI files, named like the transmitters' antennas.
 
     Returns:
         The draft.
@@ -74,13 +77,13 @@ def draft(
     """
     sites, route = (Path(file) if file else None for file in (transmitters, track))
     drafted = LinksDraft(scene, Path(links), Path(target), sites, route, frequency, tx)
-    content = _content(drafted)
+    content = _content(drafted, Path(antennas) if antennas else None)
     text = study_text(content, {assumption.what: assumption.reason for assumption in drafted.assumptions})
     study = Study.from_content(tomllib.loads(text), target)
     return Draft(text, study, tuple(drafted.assumptions))
 
 
-def _content(links: LinksDraft) -> dict[str, Any]:
+def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
     """The sections of the study."""
     section = links.section
     indoors = _indoors(links)
@@ -88,7 +91,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         section["inside"] = "move"
         reason = "satellite positions are metres off, and some are inside walls"
         links.assume("links.inside", "move", reason)
-    links.assume("antennas", "iso, V, at both ends", "unknown; state yours, with their orientation")
+    antenna_section = add_antennas(links, antennas)
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
     # Behind buildings most links have no other path.
     trace["refraction" if indoors else "diffraction"] = True
@@ -96,7 +99,7 @@ def _content(links: LinksDraft) -> dict[str, Any]:
         "version": VERSION,
         "scene": {"file": links.scene_file, "frequency": links.frequency},
         "links": section,
-        "antennas": {end: {"pattern": "iso", "polarization": "V"} for end in ("tx", "rx")},
+        "antennas": antenna_section,
         "trace": trace,
         "parameters": _parameters(links, indoors),
         "offset": {"per": links.groups} if links.groups else {},

@@ -25,6 +25,7 @@ from calibray.measurements import (
     select_rows,
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
+from calibray.measurements.planner_columns import find_powers
 from calibray.measurements.selection import find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
@@ -96,7 +97,7 @@ class LinksDraft:
         self._transmitter_key = ""
         self._table = read_table(self.links)
         self._sites = None if self.transmitters is None else read_table(self.transmitters)
-        self.section["file"] = self._relative(self.links)
+        self.section["file"] = self.relative(self.links)
         self._add_track()
         self._add_transmitters()
         self.frequency = self._frequency()
@@ -105,7 +106,7 @@ class LinksDraft:
         self._add_positions(tx, rx)
         self.section |= {"value": value.column, "quantity": value.quantity}
         if value.quantity == "received_power":
-            self.section["tx_power_dbm"] = column_names.find_transmit_power(self._table.frame)
+            self.section |= self._powers(value)
         self.groups = self._offset_groups(value)
         self._add_noise_floor(value)
         self._add_averaging(rx)
@@ -119,7 +120,14 @@ class LinksDraft:
     @property
     def scene_file(self) -> str:
         """The scene, relative to the study file's folder."""
-        return self.scene if self.scene.startswith(BUNDLED) else self._relative(Path(self.scene))
+        return self.scene if self.scene.startswith(BUNDLED) else self.relative(Path(self.scene))
+
+    @property
+    def transmitter_rows(self) -> pd.DataFrame:
+        """The table of transmitters, its columns named as in the links; the links if there is none."""
+        if self._sites is None:
+            return self._table.frame
+        return self._sites.frame.rename(columns=self._name_in_links)
 
     def assume(self, what: str, value: object, reason: str) -> None:
         """Record an assumption."""
@@ -136,7 +144,8 @@ class LinksDraft:
         }
         return Study.from_content(content, self.target).measurements()
 
-    def _relative(self, file: Path) -> str:
+    def relative(self, file: Path) -> str:
+        """A file, relative to the study file's folder."""
         return Path(os.path.relpath(file, self.target.absolute().parent)).as_posix()
 
     def _columns(self) -> str:
@@ -151,7 +160,7 @@ class LinksDraft:
             raise InputError(
                 f"{self.links}: no column of times, which {self.track} needs ({self._columns()}); name it time"
             )
-        self.section["track"] = {"file": self._relative(self.track), "time": name}
+        self.section["track"] = {"file": self.relative(self.track), "time": name}
         rows = len(self._table)
         self._table = select_rows(self._table, Preparation(track=Track(str(self.track), name)))
         reason = f"given; it covers {len(self._table)} of {rows} rows"
@@ -161,7 +170,7 @@ class LinksDraft:
         """Transmitters from their table, by a common column or by one column of values per transmitter."""
         if self._sites is None or self.transmitters is None:
             return
-        self.section["transmitters"] = self._relative(self.transmitters)
+        self.section["transmitters"] = self.relative(self.transmitters)
         name = column_names.find_shared_key(self._table.frame, self._sites.frame)
         if name is not None:
             self.section["transmitter"] = self._transmitter_key = name
@@ -254,12 +263,13 @@ class LinksDraft:
         if tx is None:
             columns = ", ".join(map(str, self._sites.frame))
             raise InputError(f"{self.transmitters}: no columns of positions ({columns})")
-        # A column of transmitters gets another name if the links have one of that name.
-        x, y, height = (
-            f"{self._transmitter_key}_{name}" if name in self._table.frame else name
-            for name in (tx.x, tx.y, tx.height)
-        )
+        x, y, height = (self._name_in_links(name) for name in (tx.x, tx.y, tx.height))
         return rx, PositionColumns(tx.position, str(x), str(y), height)
+
+    def _name_in_links(self, column: str | None) -> str | None:
+        """A column of transmitters gets another name if the links have one of that name."""
+        taken = column in self._table.frame and column != self._transmitter_key
+        return f"{self._transmitter_key}_{column}" if taken else column
 
     def _add_positions(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
         self.section["tx"] = self._transmitter(tx, rx)
@@ -322,9 +332,9 @@ class LinksDraft:
         value = column_names.find_value(self._table)
         codes = find_codes(self._table.frame[value.column])
         self._assume_codes(codes, value.column)
-        power = column_names.find_transmit_power(self._table.frame)
-        if value.quantity == "rsrp" and power is not None:
-            reason = f"{value.reason}; {power} is the transmitted power"
+        powers = self._powers(value)
+        if value.quantity == "rsrp" and powers:
+            reason = f"{value.reason}; {next(iter(powers.values()))} is the transmitted power"
             value = ValueColumn(value.column, "received_power", reason)
         self.assume("links.value", value.column, value.reason)
         reason = "by name and sign"
@@ -332,6 +342,18 @@ class LinksDraft:
             reason = "the transmitted power is unknown, and is part of [offset]"
         self.assume("links.quantity", value.quantity, reason)
         return value
+
+    def _powers(self, value: ValueColumn) -> dict[str, str]:
+        """Column of EIRP or transmitted power by the key of ``[links]``; empty if there is none.
+
+        Tables of transmitters state the power of the whole carrier, of which a reference signal is a part.
+        """
+        power = column_names.find_transmit_power(self._table.frame)
+        if power is not None:
+            return {"eirp_dbm" if column_names.matches(power, "EIRP") else "tx_power_dbm": power}
+        if self._sites is None or column_names.matches(value.column, "reference signal"):
+            return {}
+        return find_powers(self.transmitter_rows)
 
     def _offset_groups(self, value: ValueColumn) -> list[str]:
         """The columns that group the offset."""
