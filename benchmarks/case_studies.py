@@ -5,8 +5,8 @@
 The links are traced once with diffuse reflection. For each scattering coefficient S of the walls, the paths are
 replayed: the RMSE of path loss with an offset for links in sight and one for those out of sight, and the RMS delay
 spread in sight, from the power delay profile in bins of 1 ns, those above 132 dB of path loss or 30 dB below the
-strongest left out, as the sounder left them out. Beside it stands the measured one (delay.csv). Without the campaign
-nothing is measured.
+strongest left out, as the sounder left them out. The measured one (delay.csv) is printed
+next to it. Without the campaign nothing is measured.
 """
 
 from __future__ import annotations

@@ -77,15 +77,15 @@ def work(place: Path, seed: int, kinds: list[str]) -> None:
             case = make(seed, number, found, folder, kinds)
         except Exception:
             case = Case("broken", traceback.format_exc(), lambda: None, damaged=True)
-        # Told first, for who cannot be asked any more.
+        # The case's number is written first, in case the process ends in it.
         print(json.dumps({"number": number, "kind": case.kind, "note": case.note}), file=answers, flush=True)
         started = time.monotonic()
         watch.programs = case.kind in PROGRAMS
         verdict = judge(case, folder, watch)
         if peak() > MEMORY:
             verdict = Verdict("memory", f"{peak() / 2**30:.1f} GiB; {verdict.verdict} {verdict.detail}")
-        told = asdict(verdict) | {"seconds": time.monotonic() - started}
-        print(json.dumps(told), file=answers, flush=True)
+        answer = asdict(verdict) | {"seconds": time.monotonic() - started}
+        print(json.dumps(answer), file=answers, flush=True)
         _remove(folder)
 
 
@@ -148,15 +148,15 @@ class Worker:
         """Run a case, and tell what came of it."""
         self._process.stdin.write(f"{number}\n")
         self._process.stdin.flush()
-        told: dict[str, object] = {"number": number, "kind": "unmade", "note": ""}
+        answer: dict[str, object] = {"number": number, "kind": "unmade", "note": ""}
         for _ in range(2):  # what it is, and what came of it
             line, before, started = None, self._spent(), time.monotonic()
             while line is None and max(self._spent() - before, (time.monotonic() - started) / 4) < LIMIT:
                 line = self._next(1.0)
             if not line:
-                return told | self._lost(line == "")
-            told |= json.loads(line)
-        return told
+                return answer | self._lost(line == "")
+            answer |= json.loads(line)
+        return answer
 
     def _lost(self, ended: bool) -> dict[str, object]:
         """What came of a case whose process ended, or goes on without end; another takes its place."""
@@ -198,11 +198,11 @@ def attack(
             except queue.Empty:
                 worker.end()
                 return
-            told = worker.run(number)
-            found.append(told)
-            if told["verdict"] in FORBIDDEN:
+            answer = worker.run(number)
+            found.append(answer)
+            if answer["verdict"] in FORBIDDEN:
                 print(
-                    f"\ncase {number}: {told['verdict']}: {told['kind']}, {told['note']}\n{told['detail']}",
+                    f"\ncase {number}: {answer['verdict']}: {answer['kind']}, {answer['note']}\n{answer['detail']}",
                     file=sys.stderr,
                 )
 
@@ -220,13 +220,13 @@ def attack(
     started = time.monotonic()
     for thread in threads:
         thread.start()
-    seen, told = sys.stderr.isatty(), started
+    seen, written = sys.stderr.isatty(), started
     try:
         while any(thread.is_alive() for thread in threads):
             time.sleep(0.5)
-            if seen or time.monotonic() - told > 30:
-                told = time.monotonic()
-                line = f"{len(found)} of {len(numbers)} cases, {told - started:.0f} s"
+            if seen or time.monotonic() - written > 30:
+                written = time.monotonic()
+                line = f"{len(found)} of {len(numbers)} cases, {written - started:.0f} s"
                 print(line, end="\r" if seen else "\n", file=sys.stderr, flush=True)
     finally:
         for worker in team:
@@ -239,17 +239,17 @@ def attack(
 
 def report(found: list[dict[str, object]]) -> int:
     """Print counts by kind and by what came of it; 1 if something forbidden did."""
-    counts = Counter((str(told["kind"]), str(told["verdict"])) for told in found)
+    counts = Counter((str(answer["kind"]), str(answer["verdict"])) for answer in found)
     columns = [*ALLOWED, *FORBIDDEN]
     print(f"{'':9}{'cases':>7}{'ms':>7}" + "".join(f"{name:>11}" for name in columns))
     for kind in [*sorted({kind for kind, _ in counts}), "all"]:
         row = [sum(n for (k, v), n in counts.items() if kind in (k, "all") and v == name) for name in columns]
-        spent = [float(str(told["seconds"])) for told in found if kind in (told["kind"], "all")]
+        spent = [float(str(answer["seconds"])) for answer in found if kind in (answer["kind"], "all")]
         print(
             f"{kind:9}{sum(row):7}{1e3 * sum(spent) / len(spent):7.0f}"
             + "".join(f"{number:11}" for number in row)
         )
-    bad = sorted(int(str(told["number"])) for told in found if told["verdict"] in FORBIDDEN)
+    bad = sorted(int(str(answer["number"])) for answer in found if answer["verdict"] in FORBIDDEN)
     if bad:
         print(f"\nforbidden: {', '.join(map(str, bad[:100]))}; see one again with --case N")
     return 1 if bad else 0
@@ -262,8 +262,8 @@ def main(place: Path, chosen: argparse.Namespace) -> int:
     )
     found = attack(place, numbers, chosen.seed, chosen.workers, chosen.kinds)
     if chosen.case is not None:
-        told = found[0]
-        print(f"{told['kind']}: {told['note']}\n{told['verdict']}: {told['detail']}")
+        answer = found[0]
+        print(f"{answer['kind']}: {answer['note']}\n{answer['verdict']}: {answer['detail']}")
     return report(found)
 
 

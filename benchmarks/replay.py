@@ -1,4 +1,4 @@
-"""How much faster replay is than running the ray tracer again, with the agreement beside the time.
+"""How much faster replay is than running the ray tracer again, with the agreement and the time.
 
 Everything is measured in one run on one machine, so that only ratios matter:
 

@@ -48,8 +48,8 @@ WALKS = {
     "boulder": (EXAMPLES / "nist_boulder.toml", ()),
     "auckland": (EXAMPLES / "auckland_tower.toml", ()),
 }
+RUN = "run study.toml --out result"
 FINISH = (
-    "run study.toml --out result",
     "predict result result/result-links.csv --out predicted.csv",
     "export result --out exported --copy",
 )
@@ -95,19 +95,21 @@ def take(source: Path, commands: tuple[str, ...], folder: Path, samples: int | N
         if samples:
             study = re.sub(r"samples = [\d_]+", f"samples = {samples}", study)
         (folder / "study.toml").write_text(study, encoding="utf-8")
-    for command in (*commands, *FINISH):
+    for command in (*commands, RUN):
         if not walk.take(command, sys.executable, "-m", "calibray", *command.split()):
             return walk
+    for command in FINISH:
+        walk.take(command, sys.executable, "-m", "calibray", *command.split())
     walk.take("load_scene.py", sys.executable, "exported/load_scene.py")
     return walk
 
 
-def found(record: Any, key: str) -> Any:
+def first_value(record: Any, key: str) -> Any:
     """The first value of a key anywhere in a record; None if there is none."""
     if isinstance(record, dict):
         if key in record:
             return record[key]
-        values = (found(value, key) for value in record.values())
+        values = (first_value(value, key) for value in record.values())
         return next((value for value in values if value is not None), None)
     return None
 
@@ -115,7 +117,7 @@ def found(record: Any, key: str) -> Any:
 def difference(walk: Walk) -> float | None:
     """Largest difference [dB] between predicted path loss and that of the exported scene, over the links."""
     script = walk.steps[-1]
-    if script.status or script.command != "load_scene.py":
+    if any(step.status for step in walk.steps):
         return None
     loaded = pd.read_csv(StringIO(script.output)).set_index("row").iloc[:, -1]
     predicted = pd.read_csv(walk.folder / "predicted.csv")
@@ -126,28 +128,34 @@ def difference(walk: Walk) -> float | None:
 
 def line(name: str, walk: Walk) -> str:
     """The table's line of a walk."""
-    last = walk.steps[-1]
     seconds = sum(step.seconds for step in walk.steps)
-    if last.status:
-        message = (last.messages.strip().splitlines() or ["no message"])[-1]
-        return f"| {name} | {last.command} failed: {message} |"
+    failed = [step for step in walk.steps if step.status]
+    for step in failed:
+        message = (step.messages.strip().splitlines() or ["no message"])[-1]
+        print(f"{name}: {step.command}: exit {step.status}: {message}", file=sys.stderr)
+    if not (walk.folder / "result" / "result.json").exists():
+        return f"| {name} | {failed[-1].command} failed |"
     record = json.loads((walk.folder / "result" / "result.json").read_text(encoding="utf-8"))
     links = pd.read_csv(walk.folder / "result" / "result-links.csv")
-    predicted = pd.read_csv(walk.folder / "predicted.csv")
-    gap, model = difference(walk), found(record.get("prediction", record), "model")
+    gap, model = difference(walk), first_value(record.get("prediction", record), "model")
     texts = [
         name,
-        len(walk.steps),
+        f"{len(walk.steps)}" + (f" ({len(failed)} failed)" if failed else ""),
         f"{len(links)} ({int((~links['has_path']).sum())} without)",
-        int(predicted["path_loss_db"].isna().sum()),
-        number(found(record, "rmse_db")),
-        number(found(record, "holdout_rmse_db")),
-        number(found(record, "log_distance_holdout_rmse_db")),
+        missing(walk.folder / "predicted.csv"),
+        number(first_value(record, "rmse_db")),
+        number(first_value(record, "holdout_rmse_db")),
+        number(first_value(record, "log_distance_holdout_rmse_db")),
         model.get("name", "-") if isinstance(model, dict) else "-",
-        "not comparable" if gap is None else f"{gap:.4f}",
+        "-" if gap is None else f"{gap:.4f}",
         f"{seconds:.0f}",
     ]
     return "| " + " | ".join(str(text) for text in texts) + " |"
+
+
+def missing(table: Path) -> str:
+    """How many links of a table of predictions have none; a dash without a table."""
+    return str(int(pd.read_csv(table)["path_loss_db"].isna().sum())) if table.exists() else "-"
 
 
 def number(value: float | None) -> str:

@@ -166,7 +166,7 @@ def hall() -> Landscape:
 
 @cache
 def tones() -> Landscape:
-    """Frequencies and phase of two sine tones in noise: a comb of local minima beside the global one."""
+    """Frequencies and phase of two sine tones in noise: a comb of local minima next to the global one."""
     rng = np.random.default_rng(3)
     time = np.sort(rng.uniform(0.0, 1.0, 30))
 

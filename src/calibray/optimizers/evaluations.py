@@ -92,7 +92,7 @@ class Evaluations:
 
 
 class Archive:
-    """Every evaluation of a run in the order told, asked for or not."""
+    """Every evaluation of a run in the order of `tell`, asked for or not."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
@@ -130,7 +130,7 @@ class Archive:
         return self._leading
 
     def all(self) -> Evaluations:
-        """Every evaluation so far in the order told, without Jacobians.
+        """Every evaluation so far in the order of `tell`, without Jacobians.
 
         Raises:
             InputError: Nothing has been told yet.
@@ -141,7 +141,7 @@ class Archive:
         return self._parts[0]
 
     def leaders(self, count: int) -> NDArray[np.float64]:
-        """The best distinct points over the whole run [count, d], best first, ties in the order told.
+        """The best distinct points over the whole run [count, d], best first, ties in the order of `tell`.
 
         The last one is repeated if there are fewer.
         """

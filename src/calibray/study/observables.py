@@ -20,7 +20,7 @@ UNITS: Final = {
 
 
 class ObservableSection(Section):
-    """``[observables.NAME]``: a statistic of the paths of each link, measured beside its path loss.
+    """``[observables.NAME]``: a statistic of the paths of each link, measured in addition to its path loss.
 
     Attributes:
         kind: What was measured.

@@ -41,7 +41,7 @@ class RayTable:
     Attributes:
         source: Name of the table, for messages.
         path: Number or label of every path [P].
-        link: Number or label of its link [P]; None if links are told apart by their ends.
+        link: Number or label of its link [P]; None if their ends distinguish the links.
         tx: Transmitter of every path [P, 3], [m].
         rx: Receiver of every path [P, 3], [m].
         vertex: Interaction points [P, D, 3], [m].

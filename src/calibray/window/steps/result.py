@@ -1,4 +1,4 @@
-"""The fifth step: key numbers of the results, one beside the other, and the report."""
+"""The fifth step: key numbers of the results in a table, and the report."""
 
 from __future__ import annotations
 
