@@ -230,6 +230,20 @@ def test_a_byte_order_mark_and_spaces_after_commas_are_ignored(tmp_path):
     np.testing.assert_array_equal(read(tmp_path, text, group="set").path_loss_db, [80.5, 86.5, 101.25, 110])
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_columns_may_be_separated_by_semicolons_or_tabs_with_decimal_commas(tmp_path, separator):
+    plain = read(tmp_path, group="set", weight="spread")
+    points = TABLE.replace(",", separator)
+    for text in (points, points.replace(".", ",")):
+        other = read(tmp_path, text, group="set", weight="spread")
+        np.testing.assert_array_equal(other.path_loss_db, plain.path_loss_db)
+        np.testing.assert_array_equal(other.rx, plain.rx)
+        np.testing.assert_array_equal(other.weight, plain.weight)
+    # A semicolon inside a quoted cell of a table with commas separates nothing.
+    quoted = TABLE.replace("LOS", '"a;b"')
+    np.testing.assert_array_equal(read(tmp_path, quoted).path_loss_db, plain.path_loss_db)
+
+
 LATER = TABLE.splitlines()[1:]
 
 
@@ -241,7 +255,11 @@ LATER = TABLE.splitlines()[1:]
         ("x,y,z,loss\n", {}, "holds no rows"),
         (TABLE + "1,2,3\n", {}, "row 6: 3 cells, the header has 6"),
         (TABLE + "1,2,3,99,LOS,1,\n", {}, "row 6: 7 cells, the header has 6"),
-        (TABLE.replace(",", ";"), {}, "row 1: columns are separated by ';'"),
+        (
+            TABLE.replace(",", ";") + "0;50,5;1.5;99;LOS;1\n",
+            {},
+            r"a decimal comma in row 6 and a decimal point in row \d+; write all with the same mark",
+        ),
         (TABLE.replace("spread", "loss"), {}, "row 1: column 'loss' appears twice"),
         # Columns
         (TABLE, {"value": "los"}, "no column 'los'; did you mean 'loss'"),

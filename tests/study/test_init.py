@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from calibray.cli.app import app
 from calibray.coordinates import Frame
 from calibray.errors import InputError
+from calibray.materials import itu_material
 from calibray.measurements import SourceTable, column_names
 from calibray.scenes.authoring import Footprints, Terrain, make_plan_scene, make_scene, read_plan
 from calibray.scenes.checks import SceneSurfaces
@@ -227,6 +228,54 @@ def test_codes_of_missing_values_and_unknown_transmitters_are_reported(scene, tm
     links = drafted.study.measurements()
     assert links.prepared["values that mean not measured (100)"] == 2
     assert links.path_loss_db.max() < 80.0
+
+
+def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(scene, tmp_path):
+    (tmp_path / "gateways.csv").write_text("id,x,y,z,floor\nA,-30,0,15,1\nB,60,0,15,2\n")
+    file = table(tmp_path, x=np.arange(10.0), y=20.0, gatewayId=list("AABBAABBAC"), rssi=np.arange(-80, -70))
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
+    reasons = {assumption.what: assumption.reason for assumption in drafted.assumptions}
+    assert reasons["links.transmitter"] == "its values are in column id of gateways.csv"
+    assert reasons["links.where"] == "gateways.csv lacks C: 1 rows are left out"
+    assert drafted.study.offset.per == ("gatewayId",)
+    links = drafted.study.measurements()
+    assert links.tx[:, 0].tolist() == [-30, -30, 60, 60, -30, -30, 60, 60, -30]
+    # A column of numbers that happen to agree names nothing.
+    other = table(tmp_path, x=np.arange(10.0), y=20.0, layer=[1, 2] * 5, rssi=np.arange(-80, -70))
+    with pytest.raises(InputError, match="no column names the transmitter of a row"):
+        draft(scene, other, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
+
+
+def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):
+    columns = {
+        "x": np.arange(10.0),
+        "y": 20.0,
+        "tx_x": [-30.0, 60.0] * 5,
+        "tx_y": 0.0,
+        "rsrp": np.arange(-80, -70),
+    }
+    drafted = draft(
+        scene, table(tmp_path, **columns, cell_id=[7, 9] * 5), tmp_path / "study.toml", frequency=3.5e9
+    )
+    assert (drafted.study.links.transmitter, drafted.study.offset.per) == ("cell_id", ("cell_id",))
+    assert len(set(np.asarray(drafted.study.measurements().group))) == 2
+    # A cell that appears at two positions does not name a transmitter.
+    drafted = draft(scene, table(tmp_path, **columns, cell_id=7), tmp_path / "study.toml", frequency=3.5e9)
+    assert not drafted.study.offset.per
+
+
+def test_a_carrier_that_no_law_of_itu_covers_gets_the_constants_of_the_nearest(scene, tmp_path):
+    columns = {"x": np.arange(10.0), "y": 20.0, "tx_x": -30.0, "tx_y": 0.0, "pathloss": np.arange(80, 90)}
+    for frequency, covered in ((868.1e6, False), (3.5e9, True)):
+        drafted = draft(scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=frequency)
+        assert ("materials" in {assumption.what for assumption in drafted.assumptions}) != covered
+        assert (len(drafted.study.materials) == 0) == covered
+    at_1_ghz = itu_material("concrete", 1e9)
+    stated = draft(
+        scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=868.1e6
+    ).study.materials
+    assert stated["walls"].conductivity == pytest.approx(at_1_ghz.conductivity)
+    assert stated["walls"].relative_permittivity == at_1_ghz.relative_permittivity
 
 
 def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -13,14 +13,14 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.measurements.links import FREQUENCIES
 from calibray.measurements.preparation import Quantity
-from calibray.measurements.selection import without_codes
+from calibray.measurements.selection import naming_column, without_codes
 from calibray.measurements.source_table import SourceTable
 
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
-    "transmitter": r"tx|transmitter|bs|bts|site|cell|ap|bssid|gnb|enb|gnodeb|enodeb|nodeb|base|anchor|beacon",
+    "transmitter": r"tx|transmitter|bs|bts|site|cell|ap|bssid|[ge]nb|[ge]?nodeb|base|anchor|beacon|gateway|gw",
     "receiver": r"rx|receiver|ue|phone|mobile|device",
-    "receiving device": r"rx|receiver|ue|phone|device|handset",
+    "receiving device": r"rx|receiver|ue|phone|device|handset|eui|imei",
     "name of a transmitter": r"id|name",
     "x": r"x|east|easting",
     "y": r"y|north|northing",
@@ -287,6 +287,45 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
         if partial is None and labels & values and matches(name, "transmitter", "name of a transmitter"):
             partial = str(name)
     return partial
+
+
+def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
+    """Find the column of the links that names the transmitter, and that of another name in the table of transmitters.
+
+    Example:
+        >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
+        >>> find_naming_key(links, pd.DataFrame({"id": ["a", "b", "c"], "x": [0, 50, 90]}))
+        ('gateway_id', 'id')
+    """
+    for name in links:
+        labels = links[name].dropna().unique().tolist()
+        if matches(name, "transmitter") and labels:
+            of_table = naming_column(transmitters, labels)
+            if of_table is not None:
+                return str(name), of_table
+    return None
+
+
+def find_transmitter_of_positions(frame: pd.DataFrame, position: Sequence[str]) -> str | None:
+    """Find the column that names the transmitters whose positions are in columns of the same table.
+
+    Each of its labels has one position, and there are as many labels as positions or more.
+
+    Example:
+        >>> links = pd.DataFrame({"cell": ["a", "b", "a"], "tx_x": [0, 50, 0], "tx_y": 0, "rsrp": [-80, -90, -85]})
+        >>> find_transmitter_of_positions(links, ["tx_x", "tx_y"])
+        'cell'
+    """
+    positions = frame.groupby(list(position), dropna=False).ngroup()
+    quantities = ("x", "y", "longitude", "latitude", "height", "power", "frequency", "another quantity")
+    for name in frame:
+        is_name = pd.api.types.is_integer_dtype(frame[name]) or not pd.api.types.is_numeric_dtype(frame[name])
+        if not is_name or not matches(name, "transmitter") or name in position:
+            continue
+        is_quantity = matches(name, *quantities) and not matches(name, "name of a transmitter")
+        if not is_quantity and positions.groupby(frame[name], dropna=False).nunique().max() == 1:
+            return str(name)
+    return None
 
 
 def find_transmitter_names(transmitters: pd.DataFrame) -> str:

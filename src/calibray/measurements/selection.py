@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -104,9 +104,30 @@ def melt(
     return long.note("cells without a value", empty) if empty else long
 
 
+def naming_column(transmitters: pd.DataFrame, labels: Iterable[str]) -> str | None:
+    """The column of a table of transmitters that names them: no value twice, and at least half of some labels.
+
+    Returns None if no column or several do so.
+
+    Example:
+        >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
+        'id'
+    """
+    wanted = set(map(str, labels))
+    columns = [
+        str(name)
+        for name in transmitters
+        if transmitters[name].is_unique
+        and len(wanted & set(transmitters[name].astype(str))) >= max(len(wanted) / 2, 1)
+    ]
+    return columns[0] if len(columns) == 1 else None
+
+
 def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) -> SourceTable:
-    """Links with the other columns of their transmitters."""
-    label_of_link, labels = table.labels(key).tolist(), transmitters.labels(key).tolist()
+    """Links with the other columns of their transmitters, whose names may be in a column of another name."""
+    label_of_link = table.labels(key).tolist()
+    name = key if key in transmitters.frame else naming_column(transmitters.frame, label_of_link) or key
+    labels = transmitters.labels(name).tolist()
     if len(set(labels)) != len(labels):
         raise InputError(f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one")
     if unknown := sorted(set(label_of_link) - set(labels)):
@@ -120,7 +141,7 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
             f'where = "`{key}` not in [{cells}]"'
         )
     index_of_label = {label: index for index, label in enumerate(labels)}
-    joined = transmitters.frame.drop(columns=key).iloc[[index_of_label[label] for label in label_of_link]]
+    joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in label_of_link]]
     # A column that links have already keeps its name there, because filters and positions refer to it.
     joined = joined.rename(columns={name: f"{key}_{name}" for name in joined if name in table.frame})
     frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)

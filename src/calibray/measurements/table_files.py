@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -56,7 +57,10 @@ _decoded: Final[set[tuple[str | int, ...]]] = set()
 
 
 def read_table(path: str | Path) -> SourceTable:
-    """Read a .csv (UTF-8, commas), .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
+    """Read a .csv (UTF-8), .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
+
+    The header of a .csv file tells whether commas, semicolons or tabs separate its columns. Where semicolons or tabs
+    do, numbers may have decimal commas.
 
     Raises:
         InputError: The file does not exist, has another ending, is empty or malformed, or the library that reads it
@@ -72,7 +76,7 @@ def read_table(path: str | Path) -> SourceTable:
             table = _read_parquet(path)
         case ".xlsx":
             numbers, text = sheet_text(path)
-            frame = _parse_csv(path, text).frame
+            frame = _parse_csv(path, text, ",").frame
             table = SourceTable(frame, np.array(numbers[1:], dtype=np.int64), str(path))
         case suffix:
             raise InputError(
@@ -159,12 +163,16 @@ def _utf8_text(path: Path) -> str:
         ) from None
 
 
-def _parse_csv(path: Path, text: str) -> SourceTable:
-    header, lines = _checked_layout(path, text)
+def _parse_csv(path: Path, text: str, separator: str | None = None) -> SourceTable:
+    separator = _separator(text) if separator is None else separator
+    header, lines = _checked_layout(path, text, separator)
     if not header:
         return SourceTable(pd.DataFrame())
+    decimal = "." if separator == "," else _decimal_mark(path, text, separator)
     try:
-        frame = pd.read_csv(io.StringIO(text), skipinitialspace=True, low_memory=False)
+        frame = pd.read_csv(
+            io.StringIO(text), sep=separator, decimal=decimal, skipinitialspace=True, low_memory=False
+        )
     except ValueError as error:
         # pandas reports Ctrl-C while it reads as "source failed"; reading from memory fails so for no other reason.
         if "source failed" in str(error):
@@ -177,9 +185,33 @@ def _parse_csv(path: Path, text: str) -> SourceTable:
     return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
 
 
-def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
+def _separator(text: str) -> str:
+    """The mark between the columns of a CSV text: the comma, unless the header has another one and no comma."""
+    header = next((line for line in io.StringIO(text) if line.strip()), "")
+    return next((mark for mark in ";\t" if mark in header and "," not in header), ",")
+
+
+def _decimal_mark(path: Path, text: str, separator: str) -> str:
+    """The decimal mark of the numbers of a CSV text, refused if it is not the same in all."""
+    lines: dict[str, int] = {}
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+    for cells in reader:
+        for cell in cells:
+            if "," in cell or "." in cell:
+                number = re.fullmatch(r"[+-]?\d*([.,])\d+(e[+-]?\d+)?", cell.strip(), re.IGNORECASE)
+                if number is not None:
+                    lines.setdefault(number[1], reader.line_num)
+    if len(lines) > 1:
+        raise InputError(
+            f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; write "
+            "all with the same mark"
+        )
+    return "," if "," in lines else "."
+
+
+def _checked_layout(path: Path, text: str, separator: str) -> tuple[list[str], list[int]]:
     """Header and first line of each row of a CSV text, refused where pandas would repair a fault without notice."""
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
     header: list[str] = []
     lines: list[int] = []
     next_line = 1
@@ -190,8 +222,6 @@ def _checked_layout(path: Path, text: str) -> tuple[list[str], list[int]]:
                 continue
             if not header:
                 header = cells
-                if len(header) == 1 and (mark := next((mark for mark in ";\t" if mark in header[0]), None)):
-                    raise InputError(f"{path}, row {line}: columns are separated by {mark!r}, must be by ','")
                 if repeated := [name for name, count in Counter(header).items() if count > 1]:
                     raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")
             elif len(cells) != len(header):

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.scenes import read_scene
+from calibray.scenes import Scene, read_scene
 from calibray.scenes.checks import count_crossings
 from calibray.study.draft_antennas import add_antennas
 from calibray.study.draft_links import Assumption, LinksDraft
@@ -95,13 +95,15 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
     trace = {"max_depth": _depth(links) if indoors else 3, "samples": 200_000}
     # Behind buildings most links have no other path.
     trace["refraction" if indoors else "diffraction"] = True
+    scene, constants = _scene(links)
     return {
         "version": VERSION,
         "scene": {"file": links.scene_file, "frequency": links.frequency},
+        **({"materials": constants} if constants else {}),
         "links": section,
         "antennas": antenna_section,
         "trace": trace,
-        "parameters": _parameters(links, indoors),
+        "parameters": _parameters(links, scene, indoors),
         "offset": {"per": links.groups} if links.groups else {},
         # Refracted paths are sampled by the materials, so every new trace changes some links: one is enough.
         **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),
@@ -129,11 +131,32 @@ def _depth(links: LinksDraft) -> int:
     return depth
 
 
-def _parameters(links: LinksDraft, indoors: bool) -> dict[str, dict[str, Any]]:
+def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
+    """The scene, and the constants of materials for which ITU-R P.2040 has no law at the carrier.
+
+    They are those of the law at the nearest frequency that it covers.
+    """
+    try:
+        return read_scene(links.scene, links.frequency), {}
+    except InputError:
+        # Every material of Table 3 that scenes have is covered from 1 to 10 GHz.
+        covered = read_scene(links.scene, float(np.clip(links.frequency, 1e9, 10e9)))
+    constants = {}
+    for name, law in covered.laws.items():
+        nearest = float(np.clip(links.frequency / 1e9, law.lower, law.upper))
+        if nearest != links.frequency / 1e9:
+            permittivity, conductivity = law.a * nearest**law.b, law.c * nearest**law.d
+            constants[name] = {"relative_permittivity": permittivity, "conductivity": conductivity}
+    reason = f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: the constants at the nearest that it covers"
+    links.assume("materials", ", ".join(constants), reason)
+    return read_scene(links.scene, links.frequency, constants), constants
+
+
+def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:
     """The entries of ``[parameters]``: permittivities, and indoors conductivities, which walls attenuate by."""
     materials = {
         name: material
-        for name, material in read_scene(links.scene, links.frequency).materials.items()
+        for name, material in scene.materials.items()
         if material.conductivity < METAL_CONDUCTIVITY and material.relative_permittivity > 1.5
     }
     names = list(materials)[:MOST_MATERIALS]

@@ -18,7 +18,6 @@ from calibray.measurements import (
     TRACK_COLUMNS,
     Measurements,
     Preparation,
-    SourceTable,
     Track,
     column_names,
     read_table,
@@ -175,7 +174,15 @@ class LinksDraft:
         if name is not None:
             self.section["transmitter"] = self._transmitter_key = name
             self.assume("links.transmitter", name, "a column of both tables with common values")
-            self._leave_out_unknown_transmitters(name, self._sites, self.transmitters.name)
+            self._leave_out_unknown_transmitters(name, self._sites.frame[name])
+            return
+        key = column_names.find_naming_key(self._table.frame, self._sites.frame)
+        if key is not None:
+            name, of_table = key
+            self.section["transmitter"] = self._transmitter_key = name
+            reason = f"its values are in column {of_table} of {self.transmitters.name}"
+            self.assume("links.transmitter", name, reason)
+            self._leave_out_unknown_transmitters(name, self._sites.frame[of_table])
             return
         name = column_names.find_transmitter_names(self._sites.frame)
         columns = column_names.find_wide_columns(self._table.frame, self._sites.labels(name).tolist())
@@ -195,16 +202,17 @@ class LinksDraft:
         steps = Preparation(wide=columns, transmitter=name)
         self._table = select_rows(self._table, steps, column_names.name_melted_values(columns))
 
-    def _leave_out_unknown_transmitters(self, key: str, sites: SourceTable, source: str) -> None:
+    def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
         """Draft a filter for rows whose transmitter the table of transmitters lacks."""
-        known = set(sites.frame[key].astype(str))
+        known = set(names_of_sites.astype(str))
         lacking = ~self._table.frame[key].astype(str).isin(known)
         if not lacking.any():
             return
         names = self._table.frame.loc[lacking, key].dropna().unique().tolist()
         # The known ones: rows without a name are left out too.
-        self._add_filter(f"`{key}` in {sites.frame[key].dropna().tolist()}")
+        self._add_filter(f"`{key}` in {names_of_sites.dropna().tolist()}")
         named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        source = "the table of transmitters" if self.transmitters is None else self.transmitters.name
         reason = f"{source} lacks {named or 'rows without a name'}: {lacking.sum()} rows are left out"
         self.assume("links.where", self.section["where"], reason)
         self._table = self._table.select(~lacking.to_numpy())
@@ -299,6 +307,8 @@ class LinksDraft:
             reason = "columns of these names" if self.transmitters is None else f"of {self.transmitters.name}"
             reason += "" if tx.height else f"; no height: {TRANSMITTER_HEIGHT:g} m"
             self.assume("links.tx", ", ".join(map(str, position)), reason)
+            if self.transmitters is None:
+                self._name_transmitters(tx)
             return position
         if self.stated_tx is None:
             return self._transmitter_at_origin(rx)
@@ -306,6 +316,15 @@ class LinksDraft:
             raise InputError("--tx: is in metres, but receivers are in degrees; give --transmitters, a table")
         self.assume("links.tx", ", ".join(f"{part:g}" for part in self.stated_tx), "given")
         return [float(part) for part in self.stated_tx]
+
+    def _name_transmitters(self, tx: PositionColumns) -> None:
+        """The column that names transmitters whose positions are in the links."""
+        if len(self._table.frame[[tx.x, tx.y]].drop_duplicates()) < 2:
+            return
+        name = column_names.find_transmitter_of_positions(self._table.frame, [tx.x, tx.y])
+        if name is not None:
+            self.section["transmitter"] = name
+            self.assume("links.transmitter", name, "each of its names has one transmitter position")
 
     def _transmitter_at_origin(self, rx: PositionColumns) -> list[float | str]:
         """A transmitter at the scene's origin, if the table's distances are distances from there."""
