@@ -17,6 +17,7 @@ from calibray.reporting.link_survey import residual
 from calibray.reporting.result_tables import parameters, values
 from calibray.reporting.summary import summary
 from calibray.result.held_out import Model
+from calibray.result.prediction_model import ResidualField
 from calibray.result.verdict import Interval, ReasonKind, Verdict
 from calibray.result.wording import prediction_text, reason_text, scene_alone_text
 from calibray.scenes import read_scene
@@ -58,7 +59,7 @@ def test_the_tables_say_which_values_predictions_use(other: Result) -> None:
 
 def test_the_residuals_of_the_report_are_those_of_predictions(other: Result) -> None:
     expected = other.links.predicted_db - other.links.measured_db
-    np.testing.assert_array_equal(residual(other.links)[:5], expected[:5])
+    np.testing.assert_array_equal(residual(other.links, sign=1)[:5], expected[:5])
 
 
 def test_the_exported_scene_is_the_one_that_predictions_use(tmp_path: Path) -> None:
@@ -89,6 +90,11 @@ def test_an_offset_is_named_as_the_difference_between_scene_and_predictions(othe
     assert "cannot contain offset" in scene_alone_text(other)
     same = replace(other, links=other.links.assign(predicted_db=other.links.scene_db))
     assert scene_alone_text(same) == ""
+    field = replace(same.prediction, residual_field=ResidualField(range_m=12.0, shared_db=2.5, own_db=1.0))
+    near = scene_alone_text(replace(same, prediction=field))
+    assert "Within some 12 m of measured links" in near
+    assert "2.50 dB RMS" in near
+    assert scene_alone_text(replace(other, prediction=field)).endswith(near)
     assert "calibrated" in prediction_text(shown.result())
 
 

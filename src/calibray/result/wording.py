@@ -396,19 +396,26 @@ def scene_alone_text(record: Record) -> str:
     both = np.isfinite(scene_db) & np.isfinite(predicted_db)
     difference = scene_db[both] - predicted_db[both]
     rms_db = float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
+    field = record.prediction.residual_field
+    near = (
+        ""
+        if field is None
+        else f" Within some {field.range_m:.3g} m of measured links, predictions also add what "
+        f"their residuals have in common ({field.shared_db:.2f} dB RMS), which no scene contains."
+    )
     if rms_db < SCENE_ALONE_DB:
-        return ""
+        return near.lstrip()
     missing = [*(f"the region {name}" for name in record.study.regions), *(term.name for term in model.terms)]
     cause = ", ".join(missing) or "its ceiling"
     if model.parameters is None:
         return (
             f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "
             f"calibrated materials; its path loss differs from the predictions by {rms_db:.2f} dB (RMS over "
-            f"{len(difference)} links)."
+            f"{len(difference)} links).{near}"
         )
     return (
         f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links): "
-        f"a scene cannot contain {cause}."
+        f"a scene cannot contain {cause}.{near}"
     )
 
 
