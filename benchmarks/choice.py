@@ -49,6 +49,7 @@ from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.validation.held_out_statistics import interval_half_width, spatial_blocks
 from calibray.validation.validate import fit_models, validate_problem
+from calibray.validation.variants import fit_variants
 
 LEVEL = 0.9
 NOISE_DB = 4.0
@@ -86,7 +87,7 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
     inner = validate_problem(part)
-    found = fit_models(part)
+    found = fit_models(part, fit_variants(part))
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
     least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, Model.LOG_DISTANCE]).idxmin()
     errors[LEAST] = errors[str(least)]

@@ -8,12 +8,16 @@ from calibray import engines
 from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
+from calibray.fitting.preliminary_fits import estimate_noise
+from calibray.fitting.problem import Problem
 from calibray.measurements import links_from_frame
 from calibray.measurements.observables import Statistic
 from calibray.reporting import result_tables as tables
+from calibray.result.held_out import Model
 from calibray.result.remark import RemarkKind
 from calibray.study import Setup
 from calibray.tables.text import render
+from calibray.validation.validate import validate_problem
 
 MARBLE = "marble.relative_permittivity"
 SPREAD = {"kind": "rms_delay_spread", "column": "spread_ns", "unit": "ns"}
@@ -60,13 +64,13 @@ def run(folder, table, **sections):
 def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine):
     alone = run(tmp_path, table)
     gappy = table.assign(spread_ns=table.spread_ns.where(table.index != 3))
-    both = run(tmp_path, gappy, observables={"spread": SPREAD, "rtt": FLIGHT})
+    both = run(tmp_path, gappy, observables={"spread": SPREAD, "rtt": FLIGHT}, holdout={"where": "rx_x > 15"})
     for name, truth in zip(engine.parameters.names, TRUTH, strict=True):
         assert both.intervals[name].contains(truth)
     width = [result.intervals[MARBLE].upper - result.intervals[MARBLE].lower for result in (alone, both)]
     assert width[1] < 0.6 * width[0]
     fit = both.fit.observables["spread"]
-    assert (fit.links, fit.unit) == (planted.LINKS - 1, "ns")
+    assert (fit.links, fit.unit) == (planted.LINKS - 4, "ns")
     assert fit.rmse < 0.5 < fit.initial_rmse
     assert fit.error == pytest.approx(0.3, rel=0.7)
     assert fit.rmse < 0.5 * fit.mean_rmse
@@ -74,12 +78,32 @@ def test_delay_spreads_determine_what_path_loss_does_not(tmp_path, table, engine
     biases = both.fit.observables["rtt"].biases
     assert biases == {"west": pytest.approx(40.0, abs=0.6), "east": pytest.approx(-15.0, abs=0.6)}
     assert both.fit.observables["rtt"].rmse < 1.0
+    errors = both.fit.observables["rtt"].bias_errors
+    assert {name: 0.1 < error < 0.5 for name, error in errors.items()} == {"west": True, "east": True}
+    held_out = both.accuracy.observables["spread"]
+    assert held_out.links == (planted.links().rx_x > 15).sum()
+    residual = (both.links.spread_after_ns - both.links.spread_measured_ns)[both.links.held_out]
+    assert held_out.rmse == pytest.approx(np.sqrt(np.mean(residual**2)))
+    others = both.links.spread_measured_ns[~both.links.held_out].mean()
+    of_mean = (others - both.links.spread_measured_ns)[both.links.held_out]
+    assert held_out.mean_rmse == pytest.approx(np.sqrt(np.mean(of_mean**2)))
+    assert held_out.rmse < 0.5 * min(held_out.mean_rmse, held_out.distance_rmse)
+    flight = both.accuracy.observables["rtt"]
+    assert flight.rmse < 1.5 < flight.mean_rmse
+    assert "Observables of links held out" in render(*tables.tables(both))
     assert "spread [ns]" in render(*tables.tables(both))
     assert not any(remark.kind == RemarkKind.CONFLICT for remark in both.uncertainty.remarks)
     both.save(tmp_path / "out")
     loaded = Result.load(tmp_path / "out")
     assert loaded.fit.observables == both.fit.observables
-    predicted = loaded.predict_interval(planted.links())["spread_ns"].to_numpy()
+    intervals = loaded.predict_interval(planted.links())
+    predicted = intervals["spread_ns"].to_numpy()
+    lower, upper = intervals["spread_lower_ns"], intervals["spread_upper_ns"]
+    assert ((lower < predicted) & (predicted < upper)).all()
+    inside = (lower < table.spread_ns) & (table.spread_ns < upper)
+    assert inside.sum() >= 10
+    # Student's t with the three held-out links
+    assert (upper - lower).min() >= 2 * 2.35 * held_out.rmse
     assert predicted == pytest.approx(both.links.spread_after_ns.to_numpy())
     assert predicted == pytest.approx(table.spread_ns.to_numpy(), abs=1.5)
 
@@ -120,3 +144,16 @@ def test_columns_and_engines_that_cannot_be_used_are_refused(tmp_path, table):
         run(tmp_path, table.assign(spread_ns=np.nan), observables={"spread": SPREAD})
     with pytest.raises(InputError, match="needs the engine 'replay'"):
         run(tmp_path, table, observables={"spread": SPREAD}, engine={"name": "replay", "chunk_links": 6})
+
+
+def test_blocks_held_out_in_turn_judge_every_observable(tmp_path, table, engine):
+    study = planted.study(tmp_path, table, **(PLAN | {"observables": {"spread": SPREAD, "rtt": FLIGHT}}))
+    problem = estimate_noise(Problem.of(Setup.open(study), engine))
+    known = {Model.CALIBRATED: problem.parameters.to_search(TRUTH[None])}
+    validation = validate_problem(problem, 4, known_minima=known)
+    spread, flight = (validation.observables[name] for name in ("spread", "rtt"))
+    assert (spread.links, spread.unit) == (planted.LINKS, "ns")
+    assert spread.rmse < 0.7 * min(spread.mean_rmse, spread.distance_rmse)
+    assert flight.rmse < 0.5 * flight.mean_rmse
+    assert "spread [ns]" in repr(validation)
+    assert validation.content()["observables"]["rtt"]["rmse"] == flight.rmse

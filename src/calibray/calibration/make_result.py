@@ -35,6 +35,7 @@ from calibray.validation.baselines import has_obstruction, log_distance, obstruc
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.fallback import fit_fallback
 from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
+from calibray.validation.observables import held_out_gaps, observable_errors
 from calibray.validation.validate import DEFAULT_BLOCKS
 from calibray.validation.validation import Validation
 from calibray.validation.variants import add_nuisance, initial_objective
@@ -141,7 +142,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             **diagnostics.columns,
         }
     )
-    further, further_columns = observable_fits(problem, trail.best)
+    further, further_columns = observable_fits(problem, trail.best, certainty.draws)
     table = table.assign(**_as_measured(study, links, table), **further_columns)
     if validation is None:
         accuracy, name, residuals = _on_held_out_links(problem, trail, models)
@@ -249,6 +250,7 @@ def _on_held_out_links(
         nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
         log_distance_holdout_rmse_db=rmse(models.log_distance),
         judgement=judgement,
+        observables=observable_errors(held_out_gaps(problem, trail.best, judged), problem.setup.study),
     )
     return accuracy, name, residuals
 
@@ -320,6 +322,7 @@ def _on_blocks(
         nuisance_only_holdout_rmse_db=float(rmse[Model.INITIAL]) if fitted else None,
         log_distance_holdout_rmse_db=float(rmse[Model.LOG_DISTANCE]),
         judgement=validation.judgement,
+        observables=validation.observables,
     )
     return accuracy, name, residuals
 

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.fitting.problem import Problem
 from calibray.result.record import ObservableFit
 
+MOST_DRAWS: Final = 64
+"""Most posterior draws for the errors of biases; the error of a standard deviation from them is 9 %."""
+
 
 def observable_fits(
-    problem: Problem, best: NDArray[np.float64]
+    problem: Problem, best: NDArray[np.float64], draws: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, ObservableFit], dict[str, NDArray[np.float64]]]:
     """The fit of every further observable, and its columns of the table of links.
 
     Args:
         problem: The problem.
         best: The calibrated values [d].
+        draws: Draws from the posterior by name of the parameter; may be empty.
 
     Returns:
         The fits by name; and measured, initial and calibrated values [L] in the unit, by column name.
@@ -25,13 +32,25 @@ def observable_fits(
         return {}, {}
     weight, sections = problem.objective.weight, problem.setup.study.observables
     start = problem.parameters.start
-    before, after = problem.replay.observe(np.stack([start, best]), problem.statistics)
+    names = problem.parameters.names
+    drawn = np.stack([draws[name] for name in names], axis=1) if draws else np.empty((0, len(names)))
+    drawn = drawn[np.linspace(0, len(drawn) - 1, min(len(drawn), MOST_DRAWS)).round().astype(int)]
+    before, after, *spread = problem.replay.observe(np.vstack([start, best, drawn]), problem.statistics)
     fits, columns = {}, {}
     for index, each in enumerate(problem.observed):
         unit, used = sections[each.name].unit, each.used(weight)
         initial, _ = each.residuals(before[index][None], weight)
         residuals, biases = each.residuals(after[index][None], weight)
-        by_group = dict(zip(each.labels, biases[0].tolist(), strict=True))
+        groups = np.unique(each.group[used]) if each.labels else np.zeros(0, dtype=np.int64)
+        count = np.bincount(each.group[used], minlength=len(each.labels))[groups] if each.labels else groups
+        of_draws = (
+            each.residuals(np.stack([values[index] for values in spread]), weight)[1] if spread else biases
+        )
+        # The error of a mean, and that of the parameters.
+        errors = np.sqrt(
+            each.std**2 / np.maximum(count, 1) + np.mean((of_draws - biases)[:, groups] ** 2, axis=0)
+        )
+        labels = [each.labels[group] for group in groups]
         fits[each.name] = ObservableFit(
             kind=each.statistic.kind,
             unit=unit,
@@ -40,7 +59,8 @@ def observable_fits(
             initial_rmse=_rms(initial),
             mean_rmse=float(np.std(each.measured[used])),
             error=each.std,
-            biases={label: by_group[label] for k, label in enumerate(each.labels) if k in each.group[used]},
+            biases=dict(zip(labels, biases[0, groups].tolist(), strict=True)),
+            bias_errors=dict(zip(labels, errors.tolist(), strict=True)),
         )
         columns |= {
             f"{each.name}_measured_{unit}": each.measured,

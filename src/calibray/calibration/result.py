@@ -173,11 +173,19 @@ class Result(Record):
         progress: Progress | None = None,
         *,
         allow_changed_inputs: bool = False,
+        observables: bool = False,
     ) -> pd.DataFrame:
         """Suggest where to measure next; see `calibray.suggest` for the arguments, the result and errors."""
         from calibray.prediction.suggestion import suggest
 
-        return suggest(self, candidates, count, progress, allow_changed_inputs=allow_changed_inputs)
+        return suggest(
+            self,
+            candidates,
+            count,
+            progress,
+            allow_changed_inputs=allow_changed_inputs,
+            observables=observables,
+        )
 
     def report(self, file: str | Path, *, overwrite: bool = False, progress: Progress | None = None) -> Path:
         """Write the result as one HTML page; see `calibray.report` for the arguments and errors."""

@@ -74,6 +74,7 @@ def predict(
         from calibray.engines import open_workers
         from calibray.measurements import PiecedTable
         from calibray.prediction.batches import predict_batches
+        from calibray.prediction.observables import observable_columns
         from calibray.prediction.predict import as_links, as_measured
         from calibray.support.output_files import check_table, growing_table
 
@@ -84,7 +85,7 @@ def predict(
         names, texts = (PREDICTIONS[:1], TEXTS[:1]) if level is None else (PREDICTIONS, TEXTS)
         # A prediction of NaN for the first link shows which columns the measured quantity adds.
         measured = as_measured(study, first, pd.DataFrame(np.nan, index=[0], columns=list(names)))
-        further = [f"{name}_{section.unit}" for name, section in study.observables.items()]
+        further = observable_columns(study, level)
         renamed = _renamed_columns(links_file, first.frame, (*names, *measured, *further, *texts))
         if out is not None:
             check_table(out, [links_file, *study.files()], overwrite)

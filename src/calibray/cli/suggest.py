@@ -28,6 +28,10 @@ def suggest(
         Path | None,
         typer.Option("--out", "-o", metavar="FILE", help="Also write the table to this CSV or Parquet file."),
     ] = None,
+    observables: Annotated[
+        bool,
+        typer.Option("--observables", help="Also say which further observable is worth measuring there."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     allow_changed_inputs: AllowChangedInputs = False,
     overwrite: Overwrite = False,
@@ -40,7 +44,7 @@ def suggest(
         from calibray.measurements.table_files import read_table
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import suggest as suggest_links
-        from calibray.prediction.suggestion import suggestion_tables
+        from calibray.prediction.suggestion_tables import suggestion_tables
         from calibray.support.output_files import check_table, write_table
         from calibray.tables.text import render
 
@@ -50,7 +54,9 @@ def suggest(
         links = as_links(result, read_table(candidates_file))
         if out is not None:
             check_table(out, [candidates_file, *study.files()], overwrite)
-        suggestion = suggest_links(result, links, count, progress, allow_changed_inputs=allow_changed_inputs)
+        suggestion = suggest_links(
+            result, links, count, progress, allow_changed_inputs=allow_changed_inputs, observables=observables
+        )
     echo(
         json.dumps(suggestion.to_dict("records"), indent=2)
         if as_json

@@ -13,13 +13,13 @@ from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calibray.engines.kinds.replay import replay
-from calibray.engines.replay import Replay
 from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.measurements import Measurements, SourceTable
 from calibray.parameters import fixed_constant, split_name
 from calibray.prediction.fallback import fill_missing
 from calibray.prediction.nuisance_shift import model_terms, nuisance_shift
+from calibray.prediction.observables import Replayed, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model
@@ -193,10 +193,15 @@ def interval(
     """
     if level is None:
         setup = _with_columns(result, setup)
-        path_loss_db = _path_loss(result, setup, progress)
+        links = setup.links
+        # A group without a coefficient is refused before anything is traced.
+        shift = nuisance_shift(model_terms(result.prediction.model, links), links)
+        replayed = _replay(result, setup, {}, progress)
+        field_db, _ = _residual_field(result, links)
+        path_loss_db = _modelled(result, links, replayed)[0] + shift.value_db[0] + field_db
         basis = np.full(len(path_loss_db), str(result.prediction.model.name), dtype=object)
         table = pd.DataFrame({"path_loss_db": path_loss_db, "basis": basis})
-        table = table.assign(**further_observables(result, setup))
+        table = table.assign(**further_observables(result, replayed))
         return fill_missing(result.prediction, result.study, setup.links, table)
     if not 0 < level < 1:
         raise InputError(f"level = {level:g}: must be between 0 and 1, as 0.9")
@@ -210,7 +215,8 @@ def interval(
     field_db, known_share = _residual_field(result, links)
     draws = _draws(result)
     shift = nuisance_shift(model_terms(model, links), links, draws, new_groups=True)
-    modelled = _modelled(result, setup, draws, progress) + shift.value_db
+    replayed = _replay(result, setup, draws, progress)
+    modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
     variance = shift.spread_db**2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
@@ -236,7 +242,7 @@ def interval(
             "lower_db": best - half_width,
             "upper_db": best + half_width,
             "basis": link_basis.astype(object),
-            **further_observables(result, setup),
+            **further_observables(result, replayed, level),
         }
     )
     return fill_missing(result.prediction, result.study, links, table, level, half_width)
@@ -281,30 +287,6 @@ def with_constants(result: Record, setup: Setup) -> Setup:
     return replace(setup, parameters=parameters)
 
 
-def further_observables(result: Record, setup: Setup) -> dict[str, NDArray[np.float64]]:
-    """Further observables at opened links [links] by column name, as `spread_ns`; without the biases of devices.
-
-    Args:
-        result: The calibration.
-        setup: Its study, opened for the links.
-
-    Returns:
-        The columns; empty without further observables, or if the prediction model uses no scene.
-    """
-    sections, prediction = result.study.observables, result.prediction
-    if not sections or prediction.model.parameters is None:
-        return {}
-    engine = replay(setup, setup.trace(traced_materials(result, prediction.materials)))
-    if not isinstance(engine, Replay):
-        return {}
-    values = np.array([[prediction.model.parameters[name] for name in setup.parameters.names]])
-    found = engine.observe(values, tuple(section.statistic for section in sections.values()))[0]
-    return {
-        f"{name}_{section.unit}": found[index] / section.scale
-        for index, (name, section) in enumerate(sections.items())
-    }
-
-
 def as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
     """Predictions in the quantity that the study's links were measured in.
 
@@ -346,15 +328,6 @@ def _reference_level(study: Study, links: Measurements) -> NDArray[np.float64] |
     return None if power is None else np.full(len(links), float(power))
 
 
-def _path_loss(result: Record, setup: Setup, progress: Progress | None) -> NDArray[np.float64]:
-    """Path loss at opened links, with nuisances and the residual field [links], [dB]."""
-    links = setup.links
-    field_db, _ = _residual_field(result, links)
-    # A group without a coefficient is refused before anything is traced.
-    shift = nuisance_shift(model_terms(result.prediction.model, links), links)
-    return _modelled(result, setup, {}, progress)[0] + shift.value_db[0] + field_db
-
-
 def _draws(result: Record) -> dict[str, list[float]]:
     """Draws from the posterior, whose spread widens the intervals of predictions.
 
@@ -364,13 +337,13 @@ def _draws(result: Record) -> dict[str, list[float]]:
     return result.uncertainty.draws if calibrated else {}
 
 
-def _modelled(
+def _replay(
     result: Record, setup: Setup, draws: dict[str, list[float]], progress: Progress | None
-) -> NDArray[np.float64]:
-    """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
-    prediction, links, names = result.prediction, setup.links, setup.parameters.names
+) -> Replayed | None:
+    """The paths of opened links, with the values of the prediction model and of every draw; None without a scene."""
+    prediction, names = result.prediction, setup.parameters.names
     if prediction.model.parameters is None:
-        return without_scene(result.study, links)[None]
+        return None
     values = np.array([[prediction.model.parameters[name] for name in names]])
     if draws:
         setup = with_constants(result, setup)
@@ -378,8 +351,16 @@ def _modelled(
         scene_values = setup.parameters.start[None, values.shape[1] :]
         drawn = np.stack([draws[name] for name in names], axis=1)
         values = np.vstack([np.hstack([values, scene_values]), drawn])
-    paths = setup.trace(traced_materials(result, prediction.materials), progress)
-    path_loss_db = replay(setup, paths).path_loss(values)
+    return Replayed(
+        replay(setup, setup.trace(traced_materials(result, prediction.materials), progress)), values
+    )
+
+
+def _modelled(result: Record, links: Measurements, replayed: Replayed | None) -> NDArray[np.float64]:
+    """Path loss of the prediction model without nuisances, then of every draw [1 + draws, links], [dB]."""
+    if replayed is None:
+        return without_scene(result.study, links)[None]
+    path_loss_db = replayed.engine.path_loss(replayed.values)
     # Predictions of a model that validation chose end at the ceiling, as the model does in the validation.
     ceiling_db = None if result.held_out is None else result.study.objective.ceiling_db
     return path_loss_db if ceiling_db is None else np.minimum(path_loss_db, ceiling_db)

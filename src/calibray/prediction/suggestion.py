@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.kinds.replay import ReplaySection, replay
 from calibray.engines.protocol import Differentiable
+from calibray.engines.replay import Replay
 from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
@@ -25,13 +26,13 @@ from calibray.prediction.experiment_design import (
     choose_candidates,
     initial_range_probability,
 )
+from calibray.prediction.observable_choice import Worth, worth_measuring
 from calibray.prediction.position_checks import POSITION_COLUMNS
 from calibray.prediction.predict import as_links, check_inputs, traced_materials, with_constants
 from calibray.result.record import Record
 from calibray.study import Setup
 from calibray.support.messages import percent
 from calibray.support.progress import Progress
-from calibray.tables import Column, Table, numbers
 from calibray.uncertainty.residual_correlation import Correlation, shared_errors
 
 MOST_DRAWS: Final = 96
@@ -51,6 +52,7 @@ def suggest(
     progress: Progress | None = None,
     *,
     allow_changed_inputs: bool = False,
+    observables: bool = False,
 ) -> pd.DataFrame:
     """Suggest where to measure next, by the expected narrowing of the parameters' intervals.
 
@@ -64,12 +66,15 @@ def suggest(
         count: Number of suggestions.
         progress: Called with the stage "tracing" after every launch.
         allow_changed_inputs: Continue although a file of the scene or an antenna changed since the calibration.
+        observables: Also say which further observable is worth measuring there.
 
     Returns:
         One row per suggestion, the best first: the candidate's row, its positions [m] and group; path_loss_db and
         spread_db, mean and standard deviation of the draws' predictions [dB]; NAME_width for every parameter, the
         expected width of its 95 % interval once this candidate and those above are measured; NAME_sure, where several
-        ranges fit, the expected probability of knowing the right one; and gain, a summary as text.
+        ranges fit, the expected probability of knowing the right one; and gain, a summary as text. With `observables`
+        also observable, the one that narrows the intervals most if it is measured besides path loss at this candidate
+        and those above, and observable_gain, a summary as text.
 
     Raises:
         InputError: What `Result.predict` refuses except unknown groups, the calibration has no draws, or no candidate
@@ -108,39 +113,17 @@ def suggest(
     outlooks = [replace(outlook, index=int(reached[outlook.index])) for outlook in outlooks]
     draws = len(beliefs.point)
     before = initial_range_probability(beliefs.piece[:draws])
-    return _table(result, links, predicted[:draws], outlooks, before)
-
-
-def suggestion_tables(suggestions: pd.DataFrame) -> tuple[Table, ...]:
-    """Suggestions as tables for the terminal.
-
-    Args:
-        suggestions: The suggestions, from `suggest`.
-
-    Returns:
-        A table of positions, and a table of the gain expected from each suggestion and those above it.
-    """
-    grouped = ["group"] if "group" in suggestions else []
-    columns = (
-        numbers("rank"),
-        numbers("row"),
-        *(numbers(name, "m") for name in POSITION_COLUMNS),
-        *map(Column, grouped),
-        numbers("path loss", "dB"),
-        numbers("draws differ by", "dB"),
+    table = _table(result, links, predicted[:draws], outlooks, before)
+    if not observables:
+        return table
+    index = np.array([outlook.index for outlook in outlooks])
+    added = slope[:, index] / errors.own_db
+    information = beliefs.information + np.cumsum(np.einsum("nli,nlj->lnij", added, added), axis=0)
+    best = model.worth(setup, index, information + UNIFORM_INFORMATION * np.eye(slope.shape[2]))
+    return table.assign(
+        observable=[worth.kind for worth in best],
+        observable_gain=[_gain(result, worth.narrowed) for worth in best],
     )
-    rows, gains = [], []
-    for rank, row in enumerate(suggestions.to_dict("records"), start=1):
-        losses = (f"{row['path_loss_db']:.1f}", f"{row['spread_db']:.1f}")
-        position = (f"{row[name]:.2f}" for name in POSITION_COLUMNS)
-        rows.append((str(rank), str(row["row"]), *position, *(str(row[name]) for name in grouped), *losses))
-        gains.append((str(rank), row["gain"]))
-    expected = Table(
-        "Expected 95 % intervals once it and those above are measured",
-        (numbers("rank"), Column("gain")),
-        tuple(gains),
-    )
-    return Table("Where to measure next", columns, tuple(rows)), expected
 
 
 class _ReplayedDraws:
@@ -206,6 +189,22 @@ class _ReplayedDraws:
         coefficient_slopes = objective.coefficient_slopes(*self._replay(self.engine))
         path_loss_db = loss + coefficients @ design.T
         return path_loss_db, (slope + design @ coefficient_slopes)[: self.num_draws], errors
+
+    def worth(self, setup: Setup, index: NDArray[np.int64], information: NDArray[np.float64]) -> list[Worth]:
+        """Further observables at suggested candidates; see `worth_measuring`.
+
+        Raises:
+            InputError: The engine gives path loss only.
+        """
+        engine, values = self._engine(setup), self.values[: self.num_draws]
+        section = setup.study.engine
+        if not isinstance(engine, Replay) or getattr(section, "compress_db", None) is not None:
+            raise InputError(
+                f"{setup.study.path}: further observables need the engine 'replay' with one carrier, without "
+                "compress_db and coefficients of laws; suggest without them"
+            )
+        unit_slope = self.problem.parameters.search_slope(values) * self.width
+        return worth_measuring(self.result, engine, (values, unit_slope), index, information)
 
     def _engine(self, setup: Setup) -> Differentiable:
         section = setup.study.engine
@@ -357,6 +356,16 @@ def _table(
                     )
     table["gain"] = [", ".join(gain) or "no interval narrower by more than 2 %" for gain in gains]
     return pd.DataFrame(table)
+
+
+def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
+    """What an observable adds, as text."""
+    gains = [
+        f"{name} to {ratio:.2g} of its width"
+        for name, ratio in zip(result.study.parameters, narrowed, strict=False)
+        if ratio < 1 - LEAST_GAIN
+    ]
+    return ", ".join(gains) or "no interval narrower by more than 2 %"
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:

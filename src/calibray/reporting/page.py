@@ -43,7 +43,7 @@ from calibray.support.progress import Progress
 from calibray.tables import Column, Table, numbers
 from calibray.tables.display import hertz
 from calibray.tables.text import decibels
-from calibray.validation.validation import Validation
+from calibray.validation.validation import Validation, observables_table
 
 FILE: Final = "report.html"
 FIGURES: Final = "figures"
@@ -218,6 +218,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         triangles=data.triangles,
         most_triangles=TRIANGLES,
         accuracy=tables.accuracy(result),
+        observables=(tables.observables(result), observables_table(result.accuracy.observables)),
         validation=None if result.held_out is None else Validation.of(result.held_out).summary(),
         diagnostics=(
             replace(diagnostics_table(result), title=""),

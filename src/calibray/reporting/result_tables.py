@@ -17,7 +17,7 @@ from calibray.result.wording import explanation_text, interval_text
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import decibels, rows_text
 from calibray.tracing.positions import EnclosedAntennas
-from calibray.validation.validation import Validation
+from calibray.validation.validation import Validation, observables_table
 
 MARKS: Final[dict[str, str]] = {
     Verdict.IDENTIFIED: "●",
@@ -53,6 +53,7 @@ def summary(result: Record) -> tuple[Table | str, ...]:
         The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
     """
     parts = (parameters(result), nuisances(result), accuracy(result), observables(result))
+    parts = (*parts, observables_table(result.accuracy.observables))
     return (f"{heading(result)}, {result.rt_calls:,} RT calls", *(table for table in parts if table.rows))
 
 
@@ -67,7 +68,7 @@ def tables(result: Record) -> tuple[Table, ...]:
     """
     parts = (
         links(result), parameters(result), reasons(result), nuisances(result), accuracy(result), observables(result),
-        remarks(result), diagnostics_table(result), costs(result),
+        observables_table(result.accuracy.observables), remarks(result), diagnostics_table(result), costs(result),
     )  # fmt: skip
     return tuple(table for table in parts if table.rows)
 
@@ -180,7 +181,10 @@ def observables(result: Record) -> Table:
     """
     rows = []
     for name, fit in result.fit.observables.items():
-        biases = ", ".join(f"{label or 'all'} {value:+.3g}" for label, value in fit.biases.items())
+        biases = ", ".join(
+            f"{label or 'all'} {value:+.3g} ± {fit.bias_errors.get(label, 0.0):.2g}"
+            for label, value in fit.biases.items()
+        )
         figures = (fit.initial_rmse, fit.rmse, fit.mean_rmse, fit.error)
         rows.append(
             (f"{name} [{fit.unit}]", str(fit.links), *(f"{figure:.3g}" for figure in figures), biases)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import stdtrit
 
 from calibray.result.verdict import CONFIDENCE
@@ -48,6 +49,25 @@ FITTED: Final = (
 """Models that calibrate materials and can make predictions anywhere."""
 
 
+@dataclass(frozen=True)
+class ObservableErrors:
+    """Held-out errors of a further observable, in its unit.
+
+    Attributes:
+        unit: The unit.
+        links: Number of held-out links with a value.
+        rmse: RMSE of the calibrated model.
+        mean_rmse: RMSE of the mean of the other links.
+        distance_rmse: RMSE of a law of distance fitted to the other links.
+    """
+
+    unit: str
+    links: Annotated[int, Field(ge=1)]
+    rmse: Annotated[float, Field(ge=0)]
+    mean_rmse: Annotated[float, Field(ge=0)]
+    distance_rmse: Annotated[float, Field(ge=0)]
+
+
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
     """Residuals of several models on the same links, each link predicted without its block.
@@ -59,6 +79,8 @@ class HeldOutErrors:
         position: Positions of the receivers [links, 3], [m].
         measured_db: Measured path loss [links], [dB].
         level: Nominal coverage of the intervals.
+        observables: Errors of the further observables by name; empty in a result that was loaded, whose accuracy has
+            them.
     """
 
     labels: tuple[str, ...]
@@ -67,6 +89,7 @@ class HeldOutErrors:
     position: NDArray[np.float64]
     measured_db: NDArray[np.float64]
     level: float = 0.9
+    observables: dict[str, ObservableErrors] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from calibray.materials import Material
 from calibray.paths import Paths
-from calibray.result.held_out import HeldOutErrors, Judgement
+from calibray.result.held_out import HeldOutErrors, Judgement, ObservableErrors
 from calibray.result.prediction_model import PredictionModel, ResidualField
 from calibray.result.remark import Remark
 from calibray.result.verdict import Interval
@@ -39,6 +39,7 @@ class ObservableFit:
         mean_rmse: RMSE of the mean value, as a rival.
         error: Standard deviation of a value's error, stated or estimated.
         biases: Bias by group; the group "" stands for all links.
+        bias_errors: Standard error of each bias, that of the parameters included.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class ObservableFit:
     mean_rmse: NonNegative
     error: NonNegative
     biases: dict[str, float] = field(default_factory=dict)
+    bias_errors: dict[str, NonNegative] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ class Accuracy:
         nuisance_only_holdout_rmse_db: RMSE with the initial materials and fitted nuisances [dB].
         log_distance_holdout_rmse_db: RMSE of the log-distance model [dB].
         judgement: The calibrated model compared with its best baseline.
+        observables: Errors of the further observables by name.
     """
 
     holdout_rmse_db: NonNegative | None = None
@@ -101,6 +104,7 @@ class Accuracy:
     nuisance_only_holdout_rmse_db: NonNegative | None = None
     log_distance_holdout_rmse_db: NonNegative | None = None
     judgement: Judgement | None = None
+    observables: dict[str, ObservableErrors] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from calibray.tracing.default_tracer import SIONNA
 from calibray.tracing.protocol import TracerFactory
 from calibray.validation.baselines import has_obstruction, kriging, log_distance, obstructed, without_scene
 from calibray.validation.held_out_statistics import spatial_blocks
+from calibray.validation.observables import MODELS, held_out_gaps, observable_errors
 from calibray.validation.validation import Validation
 from calibray.validation.variants import NO_MINIMA, add_nuisance, fit_variants
 
@@ -127,18 +128,26 @@ def validate_problem(
     block, labels = _divide(problem, blocks, by)
     all_link_minima = {name: minima for name, (_, minima) in fit_variants(problem, known_minima).items()}
     errors: dict[str, NDArray[np.float64]] = {}
+    gaps = {each.name: np.full((len(MODELS), len(links)), np.nan) for each in problem.observed}
     for number in range(len(labels)):
         held_out = block == number
         weight = np.where(held_out, 0.0, objective.weight)
         part = replace(problem, objective=replace(objective, weight=weight))
-        for name, modelled in fit_models(part, all_link_minima).items():
+        fits = fit_variants(part, all_link_minima)
+        best = part.parameters.from_search(fits[Model.CALIBRATED][1][0])
+        for name, gap in held_out_gaps(part, best, held_out).items():
+            gaps[name][:, held_out] = gap[:, held_out]
+        for name, modelled in fit_models(part, fits).items():
             residual = errors.setdefault(name, np.full(len(links), np.nan))
             residual[held_out] = (modelled - objective.measured)[held_out]
         if progress is not None:
             progress("validating", number + 1, len(labels))
     judged = (block >= 0) & np.isfinite(errors[Model.INITIAL]) & np.isfinite(errors[Model.CALIBRATED])
     complete = {name: residual for name, residual in errors.items() if np.isfinite(residual[judged]).all()}
-    return Validation(labels, np.where(judged, block, -1), complete, links.rx, objective.measured)
+    return Validation(
+        labels, np.where(judged, block, -1), complete, links.rx, objective.measured,
+        observables=observable_errors(gaps, problem.setup.study),
+    )  # fmt: skip
 
 
 def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
@@ -169,13 +178,13 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
 
 
 def fit_models(
-    part: Problem, known_minima: Mapping[Model, NDArray[np.float64]] = NO_MINIMA
+    part: Problem, fits: Mapping[Model, tuple[Problem, NDArray[np.float64]]]
 ) -> dict[str, NDArray[np.float64]]:
     """Fit every model to the links that have a weight, and predict all links.
 
     Args:
         part: The problem; held-out links have weight 0.
-        known_minima: Additional starting points of the searches, by name of the model [k, d].
+        fits: The fitted variants that use the scene, from `fit_variants`.
 
     Returns:
         Path loss at all links by name of the model [links], [dB]; NaN where kriging is impossible.
@@ -183,7 +192,7 @@ def fit_models(
     setup, objective = part.setup, part.objective
     path_loss_db: dict[str, NDArray[np.float64]] = {
         name: add_nuisance(variant.objective, variant.modelled(minima[:1])[0])
-        for name, (variant, minima) in fit_variants(part, known_minima).items()
+        for name, (variant, minima) in fits.items()
     }
     known_db = without_scene(setup.study, setup.links)
     path_loss_db[Model.LOG_DISTANCE] = log_distance(setup.links, objective, known_db)

@@ -8,7 +8,8 @@ models of similar accuracy, and a fitted model loses more where its fit does not
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, final
 
@@ -17,12 +18,40 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.measurements import Measurements
-from calibray.result.held_out import BASELINES, FITTED, WITHOUT_MATERIALS, HeldOutErrors, Judgement, Model
+from calibray.result.held_out import (
+    BASELINES,
+    FITTED,
+    WITHOUT_MATERIALS,
+    HeldOutErrors,
+    Judgement,
+    Model,
+    ObservableErrors,
+)
 from calibray.result.prediction_model import BlockErrors
 from calibray.result.wording import choice_text, judgement_text
 from calibray.support.messages import percent
 from calibray.tables import Column, Table, display, numbers
 from calibray.validation.held_out_statistics import choose, compare, interval_half_width, least, two_levels
+
+
+def observables_table(observables: Mapping[str, ObservableErrors]) -> Table:
+    """Held-out errors of further observables, each in its unit.
+
+    Args:
+        observables: The errors by name.
+
+    Returns:
+        The table; without rows if there are none.
+    """
+    columns = (
+        Column(), numbers("links"), numbers("RMSE"), numbers("RMSE of the mean"), numbers("RMSE of a law of distance"),
+    )  # fmt: skip
+    rows = tuple(
+        (f"{name} [{each.unit}]", str(each.links), f"{each.rmse:.3g}", f"{each.mean_rmse:.3g}",
+         f"{each.distance_rmse:.3g}")
+        for name, each in observables.items()
+    )  # fmt: skip
+    return Table("Observables of links held out", columns, rows)
 
 
 @final
@@ -46,8 +75,9 @@ class Validation(HeldOutErrors):
         if isinstance(errors, Validation):
             return errors
         return cls(
-            errors.labels, errors.block, errors.errors, errors.position, errors.measured_db, errors.level
-        )
+            errors.labels, errors.block, errors.errors, errors.position, errors.measured_db, errors.level,
+            errors.observables,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         return display.text(*self.summary())
@@ -140,7 +170,7 @@ class Validation(HeldOutErrors):
         """A comparison of the models.
 
         Returns:
-            A table, the judgement, and the choice of the prediction model.
+            A table, one of further observables if there are any, the judgement, and the choice of the prediction model.
         """
         columns = (
             Column(), numbers("RMSE", "dB"), numbers("standard deviation", "dB"), numbers("log density"),
@@ -155,10 +185,17 @@ class Validation(HeldOutErrors):
         nested = (
             f"If the other blocks choose the model for each block, the RMSE is {self.nested_rmse_db:.2f} dB."
         )
-        return Table(title, columns, rows), self.sentence, f"Best: {self.best}. {self.choice} {nested}"
+        further = (observables_table(self.observables),) if self.observables else ()
+        return (
+            Table(title, columns, rows),
+            *further,
+            self.sentence,
+            f"Best: {self.best}. {self.choice} {nested}",
+        )
 
     def content(self) -> dict[str, Any]:
         """The validation as plain values."""
+        observables = {name: asdict(errors) for name, errors in self.observables.items()}
         return {
             "blocks": list(self.labels),
             "models": {str(name): row.to_dict() for name, row in self.table.iterrows()},
@@ -166,6 +203,7 @@ class Validation(HeldOutErrors):
             "chosen": str(self.chosen),
             "nested_rmse_db": self.nested_rmse_db,
             "sentence": self.sentence,
+            **({"observables": observables} if observables else {}),
         }
 
     def _choose(self, mask: NDArray[np.bool_]) -> str:
