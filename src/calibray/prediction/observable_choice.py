@@ -67,15 +67,15 @@ def worth_measuring(
     modelled, jacobian = (part[:, :, index] for part in engine.observe_and_jacobian(values, statistics))
     best: list[Worth] = []
     before = _deviation(information)
-    for index, kind in enumerate(CHOICES):
-        finite = modelled[:, index][np.isfinite(modelled[:, index])]
+    for column, kind in enumerate(CHOICES):
+        finite = modelled[:, column][np.isfinite(modelled[:, column])]
         if not len(finite):
             continue
         error = ERROR_DB if KINDS[kind] == "dB" else RELATIVE_ERROR * float(np.sqrt(np.mean(finite**2)))
         if kind in own:
             name, section = own[kind]
             error = result.fit.observables[name].error * section.scale
-        slope = np.nan_to_num(jacobian[:, index]) * unit_slope[:, None, :] / max(error, 1e-300)
+        slope = np.nan_to_num(jacobian[:, column]) * unit_slope[:, None, :] / max(error, 1e-300)
         added = np.cumsum(np.einsum("nli,nlj->lnij", slope, slope), axis=0)
         narrowed = np.mean(_deviation(information + added) / before, axis=1)
         for number, ratio in enumerate(narrowed):
