@@ -24,7 +24,7 @@ SIGNATURES = {
     "coverage_map": "result, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
     "allow_changed_inputs",
     "validate": "study, blocks, by, workers, progress, tracer",
-    "suggest": "result, candidates, count, progress, allow_changed_inputs",
+    "suggest": "result, candidates, count, progress, allow_changed_inputs, observables",
     "channel_statistics": "paths, materials",
     "power_delay_profile": "paths, delays, materials",
 }
@@ -47,7 +47,7 @@ RESULT_METHODS = {
     "predict_interval": "self, links, level, progress, allow_changed_inputs",
     "coverage_map": "self, tx, height, cell, bounds, level, power_dbm, samples, columns, progress, workers, "
     "allow_changed_inputs",
-    "suggest": "self, candidates, count, progress, allow_changed_inputs",
+    "suggest": "self, candidates, count, progress, allow_changed_inputs, observables",
     "report": "self, file, overwrite, progress",
     "apply": "self, scene",
     "export": "self, folder, copy, overwrite",
