@@ -28,7 +28,7 @@ from calibray.fitting.problem import Problem
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.validation.held_out_statistics import interval_half_width, two_levels
-from calibray.validation.validate import fit_models, validate_problem
+from calibray.validation.validate import fit_models, fit_variants, validate_problem
 from choice import opened
 
 LEVEL = 0.9
@@ -57,7 +57,10 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
         factor * float(np.sqrt(levels.within_db**2 + 2 * levels.between_db**2)),
     ]
     part = replace(part, setup=part.setup.with_obstruction())
-    errors = {str(model): (loss - objective.measured)[apart] for model, loss in fit_models(part).items()}
+    errors = {
+        str(model): (loss - objective.measured)[apart]
+        for model, loss in fit_models(part, fit_variants(part)).items()
+    }
     errors[CHOSEN] = errors[name]
     error = np.abs(errors[name][np.isfinite(errors[name])])
     return [float(np.mean(error <= half)) for half in halves], halves, errors

@@ -22,6 +22,7 @@ import pandas as pd
 
 import calibray as cb
 from antenna_pose import POSITION, district
+from calibray.engines import Replay
 from calibray.engines.kinds.replay import replay
 from calibray.measurements.observables import Statistic
 from calibray.result.remark import RemarkKind
@@ -76,6 +77,7 @@ def planted(
     setup = Setup.open(study(folder, links))
     truth = {name: random.uniform(*limits) for name, limits in DRAWN.items()}
     engine = replay(setup, setup.trace())
+    assert isinstance(engine, Replay)
     values = np.array([[truth[name] for name in engine.parameters.names]])
     loss = engine.path_loss(values)[0]
     spread = 1e9 * engine.observe(values, (Statistic("rms_delay_spread"),))[0, 0]

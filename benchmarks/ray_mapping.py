@@ -26,7 +26,8 @@ from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays
 from calibray.engines.rays.table import RayTable
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
-from calibray.fitting.ray_mapping import HALF_SPACE, map_rays
+from calibray.fitting.ray_mapping import map_rays
+from calibray.fitting.ray_model import HALF_SPACE
 from calibray.fitting.search import least_squares
 from calibray.materials import Material, itu_material
 from calibray.paths import Paths
@@ -97,7 +98,7 @@ def repetition(district: districts.District, name: str, seed: int) -> dict[str, 
     )
     optimum = least_squares(problem, 256, parameters.to_search(truth)[None]).best.y
     mapped = map_rays(problem, foreign.rays, seed=seed, most_calls=6)
-    points = parameters.to_search(np.array([export.candidate for export in mapped.exports]))
+    points = parameters.to_search(np.array([call.candidate for call in mapped.calls]))
     excess = problem.squares(points).value - optimum
     return {
         "district": district.name, "engine": name, "seed": seed, "paths": foreign.paths.num_paths,
