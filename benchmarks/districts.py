@@ -122,23 +122,25 @@ class Streets:
         return self.blocks * self.pitch + self.width
 
 
-def make(name: str, folder: Path) -> District:
+def make(name: str, folder: Path, missing: float = 0.0) -> District:
     """Make a district and trace it; the package's cache keeps its paths.
 
     Args:
         name: "demo", or "district-SEED".
         folder: Folder for the scene and its links.
+        missing: Share of the buildings that the scene lacks; the links are those of the complete district.
     """
     if name == DEMO:
         setup = Study.load(demo_study_path()).opened()
         footprints = tuple(building.footprint for building in district())
     else:
         # A folder for each process: another one may be writing the same district.
-        setup, footprints = _drawn(int(name.removeprefix("district-")), folder / f"{name}-{os.getpid()}")
+        seed = int(name.removeprefix("district-"))
+        setup, footprints = _drawn(seed, folder / f"{name}-{missing:g}-{os.getpid()}", missing)
     return District(name, Problem.of(setup, engines.make(setup, "replay")), footprints)
 
 
-def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
+def _drawn(seed: int, folder: Path, missing: float) -> tuple[Setup, tuple[np.ndarray, ...]]:
     random = np.random.default_rng([seed, 77])
     blocks, width = random.integers(2, 5, 2), random.uniform(14, 30)
     block = random.uniform(50, 130, 2)
@@ -149,24 +151,6 @@ def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
             south_west = np.array([column, row]) * streets.pitch + width - streets.extent / 2
             buildings += _block(south_west, block, random, len(buildings))
     frequency = float(random.choice([0.9e9, 2.1e9, 3.5e9, 6e9, 10e9, 28e9]))
-    structures, windows = zip(*(building_meshes(each) for each in buildings), strict=True)
-    corner = streets.extent / 2 + 20
-    ground = Mesh(
-        np.array(
-            [
-                [-corner[0], -corner[1], 0],
-                [corner[0], -corner[1], 0],
-                [*corner, 0],
-                [-corner[0], corner[1], 0],
-            ]
-        ),
-        np.array([[0, 1, 2], [0, 2, 3]]),
-    )
-    objects = [
-        MeshObject("structures", "walls", join_meshes(structures)),
-        MeshObject("panes", "windows", join_meshes(windows)),
-        MeshObject("plane", "ground", ground),
-    ]
     wall, earth = str(random.choice(["concrete", "brick", "marble"])), float(random.uniform(0.3, 3.0))
     materials = {
         "walls": _constants(itu_material(wall, frequency, float(random.uniform(0.1, 0.4)))),
@@ -177,7 +161,7 @@ def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
             "thickness": earth,
         },
     }
-    write_scene(folder / "scene", objects, materials)
+    write_scene(folder / "scene", _objects(buildings, streets), materials)
     bounds = {
         "walls.relative_permittivity": {"bounds": [1.5, 12.0]},
         "windows.relative_permittivity": {"bounds": [1.5, 10.0]},
@@ -202,8 +186,26 @@ def _drawn(seed: int, folder: Path) -> tuple[Setup, tuple[np.ndarray, ...]]:
     # Of the receivers planned, the first that some path leads to.
     reached = np.setdiff1d(np.arange(len(table)), setup.trace().links_without_path)[:count]
     table.iloc[reached].to_csv(folder / "links.csv", index=False)
+    if missing:
+        count = max(1, round(missing * len(buildings)))
+        lost = np.random.default_rng([seed, 78]).permutation(len(buildings))[:count]
+        buildings = [each for number, each in enumerate(buildings) if number not in lost]
+        write_scene(folder / "scene", _objects(buildings, streets), materials)
     setup = Study.from_content(content, folder / "study.toml").opened()
     return setup, tuple(each.footprint for each in buildings)
+
+
+def _objects(buildings: list[Building], streets: Streets) -> list[MeshObject]:
+    structures, windows = zip(*(building_meshes(each) for each in buildings), strict=True)
+    x, y = streets.extent / 2 + 20
+    ground = Mesh(
+        np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    return [
+        MeshObject("structures", "walls", join_meshes(structures)),
+        MeshObject("panes", "windows", join_meshes(windows)),
+        MeshObject("plane", "ground", ground),
+    ]
 
 
 def _block(corner: np.ndarray, size: np.ndarray, random: np.random.Generator, first: int) -> list[Building]:
