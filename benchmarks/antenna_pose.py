@@ -1,4 +1,4 @@
-"""Planted sectors whose stated directions are wrong: does calibration find them, and the materials beside them?
+"""Planted sectors whose stated directions are wrong: does calibration find them, and the materials as well?
 
     python benchmarks/antenna_pose.py --districts 20 --repetitions 5
 

@@ -193,10 +193,10 @@ def tree(root: int) -> list[int]:
 def memory(process: int) -> int:
     """The most memory that a process has had [bytes]."""
     try:
-        told = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
+        peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{process}/status").read_text())
     except OSError:
         return 0
-    return 0 if told is None else 1024 * int(told[1])
+    return 0 if peak is None else 1024 * int(peak[1])
 
 
 def explode(bomb: Bomb, folder: Path) -> tuple[str, float, int, str]:

@@ -7,8 +7,8 @@ Every seed is another walk through the places of `examples/bring_your_own`: othe
 study is the one that `calibray init` writes for the example, the scene the one that `calibray scene` makes, and what is
 chosen, fitted and profiled is what `calibray run` does. So that all is traced once and no program compiled twice,
 positions are drawn from some for each stop of the town, and the track of the hill is one of a few. --keep-faint fits
-all averages that were heard, --biased leaves the logarithm of their means as it is; both concern the town, where there
-is a noise floor. Seeds that stand in --out are not run again.
+all averages above the noise floor, --biased leaves the logarithm of their means as it is; both concern the town, where
+there is a noise floor. Seeds that stand in --out are not run again.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def constants(materials: dict[str, dict[str, float]]) -> dict[str, float]:
     return {f"{name}.{key}": value for name, values in materials.items() for key, value in values.items()}
 
 
-# The town: positions that may be recorded are links of one problem, of which a walk weighs those drawn and heard.
+# The town: positions that may be recorded are links of one problem, of which a walk weighs those drawn and received.
 
 
 def town_walk(folder: Path, biased: bool) -> Walk:
@@ -122,13 +122,13 @@ def town_walk(folder: Path, biased: bool) -> Walk:
     materials = {"walls": town.WALLS, "ground": town.GROUND}
     planted = {name: value for name, value in constants(materials).items() if "permittivity" in name}
     averaging = Averaging("cell", study.links.average.size, unbiased=not biased)
-    return Walk(planted, lambda seed: _heard_in_town(whole, gains, recorded, seed, averaging))
+    return Walk(planted, lambda seed: _received_in_town(whole, gains, recorded, seed, averaging))
 
 
-def _heard_in_town(
+def _received_in_town(
     problem: Problem, gains: list[list[np.ndarray]], recorded: np.ndarray, seed: int, averaging: Averaging
 ) -> Problem:
-    """The problem of one walk: only the positions drawn and heard count."""
+    """The problem of one walk: only the positions drawn and received count."""
     rng = np.random.default_rng(seed)
     number = np.arange(len(problem.setup.links)).reshape(len(town.MASTS), *recorded.shape[:3])
     rows = []
@@ -164,7 +164,7 @@ def _again(study: Study, problem: Problem) -> Problem:
 
 def flat_walk(folder: Path) -> Walk:
     """The flat, its laptop and three access points; floor and ceiling are planted as the scene makes them."""
-    gains = flat.heard()
+    gains = flat.received()
     scene = make_plan_scene(read_plan(flat.FOLDER / "plan.csv", 2.6), folder).path
     table = folder / "rss.csv"
     flat.measure(gains, np.random.default_rng(flat.SEED)).to_csv(table, index=False)
@@ -188,7 +188,7 @@ def flat_walk(folder: Path) -> Walk:
 
 def hill_walk(folder: Path) -> Walk:
     """The hill, its scanner and its track."""
-    gains = hill.heard()
+    gains = hill.received()
     found, frame = read_footprints(hill.FOLDER / "houses.geojson", "height_m", 0.0)
     bounds = found.bounds + MARGIN * np.array([-1, -1, 1, 1])
     terrain, frame = lower_origin(read_terrain(hill.FOLDER / "ground.tif", frame, bounds), frame)
@@ -222,23 +222,23 @@ def judged(walk: Walk, seed: int, keep_faint: bool) -> dict[str, object]:
     problem = walk.problem(seed)
     problem = problem if keep_faint else leave_out_near_floor(problem)
     trail = search(problem, choose(problem))
-    told = certainty(problem, trail).intervals
+    record = certainty(problem, trail).intervals
     best = problem.parameters.named(trail.best)
     found = {
         name: {
             "planted": planted,
             "found": best[name],
-            "pieces": [list(piece) for piece in told[name].pieces],
-            "verdict": str(told[name].verdict),
+            "pieces": [list(piece) for piece in record[name].pieces],
+            "verdict": str(record[name].verdict),
         }
         for name, planted in walk.planted.items()
     }
     return {"links": problem.objective.num_counted, "rmse_db": trail.best_rmse_db, "parameters": found}
 
 
-def holds(told: dict[str, object]) -> bool:
+def holds(record: dict[str, object]) -> bool:
     """Whether an interval holds what was planted."""
-    return any(low <= told["planted"] <= high for low, high in told["pieces"])
+    return any(low <= record["planted"] <= high for low, high in record["pieces"])
 
 
 def summary(entries: list[dict[str, object]]) -> Iterator[str]:
@@ -246,13 +246,16 @@ def summary(entries: list[dict[str, object]]) -> Iterator[str]:
     for walk in dict.fromkeys(entry["walk"] for entry in entries):
         mine = [entry["parameters"] for entry in entries if entry["walk"] == walk]
         for name in mine[0]:
-            told = [each[name] for each in mine]
-            count, sure = sum(map(holds, told)), [each for each in told if each["verdict"] == "identified"]
-            middle = np.median([each["found"] for each in told])
-            likely = binomtest(count, len(told)).proportion_ci()
+            records = [each[name] for each in mine]
+            count, sure = (
+                sum(map(holds, records)),
+                [each for each in records if each["verdict"] == "identified"],
+            )
+            middle = np.median([each["found"] for each in records])
+            likely = binomtest(count, len(records)).proportion_ci()
             yield (
-                f"{walk}, {name}: {told[0]['planted']:.4g} in {count} of {len(told)} intervals, "
-                f"{count / len(told):.2f} ({likely.low:.2f} to {likely.high:.2f}), of those called identified in "
+                f"{walk}, {name}: {records[0]['planted']:.4g} in {count} of {len(records)} intervals, "
+                f"{count / len(records):.2f} ({likely.low:.2f} to {likely.high:.2f}), of those called identified in "
                 f"{sum(map(holds, sure))} of {len(sure)}; found {middle:.4g} in the middle"
             )
 
@@ -284,16 +287,16 @@ def main() -> None:
                         "town": lambda place: town_walk(place, arguments.biased), "flat": flat_walk, "hill": hill_walk,
                     }  # fmt: skip
                     walk = walk or makers[name](Path(folder))
-                    told = {
+                    record = {
                         "walk": name,
                         "seed": seed,
                         "how": how,
                         **judged(walk, seed, arguments.keep_faint),
                     }
-                    known[name, seed] = told
+                    known[name, seed] = record
                     if arguments.out:
                         with arguments.out.open("a") as file:
-                            file.write(json.dumps(told) + "\n")
+                            file.write(json.dumps(record) + "\n")
                 entry = known[name, seed]
                 entries.append(entry)
                 shown = (

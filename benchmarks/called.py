@@ -1,13 +1,13 @@
-"""Intervals on engines that can only be called, beside those that their derivatives would give.
+"""Intervals on engines that can only be called, compared with those that their derivatives would give.
 
     python benchmarks/called.py --repetitions 30 --districts demo,development --out called.jsonl
 
 The engine is the replay of a district whose fixed constants (thickness, conductivity) are off by random factors and
-whose every link is off by 0.5 dB, so that the study's own replay is a cheap model that is told wrongly. Truths are
+whose every link is off by 0.5 dB, so that the study's own replay is a cheap model with wrong constants. Truths are
 drawn evenly from their ranges, errors have 1 and 3 dB. Twice the engine is only called: by space mapping with the
 study's replay, 10 calls a parameter, and by the vector surrogate without, 20 calls a parameter; the third time its
-derivatives are used. A row tells how often 90 % and 95 % intervals hold the truth, and how wide they are beside the
-third's on the same data.
+derivatives are used. A row says how often 90 % and 95 % intervals cover the truth, and how wide they are compared
+with the third's on the same data.
 """
 
 from __future__ import annotations
@@ -142,10 +142,10 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
         }[way]()
         trail = search(asked, optimizer)
         before = time.process_time()
-        told = certainty(asked, trail, model=model)
-        if told.posterior is None:
-            raise RuntimeError(f"{name}, {way}: no draws; {told.remarks}")
-        draws = told.posterior.means
+        assessed = certainty(asked, trail, model=model)
+        if assessed.posterior is None:
+            raise RuntimeError(f"{name}, {way}: no draws; {assessed.remarks}")
+        draws = assessed.posterior.means
         sets = [
             {
                 str(level): credible(draws.point[:, k], draws.weight, bounds[0][k], bounds[1][k], level)
@@ -154,7 +154,7 @@ def repetition(name: str, noise_db: float, turn: int, folder: Path) -> dict[str,
             for k in range(count)
         ]
         found[way] = {
-            "verdicts": [each.verdict for each in told.intervals.values()],
+            "verdicts": [each.verdict for each in assessed.intervals.values()],
             "held": [
                 {level: _holds(pieces, value) for level, pieces in each.items()}
                 for value, each in zip(point, sets, strict=True)
@@ -188,7 +188,7 @@ def _rows(lines: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
         for way in here[0]:
             held = [each for ways in here for each in ways[way]["held"]]
             verdict = [each for ways in here for each in ways[way]["verdicts"]]
-            told = [
+            widths = [
                 each["0.9"]
                 for each, said in zip(held, verdict, strict=True)
                 if said in ("identified", "weakly identified")
@@ -200,7 +200,8 @@ def _rows(lines: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
             yield (
                 f"{noise:g} dB", way, str(len(held)),
                 *(f"{np.mean([each[str(level)] for each in held]):.2f}" for level in LEVELS),
-                str(len(told)), f"{np.mean(told):.2f}" if told else "-", f"{middle:.2f}", f"{low:.2f}", f"{high:.2f}",
+                str(len(widths)), f"{np.mean(widths):.2f}" if widths else "-",
+                f"{middle:.2f}", f"{low:.2f}", f"{high:.2f}",
                 f"{np.mean([ways[way]['seconds'] for ways in here]):.1f}",
             )  # fmt: skip
 

@@ -70,11 +70,11 @@ def main() -> None:
     """Compare, print, and end with what was found."""
     data = Path(os.environ.get("CALIBRAY_DATA", Path(__file__).parents[2] / "shared" / "data"))
     found = [
-        (name, told, right)
+        (name, shown, right)
         for name, campaign in (("nist_boulder", boulder), ("auckland_tower", auckland))
-        for told, right in campaign(data / name).items()
+        for shown, right in campaign(data / name).items()
     ]
-    rows = [(name, told, "yes" if right else "NO") for name, told, right in found]
+    rows = [(name, shown, "yes" if right else "NO") for name, shown, right in found]
     columns = tuple(Column(name) for name in ("campaign", "what its description says", "holds"))
     print(render(Table("Campaigns", columns, tuple(rows))))
     sys.exit(not all(right for *_, right in found))

@@ -56,9 +56,9 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("studies", nargs="*", default=[str(demo_study_path())], help="study files")
-    given, dear = parser.parse_args(), False
+    options, expensive = parser.parse_args(), False
     columns = (Column("part"), numbers("processor", "s"), numbers("replays"), numbers("ratio"))
-    for file in given.studies:
+    for file in options.studies:
         setup = Study.load(file).opened()
         found = costs(Problem.of(setup, engines.make(setup)))
         own = found["calibration"][0]
@@ -66,15 +66,15 @@ def main() -> None:
             (name, f"{spent:.1f}", f"{calls:,}", f"{spent / own:.2f}")
             for name, (spent, calls) in found.items()
         ]
-        beside = sum(spent for name, (spent, _) in found.items() if name != "calibration") / own
+        others = sum(spent for name, (spent, _) in found.items() if name != "calibration") / own
         print(
             render(
                 Table(setup.study.path.name, columns, tuple(rows)),
-                f"All beside it: {beside:.1f} calibrations.",
+                f"All other parts: {others:.1f} calibrations.",
             )
         )
-        dear |= beside > LIMIT
-    if dear:
+        expensive |= others > LIMIT
+    if expensive:
         sys.exit(f"draws, validation and choice cost more than {LIMIT:g} calibrations")
 
 

@@ -155,7 +155,7 @@ def ruled(name: str, count: int, folder: Path) -> dict[float, list[dict[str, np.
 
 
 def rules(names: list[str], count: int) -> Table:
-    """What choosing comes to over planted truths, beside models that are always taken."""
+    """Errors of the chosen model over planted truths, compared with models that are always taken."""
     every: dict[float, list[dict[str, np.ndarray]]] = {apart: [] for apart in APART}
     with TemporaryDirectory() as folder:
         for name in names:

@@ -92,9 +92,9 @@ def searched(setup: Setup, workers: Workers | None) -> tuple[float, float]:
 
 def validated(setup: Setup, workers: Workers | None) -> tuple[float, float]:
     """Seconds of tracing and of judging by two blocks."""
-    started, told = time.perf_counter(), []
-    cb.validate(setup, blocks=2, workers=workers, progress=lambda *_: told.append(time.perf_counter()))
-    traced = told[-3]
+    started, times = time.perf_counter(), []
+    cb.validate(setup, blocks=2, workers=workers, progress=lambda *_: times.append(time.perf_counter()))
+    traced = times[-3]
     return traced - started, time.perf_counter() - traced
 
 

@@ -5,12 +5,12 @@
     python benchmarks/coverage.py --districts judging --repetitions 200 --workers 2 --out judging.jsonl
 
 Every repetition draws a truth for each parameter evenly from its search range, makes path losses of it, adds the errors
-of its world, and calibrates as `calibray run` does, from fewer starting points. Nothing is told of the world: every
-study has the defaults. A row tells how often the interval held the truth, over all repetitions and where the verdict
-was "identified" or "weakly identified", and how often the verdict was "not identifiable". Beside stands what the same
-draws tell where the noise is known as it was made: that posterior holds its share of truths by
-definition, so that what it held is the luck of the repetitions, and its width the narrowest that may be claimed. Where
-buildings differ there is no such posterior.
+of its world, and calibrates as `calibray run` does, from fewer starting points. The study does not state the world:
+all settings are defaults. A row says how often the interval covered the truth, over all repetitions and where the
+verdict was "identified" or "weakly identified", and how often the verdict was "not identifiable". For comparison, the
+same draws are weighted with the true noise. That posterior covers its share of truths by definition: what it covers is
+the luck of the repetitions, and its width is the narrowest that may be claimed. Where buildings differ there is no such
+posterior.
 
 Each repetition is a line of the file `--out`; a run that was stopped goes on where it stood, and `--repetitions 0`
 prints the tables of what is there. The last rows are the negative control, the same posterior with the noise
@@ -176,10 +176,10 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
     )
     problem = replace(problem, objective=objective)
     trail = search(problem, LeastSquares(lower, upper, starts=starts, seed=turn))
-    told = certainty(problem, trail)
-    posterior, found = told.posterior, []
+    assessed = certainty(problem, trail)
+    posterior, found = assessed.posterior, []
     if posterior is None:
-        raise RuntimeError(f"{name}, {world}, {turn}: no draws; {told.remarks}")
+        raise RuntimeError(f"{name}, {world}, {turn}: no draws; {assessed.remarks}")
     means = posterior.means
     reference = _known(district, world, problem, trail, turn) if known.all() else None
     narrow = means.weight * np.exp((UNDERSTATED - 1) * (means.density - means.density.max()))
@@ -193,7 +193,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
             luck = {"held": bool(_holds(alike, point[k])), "width": _width(alike) / (upper[k] - lower[k])}
         found.append({
             "name": parameter,
-            "verdict": told.intervals[parameter].verdict,
+            "verdict": assessed.intervals[parameter].verdict,
             "held": {level: bool(_holds(pieces, point[k])) for level, pieces in sets.items()},
             "width": _width(sets["0.9"]) / (upper[k] - lower[k]),
             "known": luck,
@@ -201,7 +201,7 @@ def repetition(name: str, world: str, turn: int, seed: int, starts: int, folder:
         })  # fmt: skip
     return {
         "district": name, "world": world, "repetition": turn, "seed": seed, "parameters": found,
-        "noise": told.noise, "agree": means.agree, "calls": told.calls,
+        "noise": assessed.noise, "agree": means.agree, "calls": assessed.calls,
         "seconds": time.process_time() - started,
     }  # fmt: skip
 
@@ -310,8 +310,8 @@ def main() -> None:
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
         print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))
-    told, denied = determined(lines)
-    print(f"Well determined with the noise known: {told} values; called not identifiable of them: {denied}.")
+    count, denied = determined(lines)
+    print(f"Well determined with the noise known: {count} values; called not identifiable of them: {denied}.")
     if denied:
         sys.exit("well-determined parameters are called not identifiable")
     control = [entry["control"] for line in lines if line["world"] == "random" for entry in line["parameters"]
@@ -349,14 +349,14 @@ def _table(title: str, lines: list[dict[str, Any]], by_name: bool) -> Table:
         here = [entry for line in lines if line["world"] == world for entry in line["parameters"]]
         for name in dict.fromkeys(entry["name"] for entry in here) if by_name else ("all",):
             mine = [entry for entry in here if name in (entry["name"], "all")]
-            told = [entry for entry in mine if entry["verdict"] in ("identified", "weakly identified")]
+            sure = [entry for entry in mine if entry["verdict"] in ("identified", "weakly identified")]
             blind = np.mean([entry["verdict"] == "not identifiable" for entry in mine])
             rows.append((
-                world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), _lucky(mine), str(len(told)),
-                _share(told, "0.9") + _error(told, "0.9"), _share(told, "0.95") + _error(told, "0.95"), _lucky(told),
+                world, name, str(len(mine)), _share(mine, "0.9"), _share(mine, "0.95"), _lucky(mine), str(len(sure)),
+                _share(sure, "0.9") + _error(sure, "0.9"), _share(sure, "0.95") + _error(sure, "0.95"), _lucky(sure),
                 f"{blind:.2f}",
                 f"{np.median([entry['width'] for entry in mine]):.2f}", _wider(mine),
-                f"{np.mean([entry['control'] for entry in told]):.2f}" if told and world == "random" else "-",
+                f"{np.mean([entry['control'] for entry in sure]):.2f}" if sure and world == "random" else "-",
             ))  # fmt: skip
     seconds = sum(line["seconds"] for line in lines) / max(len(lines), 1)
     return Table(f"{title}: {len(lines)} repetitions, {seconds:.1f} s of CPU each", columns, tuple(rows))

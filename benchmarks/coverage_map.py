@@ -1,4 +1,4 @@
-"""What a coverage map costs beside a trace of as many receivers, and how Sionna's radio map solver differs from it.
+"""Cost of a coverage map compared with a trace of as many receivers, and how Sionna's radio map solver differs from it.
 
     python benchmarks/coverage_map.py [--cells 64 | --whole] [--samples auto] [--solver]
 

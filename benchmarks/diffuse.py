@@ -4,7 +4,7 @@
 
 Needs the measured campaign that examples/README.md tells how to get; without it, nothing is measured. One run times the
 rival (Sionna RT finding the paths and evaluating the fields anew), replay of all paths, and replay of the compressed
-program, with the agreement beside the times.
+program, with the agreement next to the times.
 """
 
 from __future__ import annotations

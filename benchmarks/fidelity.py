@@ -2,7 +2,7 @@
 
     CALIBRAY_DATA=FOLDER python benchmarks/fidelity.py
 
-The scenes and the comparison are those of the tests (tests/fidelity_cases.py), and beside them those of the measured
+The scenes and the comparison are those of the tests (tests/fidelity_cases.py), and those of the measured
 campaigns, which lie in the folder that is named; materials are as traced, and then all changed at random twice. Only
 paths within 60 dB of their link's strongest count. The exit status is 1 if an error is over its bound.
 """

@@ -4,7 +4,7 @@
 
 Path programs are made up at random (three materials, three interactions a path, three hundred links), in single
 precision as large programs are. The rival in the same run is the slab formula of ITU-R P.2040 evaluated at every
-interaction, which is what replay does without tables; the difference between both is printed beside the times.
+interaction, which is what replay does without tables; the difference between both is printed next to the times.
 """
 
 from __future__ import annotations

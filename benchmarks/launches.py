@@ -1,14 +1,14 @@
 """What tracing costs by launches: rays added in rounds against a number of rays, many receivers, many transmitters.
 
-Everything is measured in one run on one machine, in processor seconds, so that ratios can be read beside other work:
+Everything is measured in one run on one machine, in processor seconds, so that other work hardly changes the ratios:
 
     python benchmarks/launches.py            # a few minutes
     python benchmarks/launches.py --full     # 4 million rays on the demo district and 10,000 receivers as well
 
 Three comparisons: the demo district, whose paths 1 million rays do not all find; receivers in the streets of Munich on
 one transmitter, traced with a million rays (the default) and with "auto"; and a flat-like case, many transmitters and
-few receivers, beside its mirror image. Each trace is run once before, so that no compiling is measured, but for the
-demo district, where the first run is told too.
+few receivers, and its mirror image. Each trace is run once before, so that no compiling is measured, but for the
+demo district, where the first run is printed too.
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ runs space mapping on each problem of the families with its own cheap model, wit
 three that know nothing of the problem: *scrambled*, the problem's own with its links shuffled and its box mirrored,
 *tones*, smooth random functions of the same size for every link, and *noise*, random numbers without any smoothness,
 the same at the same point. It prints the calls that each takes to come within a tolerance, and how many more than
-without: of the median runs, and on the median of the data profile, the i-th fastest run with it beside the i-th fastest
-without for as many as were solved by both. Finished runs are kept under out/misleading; a killed benchmark goes on.
+without: of the median runs, and on the median of the data profile, the i-th fastest run with it against the i-th
+fastest without for as many as were solved by both. Finished runs are kept under
+out/misleading; a killed benchmark continues.
 """
 
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
@@ -74,9 +75,11 @@ class Scrambled:
 
     def answer(self, points: NDArray[np.float64], constants: NDArray[np.float64]) -> CheapAnswer:
         """See `CheapModel.answer`."""
-        told = self.model.answer(self.ends - points, constants)
+        answer = self.model.answer(self.ends - points, constants)
         return CheapAnswer(
-            told.residuals[:, self.order], -told.by_point[:, self.order], told.by_constant[:, self.order]
+            answer.residuals[:, self.order],
+            -answer.by_point[:, self.order],
+            answer.by_constant[:, self.order],
         )
 
 
@@ -183,8 +186,8 @@ def noise(problem: ComparisonProblem) -> CheapModel:
 
 def in_the_middle(problem: ComparisonProblem) -> tuple[float, int]:
     """Root mean square of the residuals in the middle of the box [dB], and their number."""
-    told = problem.evaluate(0.5 * (problem.lower + problem.upper)[None], False)
-    return float(told.value[0]), told.residuals.shape[1]
+    answer = problem.evaluate(0.5 * (problem.lower + problem.upper)[None], False)
+    return float(answer.value[0]), answer.residuals.shape[1]
 
 
 def own(problem: ComparisonProblem) -> CheapModel:

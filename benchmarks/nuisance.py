@@ -93,8 +93,8 @@ def main() -> None:
     for name, target in targets.items():
         time = seconds(lambda target=target: target.jacobian(loss, slope), 5)
         value = seconds(lambda target=target: target.value(loss), 5)
-        beside = f" {rival / time:12.0f}x {gap:11.1e}" if target is plain else ""
-        print(f"{name:36} {1e3 * time:7.0f} ms {1e3 * value:7.0f} ms{beside}")
+        rival_columns = f" {rival / time:12.0f}x {gap:11.1e}" if target is plain else ""
+        print(f"{name:36} {1e3 * time:7.0f} ms {1e3 * value:7.0f} ms{rival_columns}")
 
 
 if __name__ == "__main__":

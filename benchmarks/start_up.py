@@ -1,4 +1,4 @@
-"""How long `calibray --version` and `--help` take, beside Python that does nothing.
+"""How long `calibray --version` and `--help` take, compared with Python that does nothing.
 
     python benchmarks/start_up.py [--repeats 9]
 

@@ -17,7 +17,7 @@ simulated noise. With `--separate` a repetition counts only where a material's i
 A row tells, for concrete and for glass: the median width of the 95 % interval after suggested points by that after
 random ones; how often it is narrower, ties as half; how often ranges were separate, how often they are one afterwards,
 and how often that is because the others were ruled out, not because what lies between them fits as well now; and what
-width was expected, of that before, beside what came about.
+width was expected and which one resulted, relative to the width before.
 """
 
 from __future__ import annotations
@@ -313,7 +313,9 @@ def main() -> None:
     parser.add_argument("--districts", default="demo,11,12,21,22")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--separate", action="store_true", help="only where an interval has separate ranges")
-    parser.add_argument("--oracle", action="store_true", help="beside them the choice of who knows the truth")
+    parser.add_argument(
+        "--oracle", action="store_true", help="also the choice of an oracle that knows the truth"
+    )
     given, runs = parser.parse_args(), {}
     for name in given.districts.split(","):
         with TemporaryDirectory() as folder:

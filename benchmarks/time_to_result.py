@@ -1,4 +1,4 @@
-"""How long a user waits for a calibration, by what he waits for, beside the time of one trace.
+"""How long a user waits for a calibration, by stage, compared with the time of one trace.
 
     CALIBRAY_DATA=../shared/data python benchmarks/time_to_result.py
 
@@ -90,13 +90,13 @@ def once(name: str) -> dict[str, object]:
     problem = estimate_noise(Problem.of(setup, replay(setup, paths)))
     trail = search(problem, choose(problem))
     clock.lap("search")
-    told = certainty(problem, trail)
+    timed = certainty(problem, trail)
     clock.lap("inference")
     clock.seconds["compile"] = sum(compiled), 0.0
     return {
         "seconds": clock.seconds,
         "interactions": paths.num_interactions,
-        "evaluations": [trail.rt_calls, told.calls],
+        "evaluations": [trail.rt_calls, timed.calls],
         "rmse_db": trail.best_rmse_db,
     }
 
@@ -151,19 +151,21 @@ def main() -> None:
     for name in studies:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("cold", "warm"):
-                told = in_a_process(once, name, Path(folder))
-                seconds = told["seconds"]
+                timed = in_a_process(once, name, Path(folder))
+                seconds = timed["seconds"]
                 ratio = (seconds["search"][0] + seconds["inference"][0]) / seconds["trace"][0]
                 parts = "".join(f"{seconds[part][0]:8.2f} ({seconds[part][1]:6.2f})" for part in PARTS)
-                calls = " + ".join(f"{count:,}" for count in told["evaluations"])
-                print(f"{name:15} {kind:5}{parts}{ratio:7.2f}  {calls}, {told['rmse_db']:.4f} dB", flush=True)
+                calls = " + ".join(f"{count:,}" for count in timed["evaluations"])
+                print(
+                    f"{name:15} {kind:5}{parts}{ratio:7.2f}  {calls}, {timed['rmse_db']:.4f} dB", flush=True
+                )
     print(f"\n{'study':15} {'all starts':>24} {'until it comes back':>34} {'found within 0.001 dB':>22}")
     for name in studies:
         with tempfile.TemporaryDirectory() as folder:
-            told = in_a_process(seeds, name, Path(folder))
-        best, evaluations = told["all"]
-        calls = [count for _, count in told["few"]]
-        hits = sum(rmse <= best + 1e-3 for rmse, _ in told["few"])
+            timed = in_a_process(seeds, name, Path(folder))
+        best, evaluations = timed["all"]
+        calls = [count for _, count in timed["few"]]
+        hits = sum(rmse <= best + 1e-3 for rmse, _ in timed["few"])
         print(
             f"{name:15} {best:.5f} dB, {evaluations:8,} {min(calls):23,} to {max(calls):6,} {hits:>11} of {len(SEEDS)}"
         )

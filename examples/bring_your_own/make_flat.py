@@ -1,4 +1,4 @@
-"""Make the flat of this folder: a plan as somebody draws it, and what a laptop heard of three access points in it.
+"""Make the flat of this folder: a plan as somebody draws it, and what a laptop received from three access points in it.
 
     python examples/bring_your_own/make_flat.py
 
@@ -45,7 +45,7 @@ def spots() -> np.ndarray:
     return np.array([(x, y) for x in (0.9, 2.3, 3.7, 4.8, 6.4, 7.7, 9.0) for y in (0.9, 2.4, 4.9, 6.2)])
 
 
-def heard() -> list[list[np.ndarray]]:
+def received() -> list[list[np.ndarray]]:
     """Amplitudes of the paths from every access point to every spot, in the scene of the plan."""
     places = np.column_stack([spots(), np.full(len(spots()), HEIGHT)])
     with TemporaryDirectory() as folder:
@@ -74,7 +74,7 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     plan = pd.DataFrame(WALLS, columns=["x0", "y0", "x1", "y1", "type", "thickness"])
     plan.to_csv(FOLDER / "plan.csv", index=False, lineterminator="\n")
-    table = measure(heard(), np.random.default_rng(SEED))
+    table = measure(received(), np.random.default_rng(SEED))
     table.to_csv(FOLDER / "rss.csv", index=False, lineterminator="\n")
     points = pd.DataFrame(list(ACCESS_POINTS.values()), columns=["x", "y", "z"])
     points.insert(0, "ap", list(ACCESS_POINTS))

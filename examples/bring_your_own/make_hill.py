@@ -90,7 +90,7 @@ def duration() -> int:
     return int(length / SPEED)
 
 
-def heard() -> list[np.ndarray]:
+def received() -> list[np.ndarray]:
     """Amplitudes of the paths from the mast to where the scanner is in the midst of every second."""
     with TemporaryDirectory() as folder:
         found, frame = read_footprints(FOLDER / "houses.geojson", "height_m", 0.0)
@@ -142,7 +142,7 @@ def main() -> None:
     write_houses()
     write_ground()
     rng = np.random.default_rng(SEED)
-    measure(heard(), rng).to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
+    measure(received(), rng).to_csv(FOLDER / "power.csv", index=False, lineterminator="\n")
     (FOLDER / "walk.gpx").write_text(track(rng))
     longitude, latitude, _ = FRAME.to_geographic([(*MAST[:2], 0.0)])[0]
     (FOLDER / "masts.csv").write_text(

@@ -64,8 +64,8 @@ def write_map(path: Path) -> None:
     for number, (ring, tags) in enumerate(houses(), start=1):
         nodes = [corners.setdefault(corner, len(corners) + 1) for corner in ring]
         refs = "".join(f'<nd ref="{node}"/>' for node in [*nodes, nodes[0]])
-        told = "".join(f"<tag k={quoteattr(key)} v={quoteattr(value)}/>" for key, value in tags.items())
-        ways.append(f' <way id="{number}" version="1">{refs}{told}</way>')
+        tag_text = "".join(f"<tag k={quoteattr(key)} v={quoteattr(value)}/>" for key, value in tags.items())
+        ways.append(f' <way id="{number}" version="1">{refs}{tag_text}</way>')
     degrees = FRAME.to_geographic([(*corner, 0.0) for corner in corners])
     nodes = [
         f' <node id="{number}" version="1" lat="{latitude:.7f}" lon="{longitude:.7f}"/>'
@@ -106,9 +106,9 @@ def measure(extract: Path, rng: np.random.Generator) -> pd.DataFrame:
                 clock += pd.Timedelta(seconds=1)
                 for number, (cell, eirp) in enumerate(EIRP_DBM.items()):
                     rsrp = sample(gains[number][stop], eirp + gain_db, rng)
-                    heard = round(rsrp, 1) if rsrp > FLOOR_DBM else None
+                    received = round(rsrp, 1) if rsrp > FLOOR_DBM else None
                     rows.append(
-                        (clock.isoformat(), phone, f"{longitude:.7f}", f"{latitude:.7f}", cell, heard)
+                        (clock.isoformat(), phone, f"{longitude:.7f}", f"{latitude:.7f}", cell, received)
                     )
     return pd.DataFrame(rows, columns=["time", "device", "longitude", "latitude", "cell", "rsrp_dbm"])
 

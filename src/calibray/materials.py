@@ -325,7 +325,7 @@ def itu_law(name: str, frequency: float, revision: str = DEFAULT_REVISION) -> It
     if name not in table:
         others = [other for other in ITU_MATERIALS if name in ITU_MATERIALS[other]]
         remedy = f"it is in {', '.join(others)}" if others else did_you_mean(name, table)
-        raise InputError(f"{name!r} is no material of ITU-R {revision}: {remedy}")
+        raise InputError(f"{name!r} is not a material of ITU-R {revision}: {remedy}")
     for law in table[name]:
         if law.lower <= frequency / 1e9 <= law.upper:
             return law

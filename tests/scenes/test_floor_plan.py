@@ -243,7 +243,7 @@ def test_a_plan_is_read_in_its_unit(tmp_path):
         ("x0,y0,x1,y1,type\n", "holds no segment"),
         ("x0,y0,x1,y1,type\n0,0,a,1,brick\n", "row 2: x1 = 'a' is not a number"),
         ("x0,y0,x1,y1,type\n0,0,,1,brick\n", "row 2: lacks its type or a coordinate"),
-        ("wkt,type\nLINE,brick\n", "row 2: wkt = 'LINE' is no geometry"),
+        ("wkt,type\nLINE,brick\n", "row 2: wkt = 'LINE' is not a geometry"),
         ("wkt,type\nPOINT (1 1),brick\n", "row 2: lacks its type or a coordinate"),
         ("x0,y0,x1,y1,type\n0,0,1,1,brick\n2,2,2,2,brick\n", "row 3: its length, height"),
         ("x0,y0,x1,y1,type,height\n0,0,1,1,brick,-2\n", "row 2: its length, height"),

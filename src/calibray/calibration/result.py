@@ -200,7 +200,7 @@ class Result(Record):
             scene: The `sionna.rt.Scene`, at the study's carrier.
 
         Raises:
-            InputError: It is no scene of Sionna RT, or lacks a material.
+            InputError: It is not a scene of Sionna RT, or lacks a material.
         """
         from calibray.tracing.sionna.live_scene import apply_materials
 

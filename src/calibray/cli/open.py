@@ -20,7 +20,7 @@ def open(
 ) -> None:
     """Open a study's folder in the browser: from a map and measurements to predictions, without a terminal.
 
-    The page is served on this machine only, at an address with a token. Ctrl-C ends it; commands that it started go on.
+    The page is served on this machine only, at an address with a token. Ctrl-C ends it, but not commands in progress.
 
     Raises:
         InputError: NiceGUI is not installed, or the folder or the port cannot be used.

@@ -315,4 +315,4 @@ def _material(name: str, text: str, thickness: float) -> SurfaceMaterial:
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"material {text!r}: {own_thickness!r} is no thickness in metres") from None
+        raise InputError(f"material {text!r}: {own_thickness!r} is not a thickness in metres") from None

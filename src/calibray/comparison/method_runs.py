@@ -132,7 +132,7 @@ class BudgetedMethod:
         """Parse a method, as in "gwo@600", or with the common budget [RT calls].
 
         Raises:
-            InputError: The method is unknown, or the budget is no whole number or too small.
+            InputError: The method is unknown, or the budget is not a whole number or too small.
 
         Example:
             >>> BudgetedMethod.parse("gwo@600", 225)

@@ -31,7 +31,7 @@ TOLERANCE_DB: Final = 0.01
 """Default of the largest error of a link's path loss [dB]."""
 
 MIN_PATHS: Final = 64
-"""Paths of a link below which it is not compressed: there is little to gain."""
+"""A link with fewer paths is not compressed: there is little to gain."""
 
 FIT_SHARE: Final = 0.1
 """Share of the tolerance that the fit may use; the rest is for candidates between the training candidates."""

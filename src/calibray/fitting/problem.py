@@ -294,7 +294,7 @@ class Problem:
         """The engine, which gives further observables.
 
         Raises:
-            InputError: It is no replay in this process.
+            InputError: It is not a replay in this process.
         """
         from calibray.engines.replay import Replay
 

@@ -216,8 +216,8 @@ class _Interpreter:
         return values
 
     def _comparison(self, node: ast.Compare) -> pd.Series | bool:
-        """A comparison, or a chain of them, each with its neighbours."""
-        # Each side is evaluated once. Twice, as both neighbours ask for it, would double the cost with every nesting.
+        """A comparison, or a chain such as `1 < x < 3`."""
+        # Each side is evaluated once: evaluating it for both neighbours would double the cost with every nesting.
         sides = [node.left, *node.comparators]
         values = [self.value(node.left), *(self._argument(side) for side in node.comparators)]
         results = [

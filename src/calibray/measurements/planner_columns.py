@@ -55,7 +55,7 @@ def unusable(frame: pd.DataFrame, key: str, column: str) -> str:
     if missing or column not in numeric_columns(frame):
         return f"{missing or len(frame)} of {len(frame)} rows hold no number; fill them and state the key"
     if values.abs().max() > LARGEST_ANGLE[key]:
-        return f"the value {values.abs().max():g} is no angle in degrees"
+        return f"the value {values.abs().max():g} is not an angle in degrees"
     return ""
 
 

@@ -104,7 +104,7 @@ def join_positions(
         count = place.max() + 1
         for axis in positions.T:
             order = np.lexsort((axis, place))
-            # A position that is not a number is no repeat; it is refused later.
+            # A position that is not a number is never a repeat; it is refused later.
             starts = (np.diff(place[order]) > 0) | ~(np.diff(axis[order]) <= SAME_POSITION)
             place = place.copy()
             place[order] = np.concatenate([[0], np.cumsum(starts)])

@@ -17,7 +17,7 @@ def whole(name: str, value: int, at_least: int, at_most: float = inf) -> int:
     """The whole number `value` of the argument `name`, if it lies within its bounds.
 
     Raises:
-        InputError: It is no whole number, or outside its range.
+        InputError: It is not a whole number, or outside its range.
     """
     try:
         number = index(value)
@@ -33,7 +33,7 @@ def real(name: str, value: float, at_least: float, at_most: float = inf) -> floa
     """The finite number `value` of the argument `name`, if it lies within its bounds.
 
     Raises:
-        InputError: It is no finite number, or outside its range.
+        InputError: It is not a finite number, or outside its range.
     """
     number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
     if number is None or not isfinite(number) or not at_least <= number <= at_most:

@@ -188,7 +188,7 @@ def _neighbours(result: Record) -> pd.DataFrame:
     ends = _ends(links)
     if ends is None or len(residuals) < FEWEST:
         return pd.DataFrame()
-    # Distance in six dimensions: links of two transmitters to the same receiver are no neighbours.
+    # Distance in six dimensions: links of two transmitters to the same receiver are not neighbours.
     distance, semivariance, pairs = variogram(residuals, np.hstack(ends))
     return pd.DataFrame({"distance_m": distance, "semivariance_db2": semivariance, "pairs": pairs})
 

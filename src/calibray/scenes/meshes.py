@@ -46,7 +46,7 @@ class Mesh:
         faces: Vertex indices of each triangle, counter-clockwise seen from outside [F, 3].
         step: Spacing of the numbers with which its file stores the largest coordinate [m]; 0 if that is negligible.
         misread: Whether the tracer gets a copy as PLY: a file stores coordinates as integers, or it is a rectangle,
-            which is no mesh in Mitsuba.
+            which is not a mesh in Mitsuba.
     """
 
     vertices: NDArray[np.float64]

@@ -72,7 +72,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
     """What stands between the ends of links.
 
     Args:
-        triangles: The scene's triangles; those of the ground are no obstacles.
+        triangles: The scene's triangles; those of the ground are not obstacles.
         start: One end of each link [n, 3], [m].
         end: The other end [n, 3], [m].
 

@@ -149,7 +149,7 @@ def _misplaced(overhead: SceneSurfaces, rx: NDArray[np.float64]) -> int:
 
 
 def _better_turn(overhead: SceneSurfaces, rx: NDArray[np.float64], wrong: int) -> tuple[str, int] | None:
-    """Turns of the axes that leave at most a quarter of the misplaced receivers, and their number there."""
+    """Rotations of the axes after which at most a quarter of the receivers are still misplaced, and how many are."""
     if len(rx) < MIN_LINKS or wrong < 0.15 * len(rx):
         return None
     misplaced = {name: _misplaced(overhead, turn(rx)) for name, turn in _TURNS.items()}

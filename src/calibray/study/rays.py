@@ -36,7 +36,7 @@ def read_rays(
             study, which states carrier and links; its start values are those that the engine used.
         frequency: Carrier frequency [Hz]; without a study.
         antennas: Transmit and receive antenna, if the engine used these; else the correction contains the antennas.
-        axes: The table's axes that are x, y and z of the scene, as "x -z y" for a table whose y axis points up.
+        axes: The table's axes along x, y and z of the scene, as "x -z y" for a table whose y axis points up.
 
     Returns:
         The path program. Its links are those of the study; without a study, those of the table by label or position.

@@ -82,7 +82,7 @@ def _student(freedom: NDArray[np.float64], constant: NDArray[np.float64]) -> Tai
 
 @cache
 def gross(share: float = GROSS_SHARE, times: float = GROSS_RATIO) -> Tail:
-    """Gaussian errors, a share of them gross.
+    """Gaussian errors with a share of gross errors.
 
     Args:
         share: Share of gross errors.

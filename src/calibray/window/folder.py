@@ -70,10 +70,10 @@ class StudyFolder:
             raise InputError(f"{file}: cannot be read ({shortened(str(error))})") from None
 
     def check_upload(self, name: str) -> Path:
-        """Where an uploaded file goes; meshes lie in `meshes`, as scenes name them.
+        """The path at which an uploaded file is stored; meshes go to `meshes`, where scenes expect them.
 
         Raises:
-            InputError: The name is no plain file name, its kind is none that Calibray reads, or the file exists.
+            InputError: The name is not a plain file name, Calibray does not read this kind of file, or the file exists.
         """
         shown = shortened(ascii(name))
         if not _NAME.fullmatch(name) or name.endswith((" ", ".")):
@@ -114,7 +114,7 @@ class StudyFolder:
         """Write the study file, with the reasons that it has.
 
         Raises:
-            InputError: The content is no study; the file is as before.
+            InputError: The content is not a study; the file is unchanged.
         """
         from calibray.study import Study
         from calibray.study.toml_file import study_text

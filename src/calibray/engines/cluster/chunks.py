@@ -33,7 +33,7 @@ CHUNK_LINKS: Final = 1000
 """Links of a chunk if there are workers and the study does not state a number."""
 
 MOST_CHUNKS: Final = 64
-"""Chunks of such a study, at most: each chunk compiles a program and returns its own sums."""
+"""Most chunks of such a study: each one compiles a program and returns its own sums."""
 
 _SHARED: WeakValueDictionary[bytes, Shared[Any]] = WeakValueDictionary()
 

@@ -122,7 +122,7 @@ def _read_table(path: Path) -> tuple[pd.DataFrame, Lines]:
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
     try:
-        # A file of compressed data, which some kilobytes of could fill the memory, is no text and is refused.
+        # A compressed file is refused, because some kilobytes of it could fill the memory.
         frame = pd.read_csv(path, skipinitialspace=True, compression=None)
     except OSError as error:
         raise InputError(f"floor plan {path}: cannot be read ({error.strerror}); check the file") from None
@@ -142,11 +142,11 @@ def _read_table(path: Path) -> tuple[pd.DataFrame, Lines]:
     lines = []
     for index, text in enumerate(frame["wkt"]):
         try:
-            with np.errstate(invalid="ignore"):  # what is no number is refused below
+            with np.errstate(invalid="ignore"):  # values that are not numbers are refused below
                 lines.append(_parts(shapely.from_wkt(text)))
         except (shapely.GEOSException, TypeError) as error:
             raise InputError(
-                f"floor plan {path}, row {index + 2}: wkt = {shortened(repr(text))} is no geometry "
+                f"floor plan {path}, row {index + 2}: wkt = {shortened(repr(text))} is not a geometry "
                 f"({first_line(error)}); write LINESTRING (0 0, 4 0, 4 3), for example"
             ) from None
     return frame, lines

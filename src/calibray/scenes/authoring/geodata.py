@@ -56,7 +56,7 @@ _MAGIC: Final = (
 
 _LOG: Final = logging.getLogger(__name__)
 _DXF: Final = re.compile(rb"\s*(?:999\s*\n[^\n]*\n\s*)*0\s*\n\s*SECTION\s*\n[^<{]*", re.DOTALL)
-"""Start of a DXF file; without these characters, it is no file of another driver too."""
+"""Start of a DXF file, without `<` and `{`, with which files of other drivers start."""
 
 _METRES: Final = {
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),

@@ -133,7 +133,7 @@ def write_made_scene(
 ) -> MadeScene:
     """Write a scene and the assumptions made.
 
-    Further materials, and the same one several times, do not matter. `counts` is the number of objects used, repaired
+    Other materials and repeated ones are ignored. `counts` is the number of objects used, repaired
     or left out, by what they are; `guessed` are the buildings whose height is a guess, by the source of the guess;
     `walls` says what became of the lines of a floor plan. With `overwrite`, files are replaced that Calibray did not
     write.

@@ -59,7 +59,7 @@ class LiveScene:
         """Read a scene with its transmitters, receivers and arrays.
 
         Raises:
-            InputError: It is no scene of Sionna RT, or has something that a study cannot state.
+            InputError: It is not a scene of Sionna RT, or has something that a study cannot state.
         """
         live = _checked(scene)
         if not (live.transmitters and live.receivers and live.tx_array and live.rx_array):
@@ -82,7 +82,7 @@ def apply_materials(scene: object, materials: Mapping[str, Material]) -> None:
     """Set the constants of a scene's materials by name.
 
     Raises:
-        InputError: It is no scene of Sionna RT, or lacks a material; nothing is set then.
+        InputError: It is not a scene of Sionna RT, or lacks a material; nothing is set then.
     """
     live = _checked(scene)
     for name in materials:

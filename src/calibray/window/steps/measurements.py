@@ -48,7 +48,7 @@ def show(desk: Desk) -> None:
         options = {
             "--transmitters": sites.value, "--track": track.value, "--frequency": frequency.value, "--tx": tx.value
         }  # fmt: skip
-        # One word each, so that a negative x is no option.
+        # One word each, so that a negative x is not taken for an option.
         words += [f"{option}={value}" for option, value in options.items() if value]
         desk.start(words)
 
@@ -116,7 +116,9 @@ def _control(key: str, value: Any, columns: list[str]) -> Callable[[], Any]:
         try:
             return tomllib.loads(f"value = {shown.value}")["value"]
         except ValueError as error:
-            raise InputError(f"{key} = {shown.value}: is no value ({error}); write texts in quotes") from None
+            raise InputError(
+                f"{key} = {shown.value}: is not a value ({error}); put texts in quotes"
+            ) from None
 
     return read
 
