@@ -114,7 +114,7 @@ LAWS_OF = {name: constant for constant, law in LAWS.items() for name in law}
         ),
         (
             lambda: make_parameter("walls.itu_a", (1, 9), BASE, 4e9, "itu:concret"),
-            r"walls\.itu_a: start = 'itu:concret': 'concret' is no material",
+            r"walls\.itu_a: start = 'itu:concret': 'concret' is not a material",
         ),
         (
             lambda: Parameters(

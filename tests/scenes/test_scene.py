@@ -225,7 +225,7 @@ def test_constants_out_of_bounds_are_refused(tmp_path: Path, field: str, value: 
         ({"stone": {"thickness": -1.0}}, r"material 'stone': thickness = -1\.0: must be"),
         (
             {"stone": {"itu": "concret"}},
-            r"material 'stone': 'concret' is no material .*did you mean 'concrete'\?",
+            r"material 'stone': 'concret' is not a material .*did you mean 'concrete'\?",
         ),
         (
             {"stone": {"itu": "glass", "revision": "P.2040-9"}},

@@ -247,7 +247,7 @@ TRACE = "max_depth = 4"
         ("[1.5, 12.0]", "[0.5, 12.0]", "walls.relative_permittivity: bounds = [0.5, 12.0]: 0.5 must be"),
         ("[1.5, 12.0]", "[1.5, 4.0]", "start = 5.31 lies outside bounds = [1.5, 4]"),
         ("walls.relative_permittivity", "walls.permittivity", "no field 'permittivity'; did you mean"),
-        ("itu:concrete@", "itu:concrte@", "start = 'itu:concrte@P.2040-1': 'concrte' is no material"),
+        ("itu:concrete@", "itu:concrte@", "start = 'itu:concrte@P.2040-1': 'concrte' is not a material"),
         ("itu:concrete@", "concrete@", "must be a number or 'itu:NAME'"),
         # Files
         ('"scene.xml"', '"nowhere.xml"', "scene.file = 'nowhere.xml': no such file, nowhere.xml"),
