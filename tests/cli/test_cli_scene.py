@@ -179,7 +179,7 @@ def test_footprints_become_a_scene(tmp_path):
         (["osm", "town.osm", "-o", "out", "--utm"], "--utm needs --origin"),
         (["osm", "town.osm", "-o", "out", "--origin", "48"], "must be longitude and latitude"),
         (["osm", "town.osm", "-o", "out", "--wall", "brik"], "did you mean 'brick'"),
-        (["osm", "town.osm", "-o", "out", "--wall", "brick:thick"], "'thick' is no thickness"),
+        (["osm", "town.osm", "-o", "out", "--wall", "brick:thick"], "'thick' is not a thickness"),
         (["osm", "town.osm", "-o", "out", "--window-share", "30"], "window share = 30"),
         (["osm", "town.osm", "-o", "out", "--terrain", "dem.tif"], "dem.tif: does not exist"),
         (["osm", "town.osm", "-o", "town.osm/out"], "is a file; name another folder"),
