@@ -319,7 +319,11 @@ def read(file: Path, plain: list[list[float]] | None) -> list[float]:
 def plain(raw: bytes) -> list[list[float]] | None:
     """The numbers of a CSV file by the plainest means; None where something is no number."""
     try:
-        rows = list(csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), skipinitialspace=True))
+        try:
+            text = raw.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = raw.decode("cp1252")
+        rows = list(csv.reader(io.StringIO(text, newline=""), skipinitialspace=True))
     except (UnicodeDecodeError, csv.Error):
         return None
     rows = [row for row in rows if len(row) > 1 or "".join(row).strip()]

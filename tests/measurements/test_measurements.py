@@ -324,10 +324,10 @@ def test_missing_files_and_other_formats_are_refused(tmp_path):
         read_measurements(tmp_path / "nowhere.csv", [0, 0, 1], [1, 1, 1], "loss")
     with pytest.raises(InputError, match=r"cannot read a \.ods table"):
         read_measurements(table_file(tmp_path, TABLE, "links.ods"), [0, 0, 1], [1, 1, 1], "loss")
-    latin = tmp_path / "latin.csv"
-    latin.write_bytes("stra\u00dfe,loss\n".encode("latin-1"))
+    binary = tmp_path / "links.csv"
+    binary.write_bytes(b"x,loss\n\xff\x01,80\n")
     with pytest.raises(InputError, match="not UTF-8 text"):
-        read_measurements(latin, [0, 0, 1], [1, 1, 1], "loss")
+        read_measurements(binary, [0, 0, 1], [1, 1, 1], "loss")
 
 
 def test_rows_that_repeat_a_link_are_merged_in_linear_power(tmp_path):

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, final
@@ -16,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
+from calibray.measurements.delimited_text import SUFFIXES, parse_text, read_text
 from calibray.measurements.excel import sheet_text
 from calibray.measurements.source_table import SourceTable
 from calibray.support.lazy_imports import library
@@ -57,10 +54,10 @@ _decoded: Final[set[tuple[str | int, ...]]] = set()
 
 
 def read_table(path: str | Path) -> SourceTable:
-    """Read a .csv (UTF-8), .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
+    """Read a .csv, .txt, .tsv, .dat, .parquet or .xlsx file without blank lines; of a workbook, the first sheet.
 
-    The header of a .csv file tells whether commas, semicolons or tabs separate its columns. Where semicolons or tabs
-    do, numbers may have decimal commas.
+    Commas, semicolons, tabs or spaces separate the columns of a text. Unless commas do, numbers may have decimal
+    commas. `parse_text` says what is skipped.
 
     Raises:
         InputError: The file does not exist, has another ending, is empty or malformed, or the library that reads it
@@ -70,17 +67,18 @@ def read_table(path: str | Path) -> SourceTable:
     if not exists(path):
         raise InputError(f"{shortened(str(path), 300)}: no such file")
     match path.suffix.lower():
-        case ".csv":
-            table = _parse_csv(path, _utf8_text(path))
+        case suffix if suffix in SUFFIXES:
+            table = parse_text(path, read_text(path))
         case ".parquet":
             table = _read_parquet(path)
         case ".xlsx":
             numbers, text = sheet_text(path)
-            frame = _parse_csv(path, text, ",").frame
-            table = SourceTable(frame, np.array(numbers[1:], dtype=np.int64), str(path))
+            table = parse_text(path, text, ",")
+            # Lines of the text count line breaks within cells, and rows of the sheet blank rows.
+            table = replace(table, row=np.array(numbers[len(numbers) - len(table) :], dtype=np.int64))
         case suffix:
             raise InputError(
-                f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .parquet or .xlsx"
+                f"{path}: cannot read a {suffix or 'nameless'} table; use .csv, .txt, .parquet or .xlsx"
             )
     if len(table) == 0:
         raise InputError(f"{path}: holds no rows; a table needs a header and at least one row")
@@ -149,90 +147,6 @@ class PiecedTable:
                 frame = frame.astype(dict.fromkeys(numpy_columns, np.float64))
                 yield SourceTable(frame, np.arange(start + 1, start + len(frame) + 1), self.source)
                 start += len(frame)
-
-
-def _utf8_text(path: Path) -> str:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return file.read()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
-        ) from None
-
-
-def _parse_csv(path: Path, text: str, separator: str | None = None) -> SourceTable:
-    separator = _separator(text) if separator is None else separator
-    header, lines = _checked_layout(path, text, separator)
-    if not header:
-        return SourceTable(pd.DataFrame())
-    decimal = "." if separator == "," else _decimal_mark(path, text, separator)
-    try:
-        frame = pd.read_csv(
-            io.StringIO(text), sep=separator, decimal=decimal, skipinitialspace=True, low_memory=False
-        )
-    except ValueError as error:
-        # pandas reports Ctrl-C while it reads as "source failed"; reading from memory fails so for no other reason.
-        if "source failed" in str(error):
-            raise KeyboardInterrupt from None
-        raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
-    if len(frame) != len(lines):
-        raise InputError(
-            f"{path}: the file has {len(lines)} rows, but {len(frame)} can be read; check its quotes"
-        )
-    return SourceTable(frame, np.array(lines, dtype=np.int64), str(path))
-
-
-def _separator(text: str) -> str:
-    """The mark between the columns of a CSV text: the comma, unless the header has another one and no comma."""
-    header = next((line for line in io.StringIO(text) if line.strip()), "")
-    return next((mark for mark in ";\t" if mark in header and "," not in header), ",")
-
-
-def _decimal_mark(path: Path, text: str, separator: str) -> str:
-    """The decimal mark of the numbers of a CSV text, refused if it is not the same in all."""
-    lines: dict[str, int] = {}
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
-    for cells in reader:
-        for cell in cells:
-            if "," in cell or "." in cell:
-                number = re.fullmatch(r"[+-]?\d*([.,])\d+(e[+-]?\d+)?", cell.strip(), re.IGNORECASE)
-                if number is not None:
-                    lines.setdefault(number[1], reader.line_num)
-    if len(lines) > 1:
-        raise InputError(
-            f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; write "
-            "all with the same mark"
-        )
-    return "," if "," in lines else "."
-
-
-def _checked_layout(path: Path, text: str, separator: str) -> tuple[list[str], list[int]]:
-    """Header and first line of each row of a CSV text, refused where pandas would repair a fault without notice."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
-    header: list[str] = []
-    lines: list[int] = []
-    next_line = 1
-    try:
-        for cells in reader:
-            line, next_line = next_line, reader.line_num + 1
-            if len(cells) <= 1 and not "".join(cells).strip():
-                continue
-            if not header:
-                header = cells
-                if repeated := [name for name, count in Counter(header).items() if count > 1]:
-                    raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")
-            elif len(cells) != len(header):
-                raise InputError(
-                    f"{path}, row {line}: {len(cells)} cells, the header has {len(header)}; correct the row"
-                )
-            else:
-                lines.append(line)
-    except csv.Error as error:
-        raise InputError(f"{path}, row {next_line}: malformed CSV ({error})") from None
-    return header, lines
 
 
 def _read_parquet(path: Path) -> SourceTable:

@@ -1,0 +1,277 @@
+"""Tables as text, as loggers and spreadsheets write them: encoding, separator, header, units, placeholders."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from calibray.errors import InputError
+from calibray.measurements.source_table import SourceTable
+from calibray.support.messages import shortened
+
+SUFFIXES: Final = (".csv", ".txt", ".tsv", ".dat")
+"""Endings of tables as text."""
+
+PLACEHOLDERS: Final = frozenset({"-", "--", "---", "\u2013", "\u2014", "?", "*"})
+"""Texts that stand for a missing number in a column of numbers."""
+
+UNITS: Final = frozenset({
+    "m", "cm", "mm", "km", "ft", "feet", "foot", "in", "inch", "inches", "db", "dbm", "dbi", "hz", "khz",
+    "mhz", "ghz", "deg", "degree", "degrees", "\u00b0", "rad", "s", "ms", "us", "ns", "min", "h", "%", "v",
+    "w", "mw", "m/s", "km/h", "mph", "bit", "kbps", "mbps", "bool", "string", "text", "int", "float",
+})  # fmt: skip
+"""Units, in lower case, of which a row below the header consists."""
+
+_HEAD: Final = 64  # records that show the layout of a file
+_MOST_ABOVE: Final = 30  # lines above a header at most
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where a table stands in a text.
+
+    Attributes:
+        separator: The mark between columns; a space for any white space.
+        skipped: Lines above the header.
+        units: The unit of every column, from a row below the header; empty if there is none.
+        unit_lines: First line of the row of units, and the line after its end, from the header's first line.
+    """
+
+    separator: str
+    skipped: int = 0
+    units: tuple[str, ...] = ()
+    unit_lines: tuple[int, int] = (0, 0)
+
+
+def read_text(path: Path) -> str:
+    """Text of a file in UTF-8, in UTF-16 with a byte order mark, or else in Windows-1252.
+
+    Raises:
+        InputError: The file cannot be read, or has bytes that are no text.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    try:
+        return raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        try:
+            text = raw.decode("cp1252")
+        except UnicodeDecodeError:
+            text = "\0"
+        if re.search(r"[\x00-\x08\x0e-\x1f\x7f]", text):
+            raise InputError(
+                f"{path}: not UTF-8 text ({error.reason} at byte {error.start}); save it as UTF-8"
+            ) from None
+        return text
+
+
+def parse_text(path: Path, text: str, separator: str | None = None) -> SourceTable:
+    r"""Rows of a table in a text, without blank lines.
+
+    Lines above the header with another number of cells are skipped; units in a row below it become part of the names.
+    Columns of numbers may have placeholders (`PLACEHOLDERS`) and one unit of decibels in every cell.
+
+    Args:
+        path: Name of the table for messages.
+        text: The text.
+        separator: The mark between columns; found in the text if None.
+
+    Raises:
+        InputError: The text is malformed, or its header or decimal mark is not unique.
+        KeyboardInterrupt: Ctrl-C arrived while pandas was reading.
+
+    Example:
+        >>> text = "Logger 2.1\nx;y;Pegel\nm;m;dBm\n1,5;2;-70,5\n2,5;2;-\n"
+        >>> parse_text(Path("log.csv"), text).frame
+           x [m]  y [m]  Pegel [dBm]
+        0    1.5      2        -70.5
+        1    2.5      2          NaN
+    """
+    layout = _layout(text, separator)
+    lines = list(io.StringIO(text, newline=""))[layout.skipped :]
+    if layout.separator == " ":
+        lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
+    first, end = layout.unit_lines
+    # Blank lines in place of the units keep the numbers of the lines.
+    lines[first:end] = ["\n"] * (end - first)
+    text = "".join(lines)
+    header, rows, has_empty_end = _checked_layout(path, text, layout)
+    if not header:
+        return SourceTable(pd.DataFrame())
+    decimal = "." if layout.separator == "," else _decimal_mark(path, text, layout)
+    try:
+        frame = pd.read_csv(
+            io.StringIO(text),
+            sep=layout.separator,
+            decimal=decimal,
+            skipinitialspace=True,
+            low_memory=False,
+            index_col=False if has_empty_end else None,
+        )
+    except ValueError as error:
+        # pandas reports Ctrl-C while it reads as "source failed"; reading from memory fails so for no other reason.
+        if "source failed" in str(error):
+            raise KeyboardInterrupt from None
+        raise InputError(f"{path}: malformed CSV ({shortened(str(error), 300)}); check its quotes") from None
+    if len(frame) != len(rows):
+        raise InputError(
+            f"{path}: the file has {len(rows)} rows, but {len(frame)} can be read; check its quotes"
+        )
+    units = layout.units or [""] * len(frame.columns)
+    frame = frame.set_axis(list(map(_with_unit, frame, units)), axis=1)
+    for name in frame:
+        frame[name] = _plain_numbers(frame[name], decimal)
+    table = SourceTable(frame, np.array(rows, dtype=np.int64), str(path))
+    return table.note("lines above the header, skipped", layout.skipped) if layout.skipped else table
+
+
+def _layout(text: str, separator: str | None) -> _Layout:
+    """The first line from which on all lines have equally many cells, and the mark that gives the most cells."""
+    for above in range(_MOST_ABOVE + 1):
+        found: list[tuple[int, _Layout]] = []
+        head = list(islice(io.StringIO(text, newline=""), above, above + 4 * _HEAD))
+        if above and (len(head) < 2 or not head[0].strip()):
+            continue
+        for mark in ",;\t " if separator is None else separator:
+            records = _records(head, mark)
+            widths = {len(cells) for cells, _, _ in records[1:]}
+            width = len(records[0][0]) if records else 0
+            if width < 2 or not widths <= {width, width + 1} or len(widths) > 1:
+                continue
+            # A row of values is no header. What stands above a header is no row of its table.
+            if above and (len(records) < 2 or any(map(_is_number, records[0][0]))):
+                continue
+            found.append((width, _Layout(mark, above, *_unit_row(records))))
+        marks = {layout.separator for _, layout in found}
+        if found and marks != {" "}:
+            return max((each for each in found if each[1].separator != " "), key=lambda each: each[0])[1]
+        if found and not any(mark in head[0] for mark in ",;\t"):
+            return found[0][1]
+    header = next((line for line in io.StringIO(text) if line.strip()), "")
+    return _Layout(separator or next((mark for mark in ";\t" if mark in header and "," not in header), ","))
+
+
+def _records(lines: Sequence[str], mark: str) -> list[tuple[list[str], int, int]]:
+    """Cells of the first records of a text that are not blank, with the first line and the line after the end."""
+    if mark == " ":
+        lines = [re.sub(r"[ \t]+", " ", line.strip(" \t")) for line in lines]
+    reader, records, start = csv.reader(lines, delimiter=mark, skipinitialspace=True), [], 0
+    try:
+        for cells in islice(reader, _HEAD):
+            if len(cells) > 1 or "".join(cells).strip():
+                records.append((cells, start, reader.line_num))
+            start = reader.line_num
+    except csv.Error:
+        return []
+    return records
+
+
+def _unit_row(records: Sequence[tuple[list[str], int, int]]) -> tuple[tuple[str, ...], tuple[int, int]]:
+    """Units of the columns and their lines, if the row below the header has units where the next row has numbers."""
+    if len(records) < 3:
+        return (), (0, 0)
+    (header, *_), (cells, start, end), (below, *_) = records[:3]
+    units = [cell.strip().strip("[]()") for cell in cells]
+    over_numbers = [unit.lower() for unit, number in zip(units, below, strict=False) if _is_number(number)]
+    allowed = UNITS | PLACEHOLDERS | {""}
+    if not (UNITS & set(over_numbers) and set(over_numbers) <= allowed) or any(map(_is_number, cells)):
+        return (), (0, 0)
+    return tuple(unit if unit.lower() in UNITS else "" for unit in units[: len(header)]), (start, end)
+
+
+def _is_number(cell: str) -> bool:
+    return bool(re.fullmatch(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?", cell.strip(), re.IGNORECASE))
+
+
+def _with_unit(name: object, unit: str) -> str:
+    """Name of a column with its unit, unless the name has it."""
+    plain = str(name).strip()
+    return plain if not unit or unit.lower() in re.split(r"[^a-z\u00b0%/]+", plain.lower()) else f"{plain} [{unit}]"
+
+
+def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:
+    """A column of texts as numbers if each is a number, a placeholder, or a number with the unit of all others.
+
+    Other texts lose white space at their ends.
+    """
+    if not pd.api.types.is_string_dtype(column):
+        return column
+    texts = column.str.strip()
+    empty = column.isna() | texts.isin(PLACEHOLDERS)
+    units = texts.str.extract(r"(?i)^[^a-z]*?\d\s*(dbm?)$", expand=False).str.lower()[~empty]
+    if len(units) and units.notna().all() and units.nunique() == 1:
+        texts = texts.str.replace(r"(?i)\s*dbm?$", "", regex=True)
+    elif empty.sum() == column.isna().sum():
+        return texts
+    numbers = pd.to_numeric(texts.str.replace(decimal, ".") if decimal != "." else texts, errors="coerce")
+    is_text = numbers.isna() & ~empty
+    return texts if is_text.any() or empty.all() else numbers
+
+
+def _decimal_mark(path: Path, text: str, layout: _Layout) -> str:
+    """The decimal mark of the numbers of a CSV text.
+
+    Raises:
+        InputError: It is not the same in all.
+    """
+    lines: dict[str, int] = {}
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.separator, skipinitialspace=True)
+    for cells in reader:
+        for cell in cells:
+            if "," in cell or "." in cell:
+                number = re.fullmatch(r"[+-]?\d*([.,])\d+(e[+-]?\d+)?(\s*dbm?)?", cell.strip(), re.IGNORECASE)
+                if number is not None:
+                    lines.setdefault(number[1], layout.skipped + reader.line_num)
+    if len(lines) > 1:
+        raise InputError(
+            f"{path}: numbers have a decimal comma in row {lines[',']} and a decimal point in row {lines['.']}; write "
+            "all with the same mark"
+        )
+    return "," if "," in lines else "."
+
+
+def _checked_layout(path: Path, text: str, layout: _Layout) -> tuple[list[str], list[int], bool]:
+    """Header and first line of each row of a CSV text, refused where pandas would repair a fault without notice.
+
+    The last result says whether every row ends with an empty cell beyond the header.
+
+    Raises:
+        InputError: A column appears twice, or a row has more or fewer cells than the header.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.separator, skipinitialspace=True)
+    header: list[str] = []
+    lines: list[int] = []
+    ends: set[int] = set()
+    next_line = layout.skipped + 1
+    try:
+        for cells in reader:
+            line, next_line = next_line, layout.skipped + reader.line_num + 1
+            if len(cells) <= 1 and not "".join(cells).strip():
+                continue
+            if not header:
+                header = cells
+                names = Counter(name.strip() for name in header if name.strip())
+                if repeated := [name for name, count in names.items() if count > 1]:
+                    raise InputError(f"{path}, row {line}: column {repeated[0]!r} appears twice; rename one")
+                continue
+            ends.add(len(cells) - len(header))
+            if len(ends) > 1 or ends - {0, 1} or (1 in ends and cells[-1].strip()):
+                raise InputError(
+                    f"{path}, row {line}: {len(cells)} cells, the header has {len(header)}; correct the row"
+                )
+            lines.append(line)
+    except csv.Error as error:
+        raise InputError(f"{path}, row {next_line}: malformed CSV ({error})") from None
+    return header, lines, 1 in ends
