@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,21 @@ def test_a_plan_becomes_a_scene(tmp_path):
         "drywall",
         "floor",
     }
+
+
+def test_the_remedy_for_types_without_a_material_works_as_printed(tmp_path):
+    plan = tmp_path / "plan.csv"
+    text = "x0;y0;x1;y1;type\n0;0;5,5;0;T\u00fcr\n5,5;0;5,5;4;Mauer 2\n5,5;4;0;0;concrete\n"
+    plan.write_text(text, encoding="utf-8")
+    status, _, err = scene_command("plan", plan, "-o", tmp_path / "flat")
+    assert status == 2
+    words = shlex.split(re.search(r"as in (.*); or correct it", err)[1])
+    status, out, _ = scene_command(
+        "plan", plan, "-o", tmp_path / "flat", *words, "--material", "concrete=brick"
+    )
+    assert (status, "lines      3" in out) == (0, True)
+    materials = read_scene(tmp_path / "flat" / "scene.xml", 3.5e9).materials
+    assert {"tur", "mauer_2", "concrete_wall"} < set(materials)
 
 
 @pytest.mark.parametrize("target", ["scene.xml", "scene.json", "meshes/all-floor.ply", "meshes"])

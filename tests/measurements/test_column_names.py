@@ -187,6 +187,36 @@ HEADERS = {
         "120,-85.0,115.0,30.0,5.0,8.0",
         "Path Loss (dB)", "path_loss", ("RX_X (m)", "RX_Y (m)"),
     ),
+    "Measuring receiver, German": (
+        "Messpunkt;Rechtswert;Hochwert;Höhe;Empfangspegel [dBm];Rauschen [dBm];Frequenz [MHz]".replace(";", ","),
+        "1,200.0,145.4,1.5,-30.6,-95.0,2450.0",
+        "Empfangspegel [dBm]", "rsrp", ("Rechtswert", "Hochwert"),
+    ),
+    "Drive test, German": (
+        "Uhrzeit,Längengrad,Breitengrad,Funkzelle,Signalpegel dBm,Qualität dB",
+        "10:01,9.9,50.0,A,-88.0,-9.0",
+        "Signalpegel dBm", "rsrp", ("Längengrad", "Breitengrad"),
+    ),
+    "Drive test, Spanish": (
+        "Fecha,Hora,Longitud,Latitud,Celda,Nivel de señal (dBm),Calidad (dB)",
+        "04/05/2023,10:01,-3.7,40.4,MAD-01,-61.2,-14.3",
+        "Nivel de señal (dBm)", "rsrp", ("Longitud", "Latitud"),
+    ),
+    "Survey, French": (
+        "Heure,Longitude,Latitude,Cellule,Puissance reçue (dBm),Bruit (dBm)",
+        "10:01,2.3,48.8,B,-77.1,-99.0",
+        "Puissance reçue (dBm)", "rsrp", GEOGRAPHIC,
+    ),
+    "Sounder, German": (
+        "Ort,x [m],y [m],Pfaddämpfung [dB],Antennenhöhe [m]",
+        "a,12.0,4.0,101.5,2.0",
+        "Pfaddämpfung [dB]", "path_loss", ("x [m]", "y [m]"),
+    ),
+    "TTN Mapper": (
+        "time,dev_eui,gateway_eui,gateway_latitude,gateway_longitude,latitude,longitude,altitude,hdop,rssi,snr,sf,frequency",
+        "10:01,70B3,eui-b8,51.2,4.4,51.21,4.41,8,1.5,-99,6.0,7,868100000",
+        "rssi", "rsrp", ("longitude", "latitude"),
+    ),
     "CW scanner": (
         "Easting,Northing,Freq_MHz,Prx(dBm)",
         "456000,5540000,3500,-88.1",
@@ -277,6 +307,25 @@ def test_columns_of_unknown_transmitters_are_named():
     frame = pd.DataFrame(columns=["X", "AP1 RSS(dBm)", "AP2 RSS(dBm)", "AP13 RSS(dBm)", "AP13 RTT(mm)"])
     columns = column_names.find_wide_columns(frame, ["AP1", "AP2"])
     assert column_names.find_unknown_wide_columns(frame, columns) == ["AP13 RSS(dBm)"]
+
+
+@pytest.mark.parametrize(
+    ("names", "unit"),
+    [
+        (["X [cm]", "Y [cm]", "Höhe [cm]"], 0.01),
+        (["x_mm", "y_mm"], 0.001),
+        (["Tx X (ft)", "Tx Y (ft)"], 0.3048),
+        (["x", "y_m"], 1.0),
+        (["longitude", "latitude"], 1.0),
+    ],
+)
+def test_units_of_length_are_read_from_names(names, unit):
+    assert column_names.find_length_unit(names) == unit
+
+
+def test_several_units_of_length_are_asked_about():
+    with pytest.raises(InputError, match=r"different units \(X \[cm\], height_m\); give all in metres"):
+        column_names.find_length_unit(["X [cm]", "height_m", "n"])
 
 
 def test_values_are_judged_without_the_codes_of_missing_ones():

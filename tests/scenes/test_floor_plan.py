@@ -219,7 +219,7 @@ def test_types_become_materials(tmp_path):
     assert {name: material.thickness for name, material in materials.items()} == {
         "brick_wall_120mm": 0.12, "brick_wall_100mm": 0.1, "drywall": 0.09, "floor": 0.2,
     }  # fmt: skip
-    with pytest.raises(InputError, match="floor plan: type 'brik' has no material; did you mean 'brick'"):
+    with pytest.raises(InputError, match=r"no material for 'brik'; .*--material brik=concrete; .*'brick'"):
         make_plan_scene([line(0, 0, 1, 0, "brik")], tmp_path)
 
 
@@ -236,9 +236,25 @@ def test_a_plan_is_read_in_its_unit(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("\ufeffX1;Y1;X2;Y2;Material;width_cm\n0;0;4,5;0;Brick;11,5\n", 1.0),
+        ("Survey of 4 May\nx0 [cm];y0 [cm];x1 [cm];y1 [cm];Typ;Dicke [mm]\n0;0;450;0;brick;115\n", 1.0),
+        ("x0,y0,x1,y1,type,thickness_m\n0,0,4500,0,brick,0.115\n", 0.001),
+        ("start_x\tstart_y\tend_x\tend_y\ttype\tthickness\nm\tm\tm\tm\t-\tcm\n0\t0\t4.5\t0\tbrick\t11.5\n", 1.0),
+    ],
+)  # fmt: skip
+def test_a_table_of_walls_is_read_as_surveyors_write_it(tmp_path, text, unit):
+    (tmp_path / "plan.csv").write_text(text, encoding="utf-8")
+    assert read_plan(tmp_path / "plan.csv", unit=unit) == [
+        Segment((0, 0), (4.5, 0), "brick", 0.0, 3.0, pytest.approx(0.115))
+    ]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not a table"),
+        ("", "no column 'x0'"),
         ("x0,y0,x1,y1\n0,0,1,1\n", "no column 'type'"),
         ("x0,y0,x1,y1,type\n", "holds no segment"),
         ("x0,y0,x1,y1,type\n0,0,a,1,brick\n", "row 2: x1 = 'a' is not a number"),
@@ -304,7 +320,7 @@ def test_walls_of_impossible_size_are_refused(tmp_path, row):
 )
 def test_a_compressed_plan_is_refused_without_decompressing_it(tmp_path, ending, content):
     (tmp_path / f"plan.{ending}").write_bytes(content)
-    with pytest.raises(InputError, match=r"is not a table|no column"):
+    with pytest.raises(InputError, match=r"not UTF-8 text|no column"):
         read_plan(tmp_path / f"plan.{ending}")
 
 

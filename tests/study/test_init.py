@@ -246,6 +246,42 @@ def test_transmitters_are_found_by_their_names_whatever_the_column_is_called(sce
         draft(scene, other, tmp_path / "study.toml", tmp_path / "gateways.csv", 3.5e9)
 
 
+def test_names_of_transmitters_are_compared_as_tools_write_them(scene, tmp_path):
+    """Addresses in lower case, whole numbers as floats since a row has none; `run` finds them as `init` does."""
+    (tmp_path / "beacons.csv").write_text(
+        "name,mac,number,x,y,z\nb1,C4-64-E3,7,-30,0,15\nb2,C4-64-E4,9,60,0,15\n"
+    )
+    for column, labels in (("address", ["c4:64:e3", "c4:64:e4"]), ("Cell ID", [7.0, 9.0])):
+        rows = {"x": np.arange(10.0), "y": 20.0, column: labels * 5, "rssi": np.arange(-80, -70)}
+        file = table(tmp_path, **rows)
+        if column == "Cell ID":
+            file.write_text(file.read_text() + "3.0,25.0,,-70\n")
+        drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "beacons.csv", 3.5e9)
+        assert drafted.study.links.transmitter == column
+        assert drafted.study.measurements().tx[:, 0].tolist() == [-30, 60] * 5
+    # Names that differ in case alone stay apart.
+    (tmp_path / "beacons.csv").write_text("name,x,y,z\na,-30,0,15\nA,60,0,15\n")
+    file = table(tmp_path, x=np.arange(10.0), y=20.0, name=["a", "A"] * 5, rssi=np.arange(-80, -70))
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "beacons.csv", 3.5e9)
+    assert drafted.study.measurements().tx[:, 0].tolist() == [-30, 60] * 5
+
+
+def test_positions_in_centimetres_are_read_as_such(scene, tmp_path):
+    rows = {
+        "X [cm]": 100 * np.arange(10.0),
+        "Y [cm]": 2000.0,
+        "H\u00f6he [cm]": 150,
+        "Pegel [dBm]": np.arange(-80, -70),
+    }
+    drafted = draft(
+        scene, table(tmp_path, **rows), tmp_path / "study.toml", frequency=3.5e9, tx=(-30.0, 0.0, 15.0)
+    )
+    assert assumed(drafted)["links.position_unit"] == "0.01 m"
+    links = drafted.study.measurements()
+    np.testing.assert_allclose(links.rx[3], [3.0, 20.0, 1.5])
+    assert links.tx[0].tolist() == [-30, 0, 15]
+
+
 def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):
     columns = {
         "x": np.arange(10.0),

@@ -290,18 +290,22 @@ def _check_origin(origin: str | None, buildings: Footprints) -> None:
 
 def _types(entries: list[str]) -> dict[str, SurfaceMaterial]:
     """Materials by type of wall, from entries such as `drywall=plasterboard:0.1`."""
-    from calibray.scenes.authoring import WALL_THICKNESS
+    from calibray.scenes.authoring import WALL_THICKNESS, material_name
 
-    types = {}
+    types: dict[str, SurfaceMaterial] = {}
     for entry in entries:
         kind, equals, material = entry.partition("=")
+        kind = kind.strip().lower()
         if not equals:
             raise InputError(f"--material {entry}: must be TYPE=ITU, such as drywall=plasterboard:0.1")
         if kind in types:
             raise InputError(
                 f"--material {entry}: the type {kind!r} has a material already; give one for each type"
             )
-        types[kind] = _material(kind, material, WALL_THICKNESS)
+        name, taken = material_name(kind), {other.name for other in types.values()}
+        while name in taken:
+            name += "_2"
+        types[kind] = _material(name, material, WALL_THICKNESS)
     return types
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -13,31 +14,36 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.measurements.links import FREQUENCIES
 from calibray.measurements.preparation import Quantity
-from calibray.measurements.selection import naming_column, without_codes
+from calibray.measurements.selection import comparison, naming_column, without_codes
 from calibray.measurements.source_table import SourceTable
 
 PATTERNS: Final = {
     # What a column may hold, and the regular expression that a whole word of its name matches.
-    "transmitter": r"tx|transmitter|bs|bts|site|cell|ap|bssid|[ge]nb|[ge]?nodeb|base|anchor|beacon|gateway|gw",
-    "receiver": r"rx|receiver|ue|phone|mobile|device",
-    "receiving device": r"rx|receiver|ue|phone|device|handset|eui|imei",
-    "name of a transmitter": r"id|name",
-    "x": r"x|east|easting",
-    "y": r"y|north|northing",
-    "longitude": r"lon|lng|long|longitude",
-    "latitude": r"lat|latitude",
-    "height": r"z|h|height|hgt|agl|hba",
-    "another height": r"ground|terrain|amsl|asl|building|tower|clutter|mast",
-    "altitude or floor": r"alt|altitude|level",
-    "path loss": r"pl|loss|pathloss",
+    "transmitter": r"tx|transmitter|bs|bts|site|cell|cell_?(id|name)|[en]?ci|eci|ap|bssid|[ge]nb|[ge]?nodeb|base|"
+    r"basestation|anchor|beacon|gateway|gw|sender|basisstation|(funk)?zelle|celda|cellule|cella|celula|emisor|emetteur|"
+    r"estacion|station",
+    "receiver": r"rx|receiver|ue|phone|mobile|device|empf(a|ae)nger|receptor|recepteur|ricevitore|movil|mobil",
+    "receiving device": r"rx|receiver|ue|phone|device|handset|eui|imei|(phone|user|device|dev)_?id|empf(a|ae)nger|"
+    r"movil",
+    "name of a transmitter": r"id|name|mac|address|bssid",
+    "x": r"x|east|easting|pos_?x|x_?pos|ost(wert)?|rechtswert|este",
+    "y": r"y|north|northing|pos_?y|y_?pos|nord(wert)?|hochwert|norte",
+    "longitude": r"lon|lng|long|longitude|longitud|longitudine|l(a|ae)nge|l(a|ae)ngengrad",
+    "latitude": r"lat|latitude|latitud|latitudine|breite|breitengrad",
+    "height": r"z|h|height|heights|ht|hgt|agl|hba|ant(enna)?height|(antennen)?h(o|oe)he|altura|hauteur|altezza",
+    "another height": r"ground|terrain|amsl|asl|msl|nn|nhn|msnm|building|tower|clutter|mast",
+    "altitude or floor": r"alt|altitude|level|altitud|elevation|elev",
+    "path loss": r"pl|loss|pathloss|(pfad|strecken|funkfeld)?d(a|ae)mpfung|pfadverlust|perdidas?|pertes?|perdita",
     "path gain": r"gain|pathgain",
     "reference signal": r"(n|ss|csi|ssb)?rsrp",
-    "received power": r"(n|ss|csi|ssb)?rsrp|rscp|n?rssi|rss|dbm|prx|power|level|rxlev(el)?|signal|strength",
+    "received power": r"(n|ss|csi|ssb)?rsrp|rscp|n?rssi|rss|dbm|prx|power|level|rxlev(el)?|rxpower|signal|strength|"
+    r"(empfangs|signal)?pegel|(empfangs)?leistung|nivel|senal|potencia|sinal|puissance|niveau|livello|potenza|segnale",
     "another quantity": r"std|sigma|n?sinr|snr|cinr|n?rsrq|cqi|count|n|nr?x|ncell|number|noise|floor|eirp|tx|id|error|"
-    r"rtt|rtd|toa|tof|aoa|distance|ecio|ecno|ec|ta|neighbou?r|neigh|nbr|adj|quality|accuracy|asu|bitrate|speed|channel",
+    r"rtt|rtd|toa|tof|aoa|distance|ecio|ecno|ec|ta|neighbou?r|neigh|nbr|adj|quality|accuracy|asu|bitrate|speed|channel|"
+    r"rauschen|ruido|bruit|rumore|qualit(a|ae)t|calidad|qualite|qualita|nachbar(zelle)?|vecin[ao]|voisine?",
     "EIRP": r"eirp",
-    "transmitted": r"tx|transmit|transmitted",
-    "power": r"power|dbm",
+    "transmitted": r"tx|transmit|transmitted|sende(r|leistung)|transmitida|emise",
+    "power": r"power|pwr|dbm|(sende)?leistung|potencia|puissance|potenza",
     "decibel": r"db|dbm",
     "antenna": r"antennas?|ant|aerial",
     "azimuth": r"azimuths?|azimut|azi|bearing|boresight",
@@ -46,11 +52,23 @@ PATTERNS: Final = {
     "electrical": r"e|elec.*|e(down)?tilt|edt|ret|remote",
     "additional": r"add.*|extra",
     "sum of both tilts": r"total|tot|sum|combined|effective",
-    "frequency": r"freq|frequency|carrier|fc",
-    "time": r"time|timestamp|date|datetime|utc|epoch",
-    "distance": r"dist.*",
+    "frequency": r"freq|frequency|carrier|fc|frequenz|frecuencia|frequence|frequenza",
+    "time": r"time|timestamp|date|datetime|utc|epoch|zeit(stempel)?|uhrzeit|datum|fecha|hora|heure",
+    "distance": r"dist.*|separation|abstand|entfernung",
 }
-"""Spellings of column names. To recognize one more, add it to its row; case and punctuation do not matter."""
+"""Spellings of column names, without accents. To recognize one more, add it to its row; case and punctuation do not
+matter."""
+
+LENGTH_UNITS: Final = {
+    "cm": 0.01,
+    "mm": 0.001,
+    "km": 1e3,
+    "ft": 0.3048,
+    "feet": 0.3048,
+    "foot": 0.3048,
+    "inch": 0.0254,
+}
+"""Units of length in column names, other than the metre [m]."""
 
 FREQUENCY_UNITS: Final = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 """Units of carriers in column names [Hz]."""
@@ -91,6 +109,17 @@ class ValueColumn:
     reason: str
 
 
+def without_accents(name: object) -> str:
+    """A name without accents.
+
+    Example:
+        >>> without_accents("Höhe (straße)")
+        'Hohe (strasse)'
+    """
+    parts = unicodedata.normalize("NFKD", str(name).replace("\u00df", "ss"))
+    return "".join(character for character in parts if not unicodedata.combining(character))
+
+
 def words(name: object) -> frozenset[str]:
     """Words of a column's name, in lower case; a word in camel case counts as a whole and in parts.
 
@@ -101,7 +130,7 @@ def words(name: object) -> frozenset[str]:
         ['bs', 'bslatitude', 'deg', 'latitude']
     """
     # Units keep their capitals together: "dBm" is one word.
-    text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", str(name))
+    text = re.sub(r"[dD][bB][mM]|dB|[kMG]?Hz", lambda unit: f" {unit[0].lower()} ", without_accents(name))
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     split = (re.split(r"[^a-z0-9]+", spelling.lower()) for spelling in (text, parts))
     return frozenset(word for spelling in split for word in spelling if word)
@@ -211,6 +240,24 @@ def find_transmit_power(frame: pd.DataFrame) -> str | None:
     return None
 
 
+def find_length_unit(names: Iterable[str]) -> float:
+    """Length of the unit that columns name [m]; 1 if they name none.
+
+    Raises:
+        InputError: They name several.
+
+    Example:
+        >>> find_length_unit(["X [cm]", "Y [cm]", "device"]), find_length_unit(["x", "y_m"])
+        (0.01, 1.0)
+    """
+    stated = {str(name): words(name) & {*LENGTH_UNITS, "m"} for name in names}
+    units = {next(iter(found)) for found in stated.values() if len(found) == 1}
+    if len({LENGTH_UNITS.get(unit, 1.0) for unit in units}) > 1:
+        listed = ", ".join(name for name, found in stated.items() if found)
+        raise InputError(f"positions are in different units ({listed}); give all in metres")
+    return LENGTH_UNITS.get(next(iter(units), "m"), 1.0)
+
+
 def find_wide_columns(frame: pd.DataFrame, transmitters: Iterable[str]) -> dict[str, str]:
     """Find the columns of a wide table, and the transmitter of each.
 
@@ -249,12 +296,15 @@ def find_unknown_wide_columns(frame: pd.DataFrame, columns: Mapping[str, str]) -
         >>> table = pd.DataFrame(columns=["x", "rss_a", "rss_b", "rss_c"])
         >>> find_unknown_wide_columns(table, {"rss_a": "a", "rss_b": "b"})
         ['rss_c']
+        >>> table = pd.DataFrame(columns=["x", "WAP1", "WAP2", "WAP13"])
+        >>> find_unknown_wide_columns(table, {"WAP1": "WAP1", "WAP2": "WAP2"})
+        ['WAP13']
     """
     column, name = next(iter(columns.items()))
     before, _, after = column.lower().rpartition(name.lower())
-    if not before + after:
-        return []
-    pattern = re.compile(rf"{re.escape(before)}[^ _]+{re.escape(after)}")
+    # Where columns have no other words, those differ from the transmitters' in digits alone.
+    middle = r"[^ _]+" if before + after else re.sub(r"\d+", r"\\d+", re.escape(name.lower()))
+    pattern = re.compile(rf"{re.escape(before)}{middle}{re.escape(after)}")
     return [str(other) for other in frame if other not in columns and pattern.fullmatch(str(other).lower())]
 
 
@@ -278,10 +328,11 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
     """
     partial = None
     for name in transmitters:
-        values = set(transmitters[name].astype(str))
+        compared = comparison(transmitters[name])
+        values = set(compared(transmitters[name]))
         if name not in links or len(values) != len(transmitters):
             continue
-        labels = set(links[name].astype(str))
+        labels = set(compared(links[name].dropna()))
         if labels <= values:
             return str(name)
         if partial is None and labels & values and matches(name, "transmitter", "name of a transmitter"):
@@ -292,14 +343,17 @@ def find_shared_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> str | No
 def find_naming_key(links: pd.DataFrame, transmitters: pd.DataFrame) -> tuple[str, str] | None:
     """Find the column of the links that names the transmitter, and that of another name in the table of transmitters.
 
+    Columns that are named like transmitters come first, then other columns of texts.
+
     Example:
         >>> links = pd.DataFrame({"gateway_id": ["a", "b", "a"], "rssi": [-80, -90, -85]})
         >>> find_naming_key(links, pd.DataFrame({"id": ["a", "b", "c"], "x": [0, 50, 90]}))
         ('gateway_id', 'id')
     """
-    for name in links:
-        labels = links[name].dropna().unique().tolist()
-        if matches(name, "transmitter") and labels:
+    for name in sorted(links, key=lambda name: not matches(name, "transmitter")):
+        labels = links[name].dropna().drop_duplicates()
+        is_likely = matches(name, "transmitter") or not pd.api.types.is_numeric_dtype(labels)
+        if is_likely and len(labels):
             of_table = naming_column(transmitters, labels)
             if of_table is not None:
                 return str(name), of_table

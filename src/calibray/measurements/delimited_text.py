@@ -198,7 +198,11 @@ def _is_number(cell: str) -> bool:
 def _with_unit(name: object, unit: str) -> str:
     """Name of a column with its unit, unless the name has it."""
     plain = str(name).strip()
-    return plain if not unit or unit.lower() in re.split(r"[^a-z\u00b0%/]+", plain.lower()) else f"{plain} [{unit}]"
+    return (
+        plain
+        if not unit or unit.lower() in re.split(r"[^a-z\u00b0%/]+", plain.lower())
+        else f"{plain} [{unit}]"
+    )
 
 
 def _plain_numbers(column: pd.Series, decimal: str) -> pd.Series:

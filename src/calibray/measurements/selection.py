@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -104,7 +104,30 @@ def melt(
     return long.note("cells without a value", empty) if empty else long
 
 
-def naming_column(transmitters: pd.DataFrame, labels: Iterable[str]) -> str | None:
+def plain_labels(column: Iterable[object]) -> list[str]:
+    """Labels for comparison: without case, without white space at the ends, 5 for 5.0, and a colon for a hyphen.
+
+    Tools write one address as `AA-BB` and as `aa:bb`, and whole numbers as floats if a column has gaps.
+
+    Example:
+        >>> plain_labels(["C4-64", "c4:64 ", 5.0])
+        ['c4:64', 'c4:64', '5']
+    """
+    texts = (
+        f"{label:.0f}" if isinstance(label, float) and label % 1 == 0 else str(label) for label in column
+    )
+    return [text.strip().casefold().replace("-", ":") for text in texts]
+
+
+def comparison(names: Iterable[object]) -> Callable[[Iterable[object]], list[str]]:
+    """How labels are compared with names: as `plain_labels`, unless that makes two names one."""
+    texts = list(map(str, names))
+    if len(set(plain_labels(texts))) == len(set(texts)):
+        return plain_labels
+    return lambda labels: list(map(str, labels))
+
+
+def naming_column(transmitters: pd.DataFrame, labels: Iterable[object]) -> str | None:
     """The column of a table of transmitters that names them: no value twice, and at least half of some labels.
 
     Returns None if no column or several do so.
@@ -113,13 +136,12 @@ def naming_column(transmitters: pd.DataFrame, labels: Iterable[str]) -> str | No
         >>> naming_column(pd.DataFrame({"id": ["a", "b"], "height": [5.0, 5.0]}), ["b", "b"])
         'id'
     """
-    wanted = set(map(str, labels))
-    columns = [
-        str(name)
-        for name in transmitters
-        if transmitters[name].is_unique
-        and len(wanted & set(transmitters[name].astype(str))) >= max(len(wanted) / 2, 1)
-    ]
+    labels, columns = list(labels), []
+    for name in transmitters:
+        compared = comparison(transmitters[name])
+        names, wanted = set(compared(transmitters[name])), set(compared(labels))
+        if len(names) == len(transmitters) and len(wanted & names) >= max(len(wanted) / 2, 1):
+            columns.append(str(name))
     return columns[0] if len(columns) == 1 else None
 
 
@@ -130,18 +152,20 @@ def _join_transmitters(table: SourceTable, transmitters: SourceTable, key: str) 
     labels = transmitters.labels(name).tolist()
     if len(set(labels)) != len(labels):
         raise InputError(f"{transmitters.source}: one of {', '.join(labels[:5])} appears twice; remove one")
-    if unknown := sorted(set(label_of_link) - set(labels)):
-        known = set(labels)
-        lacking = np.array([label not in known for label in label_of_link])
-        cells = ", ".join(map(repr, table.frame.loc[lacking, key].unique().tolist()[:NAMED]))
+    compared = comparison(labels)
+    index_of_label = {label: index for index, label in enumerate(compared(labels))}
+    compared_of_link = compared(label_of_link)
+    lacking = np.array([label not in index_of_label for label in compared_of_link])
+    if lacking.any():
+        unknown = table.frame.loc[lacking, key].unique().tolist()
+        cells = ", ".join(map(repr, unknown[:NAMED]))
         more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
         raise InputError(
             f"{table.source}: {transmitters.source} lacks {cells}{more}, the {key} of {lacking.sum()} of {len(table)} "
-            f"rows; {did_you_mean(unknown[0], labels)}; add them, or leave their rows out with links.where, as in "
+            f"rows; {did_you_mean(str(unknown[0]), labels)}; add them, or leave their rows out with links.where, as in "
             f'where = "`{key}` not in [{cells}]"'
         )
-    index_of_label = {label: index for index, label in enumerate(labels)}
-    joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in label_of_link]]
+    joined = transmitters.frame.drop(columns=name).iloc[[index_of_label[label] for label in compared_of_link]]
     # A column that links have already keeps its name there, because filters and positions refer to it.
     joined = joined.rename(columns={name: f"{key}_{name}" for name in joined if name in table.frame})
     frame = pd.concat([table.frame.reset_index(drop=True), joined.reset_index(drop=True)], axis=1)

@@ -25,7 +25,7 @@ from calibray.measurements import (
 )
 from calibray.measurements.column_names import PositionColumns, ValueColumn
 from calibray.measurements.planner_columns import find_powers
-from calibray.measurements.selection import find_codes, without_codes
+from calibray.measurements.selection import comparison, find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
 from calibray.study.link_checks import CELL_SHARE
@@ -204,18 +204,18 @@ class LinksDraft:
 
     def _leave_out_unknown_transmitters(self, key: str, names_of_sites: pd.Series) -> None:
         """Draft a filter for rows whose transmitter the table of transmitters lacks."""
-        known = set(names_of_sites.astype(str))
-        lacking = ~self._table.frame[key].astype(str).isin(known)
+        column, compared = self._table.frame[key], comparison(names_of_sites)
+        lacking = ~np.isin(compared(column), compared(names_of_sites))
         if not lacking.any():
             return
-        names = self._table.frame.loc[lacking, key].dropna().unique().tolist()
+        names = column[lacking].dropna().unique().tolist()
         # The known ones: rows without a name are left out too.
-        self._add_filter(f"`{key}` in {names_of_sites.dropna().tolist()}")
+        self._add_filter(f"`{key}` in {column[~lacking].unique().tolist()}")
         named = ", ".join(map(str, names[:10])) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
         source = "the table of transmitters" if self.transmitters is None else self.transmitters.name
         reason = f"{source} lacks {named or 'rows without a name'}: {lacking.sum()} rows are left out"
         self.assume("links.where", self.section["where"], reason)
-        self._table = self._table.select(~lacking.to_numpy())
+        self._table = self._table.select(~lacking)
 
     def _add_filter(self, condition: str) -> None:
         """Add a condition to the row filter."""
@@ -283,7 +283,9 @@ class LinksDraft:
         self.section["tx"] = self._transmitter(tx, rx)
         self.section["rx"] = [rx.x, rx.y, RECEIVER_HEIGHT if rx.height is None else rx.height]
         unit = "degrees" if rx.position == "geographic" else "metres"
-        reason = f"columns named as {unit}" + ("" if rx.height else f"; no height: {RECEIVER_HEIGHT} m")
+        self._add_position_unit(tx, rx)
+        reason = f"columns named as {unit}" if "position_unit" not in self.section else "by their names"
+        reason += "" if rx.height else f"; no height: {RECEIVER_HEIGHT} m"
         self.assume("links.rx", ", ".join(map(str, self.section["rx"])), reason)
         if rx.position != "geographic":
             return
@@ -295,6 +297,26 @@ class LinksDraft:
             )
         reason = f"degrees; {Path(self.scene).name} has the scene's place on the globe"
         self.assume("links.position", "geographic", reason)
+
+    def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:
+        """The unit of the position columns, if their names state another one than the metre."""
+        ends = [end for end in (tx, rx) if end is not None]
+        if any(end.position == "geographic" for end in ends):
+            names = [end.height for end in ends if end.height is not None]
+        else:
+            names = [name for end in ends for name in (end.x, end.y, end.height) if name is not None]
+        try:
+            unit = column_names.find_length_unit(names)
+        except InputError as error:
+            raise InputError(f"{self.links}: {error}") from None
+        if unit == 1:
+            return
+        if rx.position == "geographic":
+            raise InputError(
+                f"{self.links}: heights are not in metres ({', '.join(names)}); give them in metres"
+            )
+        self.section["position_unit"] = unit
+        self.assume("links.position_unit", f"{unit:g} m", f"named by the columns {', '.join(names)}")
 
     def _transmitter(self, tx: PositionColumns | None, rx: PositionColumns) -> list[float | str]:
         if tx is not None:

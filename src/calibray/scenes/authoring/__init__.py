@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.made_scene import MadeScene as MadeScene
     from calibray.scenes.authoring.made_scene import Palette as Palette
     from calibray.scenes.authoring.made_scene import SurfaceMaterial as SurfaceMaterial
+    from calibray.scenes.authoring.made_scene import material_name as material_name
     from calibray.scenes.authoring.terrain import Terrain as Terrain
     from calibray.scenes.authoring.terrain import lower_origin as lower_origin
     from calibray.scenes.authoring.terrain import read_terrain as read_terrain
@@ -37,7 +38,7 @@ _MODULES = {
     "floor_plan_scene": ("WALL_THICKNESS", "make_plan_scene"),
     "footprint_files": ("read_footprints", "read_openstreetmap"),
     "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
-    "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial"),
+    "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial", "material_name"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),
     "wall_faces": ("merge_faces",),
 }

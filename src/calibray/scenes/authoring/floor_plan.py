@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.measurements.column_names import LENGTH_UNITS, find_length_unit, without_accents, words
+from calibray.measurements.delimited_text import parse_text, read_text
 from calibray.scenes.authoring.footprints import HIGHEST, WIDEST
 from calibray.scenes.authoring.geodata import read_features
 from calibray.support.lazy_imports import library
@@ -29,6 +33,18 @@ Lines = list[list[NDArray[np.float64]]]
 """For each row the points [n, 2] of its lines."""
 
 _ENDS: Final = ("x0", "y0", "x1", "y1")
+_OTHER_ENDS: Final = (
+    ("x1", "y1", "x2", "y2"),
+    ("xstart", "ystart", "xend", "yend"),
+    ("xa", "ya", "xe", "ye"),
+)
+_OTHER_NAMES: Final = {
+    "type": ("material", "kind", "class", "category", "typ", "tipo"),
+    "thickness": ("width", "dicke", "starke", "staerke", "espesor", "epaisseur"),
+    "height": ("hohe", "hoehe", "altura", "hauteur"),
+    "bottom": ("sill", "base"),
+    "wkt": ("geometry", "geom"),
+}
 
 
 @dataclass(frozen=True)
@@ -67,8 +83,9 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
     """Read a floor plan.
 
     Args:
-        path: A CSV table with the columns x0, y0, x1, y1 and type, or, instead of the coordinates, a column wkt with
-            lines, polylines or outlines; optionally thickness, bottom and height. Or a DXF, GeoJSON or other vector
+        path: A table as text with the columns x0, y0, x1, y1 and type, or, instead of the coordinates, a column wkt
+            with lines, polylines or outlines; optionally thickness, bottom and height. Similar names are understood,
+            and a unit of length in a name, as in `width_cm`, counts for its column. Or a DXF, GeoJSON or other vector
             file with these attributes, whose coordinates are taken as those of the plan; without an attribute type,
             the layer of DXF is the type. Points and texts of such files are left out.
         height: Height of the top of segments without a height [m].
@@ -87,12 +104,13 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
             )
     path = Path(path)
     is_vector = path.suffix.lower() in VECTOR_SUFFIXES
-    frame, lines = _read_vector(path) if is_vector else _read_table(path)
+    frame, lines = _read_vector(path) if is_vector else _read_table(path, unit)
     numbers = {name: _numbers(path, frame, name) * unit for name in ("thickness", "bottom", "height")}
+    places = [f"feature {index + 1}" if is_vector else f"row {index}" for index in frame.index]
     segments = []
     for index, (kind, parts) in enumerate(zip(frame["type"], lines, strict=True)):
         thickness, bottom, extent = (float(values[index]) for values in numbers.values())
-        row = f"floor plan {path}, {f'feature {index + 1}' if is_vector else f'row {index + 2}'}"
+        row = f"floor plan {path}, {places[index]}"
         points = np.concatenate(parts) * unit if parts else np.empty((0, 2))
         if not isinstance(kind, str) or not len(points) or not np.isfinite(points).all():
             raise InputError(f"{row}: lacks its type or a coordinate; complete or remove it")
@@ -118,35 +136,34 @@ def read_plan(path: str | Path, height: float = 3.0, unit: float = 1.0) -> list[
     return segments
 
 
-def _read_table(path: Path) -> tuple[pd.DataFrame, Lines]:
+def _read_table(path: Path, unit: float) -> tuple[pd.DataFrame, Lines]:
+    """The columns of a table under the names of this module, by the lines of its rows; lengths in the plan's unit."""
     if not exists(path):
         raise InputError(f"floor plan {path}: is not a file; check the path")
-    try:
-        # A compressed file is refused, because some kilobytes of it could fill the memory.
-        frame = pd.read_csv(path, skipinitialspace=True, compression=None)
-    except OSError as error:
-        raise InputError(f"floor plan {path}: cannot be read ({error.strerror}); check the file") from None
-    except (ValueError, OverflowError) as error:
-        raise InputError(
-            f"floor plan {path}: is not a table ({first_line(error)}); give a CSV file"
-        ) from None
+    table = parse_text(path, read_text(path))
+    known = _known_names(map(str, table.frame))
+    frame = table.frame.rename(columns=known).set_index(table.row)
     for column in ("type",) if "wkt" in frame else (*_ENDS, "type"):
         if column not in frame:
             raise InputError(
-                f"floor plan {path}: no column {column!r}; {did_you_mean(column, map(str, frame))}"
+                f"floor plan {path}: no column {column!r}; {did_you_mean(column, map(str, table.frame))}; a plan has "
+                "x0, y0, x1, y1 (or wkt) and type"
             )
+    for column, name in known.items():
+        if words(column) & {*LENGTH_UNITS, "m"}:
+            frame[name] = _numbers(path, frame, name) * find_length_unit([column]) / unit
     if "wkt" not in frame:
         ends = np.stack([_numbers(path, frame, name) for name in _ENDS], axis=1)
         return frame, [[row.reshape(2, 2)] for row in ends]
     shapely = library("shapely", "scenes")
     lines = []
-    for index, text in enumerate(frame["wkt"]):
+    for row, text in frame["wkt"].items():
         try:
             with np.errstate(invalid="ignore"):  # values that are not numbers are refused below
                 lines.append(_parts(shapely.from_wkt(text)))
         except (shapely.GEOSException, TypeError) as error:
             raise InputError(
-                f"floor plan {path}, row {index + 2}: wkt = {shortened(repr(text))} is not a geometry "
+                f"floor plan {path}, row {row}: wkt = {shortened(repr(text))} is not a geometry "
                 f"({first_line(error)}); write LINESTRING (0 0, 4 0, 4 3), for example"
             ) from None
     return frame, lines
@@ -162,6 +179,29 @@ def _read_vector(path: Path) -> tuple[pd.DataFrame, Lines]:
     if "type" not in frame:
         raise InputError(f"floor plan {path}: no attribute 'type'; {did_you_mean('type', map(str, frame))}")
     return frame, [parts for parts in lines if parts]
+
+
+def _known_names(columns: Iterable[str]) -> dict[str, str]:
+    """The name that this module uses by the name of a column, without case and unit.
+
+    Example:
+        >>> _known_names(["X1 [cm]", "Y1 [cm]", "X2 [cm]", "Y2 [cm]", "Material", "width_cm"])["X2 [cm]"]
+        'x1'
+    """
+    plain = {}
+    for name in columns:
+        parts = re.split(r"[^a-z0-9]+", without_accents(name).lower())
+        joined = "".join(part for part in parts if part not in {*LENGTH_UNITS, "m"})
+        plain[name] = re.sub(r"^(start|end|a|e)([xy])$", r"\2\1", joined)
+    known = {}
+    for ends in (_ENDS, *_OTHER_ENDS):
+        if set(ends) <= set(plain.values()):
+            known = dict(zip(ends, _ENDS, strict=True))
+            break
+    for name, others in _OTHER_NAMES.items():
+        stated = next((other for other in (name, *others) if other in plain.values()), name)
+        known[stated] = name
+    return {column: known[name] for column, name in plain.items() if name in known}
 
 
 def _parts(geometry: Any) -> list[NDArray[np.float64]]:
@@ -184,8 +224,8 @@ def _numbers(path: str | Path, frame: pd.DataFrame, name: str) -> NDArray[np.flo
         column = column.astype("string")
     values = pd.Series(pd.to_numeric(column, errors="coerce")).to_numpy(dtype=np.float64, na_value=np.nan)
     if (bad := np.flatnonzero((np.isnan(values) & frame[name].notna().to_numpy()) | np.isinf(values))).size:
+        cell = shortened(repr(frame[name].iloc[bad[0]]))
         raise InputError(
-            f"floor plan {path}, row {bad[0] + 2}: {name} = {shortened(repr(frame[name].iloc[bad[0]]))} is not a "
-            "number; correct it"
+            f"floor plan {path}, row {frame.index[bad[0]]}: {name} = {cell} is not a number; correct it"
         )
     return values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -43,6 +44,9 @@ TYPES: Final = {
 
 WALL_THICKNESS: Final = 0.12
 """Thickness of a wall of an ITU material if the plan does not state it [m]."""
+
+NAMED: Final = 10
+"""Largest number of types without a material that a message names."""
 
 ROUNDING: Final = 2.0
 """Distance of a corner from its line that rounding explains [mm]: walls of a plan are cut where they cross."""
@@ -124,18 +128,20 @@ def make_plan_scene(
 
 def _materials(sheets: Sequence[Segment], types: Mapping[str, SurfaceMaterial]) -> list[SurfaceMaterial]:
     """The material of each sheet; a type with several thicknesses has several materials."""
+    unknown = dict.fromkeys(sheet.kind for sheet in sheets if sheet.kind not in {*types, *ITU_NAMES})
+    if unknown:
+        listed = list(unknown)[:NAMED]
+        options = " ".join(f"--material {shlex.quote(kind)}=concrete" for kind in listed)
+        raise InputError(
+            f"floor plan: no material for {', '.join(map(repr, listed))}; give each the material of ITU-R P.2040 that "
+            f"comes closest, as in {options}; or correct it, {did_you_mean(listed[0], sorted({*types, *ITU_NAMES}))}"
+        )
     materials = []
     for sheet in sheets:
         if sheet.kind in types:
             base = types[sheet.kind]
-        elif sheet.kind in ITU_NAMES:
-            base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
         else:
-            names = sorted({*types, *ITU_NAMES})
-            raise InputError(
-                f"floor plan: type {sheet.kind!r} has no material; {did_you_mean(sheet.kind, names)} (or give it one "
-                "with --material)"
-            )
+            base = SurfaceMaterial(f"{sheet.kind}_wall", sheet.kind, WALL_THICKNESS)
         materials.append(base if sheet.thickness is None else replace(base, thickness=sheet.thickness))
     thicknesses: dict[str, set[float]] = defaultdict(set)
     for material in materials:

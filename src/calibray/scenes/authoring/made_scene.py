@@ -13,6 +13,7 @@ import numpy as np
 
 from calibray.coordinates import Frame
 from calibray.errors import InputError
+from calibray.measurements.column_names import without_accents
 from calibray.scenes.meshes import MeshObject
 from calibray.scenes.scene import ITU_NAMES, is_itu_name
 from calibray.scenes.scene_file import write_scene
@@ -68,6 +69,18 @@ class SurfaceMaterial:
     def constants(self) -> dict[str, float | str]:
         """The constants as a scene file holds them."""
         return {"type": self.itu, "thickness": self.thickness}
+
+
+def material_name(kind: str) -> str:
+    """The name of a material for a type of wall, whose name may have any characters.
+
+    Example:
+        >>> material_name("tür 2"), material_name("brick"), material_name("2 x drywall")
+        ('tur_2', 'brick_wall', 'wall_2_x_drywall')
+    """
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", without_accents(kind)).strip("_-")
+    name = name if _NAME.fullmatch(name) else f"wall_{name}".rstrip("_")
+    return f"{name}_wall" if is_itu_name(name) else name
 
 
 @dataclass(frozen=True)
