@@ -193,7 +193,7 @@ def _known_names(columns: Iterable[str]) -> dict[str, str]:
         parts = re.split(r"[^a-z0-9]+", without_accents(name).lower())
         joined = "".join(part for part in parts if part not in {*LENGTH_UNITS, "m"})
         plain[name] = re.sub(r"^(start|end|a|e)([xy])$", r"\2\1", joined)
-    known = {}
+    known: dict[str, str] = {}
     for ends in (_ENDS, *_OTHER_ENDS):
         if set(ends) <= set(plain.values()):
             known = dict(zip(ends, _ENDS, strict=True))
