@@ -69,12 +69,6 @@ def screened_iterations(budget: int) -> dict[str, int]:
 
     Two thirds are spent in 5 full iterations, on 30 wolves at most, and the rest on 5 elites per iteration.
 
-    Args:
-        budget: Number of evaluations.
-
-    Returns:
-        Population, elites and iterations.
-
     Example:
         >>> screened_iterations(225)
         {'population': 30, 'elites': 5, 'iterations': 20}

@@ -268,9 +268,6 @@ def seal(path: str | Path) -> None:
 
     `Paths.save` seals its files itself.
 
-    Args:
-        path: The file.
-
     Raises:
         InputError: The file does not exist, is not an HDF5 file, or cannot be written.
     """

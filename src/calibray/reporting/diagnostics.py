@@ -41,9 +41,6 @@ EVEN_DB: Final = 0.1
 def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     """Compute tables that describe the residuals and the certainty of a calibration.
 
-    Args:
-        result: The calibration.
-
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
         and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
@@ -67,9 +64,6 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
 
 def diagnostics_table(result: Record) -> Table:
     """Summarize the diagnostics in a line each.
-
-    Args:
-        result: The calibration.
 
     Returns:
         A table: the subject, and the finding.

@@ -28,9 +28,6 @@ DEEPEST_DB: Final = -30.0
 def residuals_by_direction(result: Record) -> Figure | None:
     """Draw the residuals of links over the direction from their transmitter, and its pattern on the horizon.
 
-    Args:
-        result: The calibration.
-
     Returns:
         The figure; None if the study does not state how transmitters are mounted, or its links cannot be read.
     """

@@ -52,14 +52,7 @@ GROUPS: Final = 24
 
 @styled()
 def cumulative_cost(results: Mapping[str, Record]) -> Figure:
-    """Draw RT calls and time over iterations (the paper's figure of cumulative cost).
-
-    Args:
-        results: Results by method.
-
-    Returns:
-        The figure.
-    """
+    """Draw RT calls and time over iterations (the paper's figure of cumulative cost)."""
     figure = Figure(figsize=(6.4, 4.2), dpi=150, layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     for axes, column, y in zip(
@@ -188,14 +181,7 @@ def path_loss_by_receiver(results: Mapping[str, Record]) -> Figure:
 
 @styled()
 def residual_over_distance(survey: Survey) -> Figure:
-    """Draw the residual of each link over the distance between its antennas.
-
-    Args:
-        survey: The links.
-
-    Returns:
-        The figure.
-    """
+    """Draw the residual of each link over the distance between its antennas."""
     figure, axes = residual_figure("Distance [m]")
     residuals, held_out = survey.residual_db, survey.table["held_out"].to_numpy(bool)
     for mask, color, marker, name in (

@@ -72,14 +72,7 @@ QUANTITIES: Final = {
 
 
 def measured_quantity(result: Record) -> Quantity:
-    """The quantity that the study measured; path loss if the links have no other values.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The quantity.
-    """
+    """The quantity that the study measured; path loss if the links have no other values."""
     quantity = result.study.links.quantity
     return QUANTITIES[quantity if _column(result) in result.links else "path_loss"]
 

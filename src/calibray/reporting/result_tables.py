@@ -29,14 +29,7 @@ MARKS: Final[dict[str, str]] = {
 
 
 def heading(result: Record) -> str:
-    """Study, method, engine and seed of a calibration.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        A line.
-    """
+    """Study, method, engine and seed of a calibration."""
     study = result.study
     return (
         f"{study.path.name}: method {study.method.name}, engine {study.engine.name}, seed {study.method.seed}"
@@ -45,9 +38,6 @@ def heading(result: Record) -> str:
 
 def summary(result: Record) -> tuple[Table | str, ...]:
     """What Python and notebooks show of a calibration.
-
-    Args:
-        result: The calibration.
 
     Returns:
         The heading with the number of RT calls, and the tables of parameters, nuisances and accuracy.
@@ -58,14 +48,7 @@ def summary(result: Record) -> tuple[Table | str, ...]:
 
 
 def tables(result: Record) -> tuple[Table, ...]:
-    """All tables of a calibration.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        Those that have rows.
-    """
+    """All tables of a calibration."""
     parts = (
         links(result), parameters(result), reasons(result), nuisances(result), accuracy(result), observables(result),
         observables_table(result.accuracy.observables), remarks(result), diagnostics_table(result), costs(result),
@@ -74,14 +57,7 @@ def tables(result: Record) -> tuple[Table, ...]:
 
 
 def links(result: Record) -> Table:
-    """Numbers of links, and the rows that need a look.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The table.
-    """
+    """Numbers of links, and the rows that need a look."""
     count = result.counts
     censored = result.study.objective.no_path == "censor"
     treatment = (
@@ -131,14 +107,7 @@ def suspicious_rows(
 
 
 def parameters(result: Record) -> Table:
-    """Values before and after calibration, with intervals and verdicts.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The table.
-    """
+    """Values before and after calibration, with intervals and verdicts."""
     predicted = result.prediction.model.parameters
     differs = predicted is not None and predicted != result.parameters
     rows = []
@@ -156,14 +125,7 @@ def parameters(result: Record) -> Table:
 
 
 def reasons(result: Record) -> Table:
-    """The reason of every verdict that has one.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The table.
-    """
+    """The reason of every verdict that has one."""
     rows = [
         (name, explanation_text(interval)) for name, interval in result.intervals.items() if interval.reason
     ]
@@ -172,9 +134,6 @@ def reasons(result: Record) -> Table:
 
 def observables(result: Record) -> Table:
     """The fit of further observables, each in its unit.
-
-    Args:
-        result: The calibration.
 
     Returns:
         The table; without rows if the study has none.
@@ -197,14 +156,7 @@ def observables(result: Record) -> Table:
 
 
 def remarks(result: Record) -> Table:
-    """Warnings and advice.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        A table of sentences.
-    """
+    """Warnings and advice."""
     choice = "" if result.held_out is None else Validation.of(result.held_out).choice
     sentences = wording.remarks(result, choice)
     return Table("Remarks", (Column(),), tuple((sentence,) for sentence in sentences))
@@ -212,9 +164,6 @@ def remarks(result: Record) -> Table:
 
 def nuisances(result: Record) -> Table:
     """Offsets and the coefficients of further nuisances, by group.
-
-    Args:
-        result: The calibration.
 
     Returns:
         The table; without rows if the study declares no nuisance.
@@ -229,14 +178,7 @@ def nuisances(result: Record) -> Table:
 
 
 def accuracy(result: Record) -> Table:
-    """RMSE before and after calibration, and that of the baselines.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The table.
-    """
+    """RMSE before and after calibration, and that of the baselines."""
     fit, held_out = result.fit, result.accuracy
     nuisances_only = "nuisances only" if _nuisances_besides_offset(result) else "offset only"
     rows = (
@@ -252,14 +194,7 @@ def accuracy(result: Record) -> Table:
 
 
 def costs(result: Record) -> Table:
-    """RT calls, replays and time.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        The table.
-    """
+    """RT calls, replays and time."""
     cost = result.cost
     rows = [("RT calls", f"{cost.rt_calls:,}")]
     if cost.ledger_hits:
@@ -318,9 +253,6 @@ class Value:
 
 def values(result: Record) -> list[Value]:
     """The parameters of a calibration as the report shows them.
-
-    Args:
-        result: The calibration.
 
     Returns:
         One entry per parameter, in the study's order.

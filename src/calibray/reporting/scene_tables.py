@@ -22,9 +22,6 @@ _HEIGHT_SOURCES: Final = {
 def contents(scene: MadeScene) -> Table:
     """The contents of a new scene, and the assumptions made.
 
-    Args:
-        scene: The scene.
-
     Returns:
         A table of two columns without headings.
     """
@@ -115,9 +112,6 @@ def objects(check: SceneCheck) -> Table:
 def assumptions(draft: Draft) -> Table:
     """The assumptions of a drafted study.
 
-    Args:
-        draft: The draft.
-
     Returns:
         One row per assumption, with its reason.
     """
@@ -127,9 +121,6 @@ def assumptions(draft: Draft) -> Table:
 
 def warning_lines(findings: Sequence[Finding]) -> str:
     """Findings about links as warnings.
-
-    Args:
-        findings: The findings.
 
     Returns:
         A line each; empty without findings.

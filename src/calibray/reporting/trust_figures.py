@@ -40,14 +40,7 @@ ROWS: Final = 14
 
 
 def trust_figures(result: Record) -> dict[str, Figure]:
-    """Draw the figures for which the calibration has data.
-
-    Args:
-        result: The calibration.
-
-    Returns:
-        Figures by name.
-    """
+    """Draw the figures for which the calibration has data."""
     tables, figures = diagnostics(result), {}
     if all(len(result.uncertainty.draws.get(name, ())) > 1 for name in result.parameters):
         figures["possible-values"] = possible_values(result)
@@ -118,14 +111,7 @@ def _spread(result: Record, name: str) -> float:
 
 @styled()
 def held_out_errors(validation: Validation) -> Figure:
-    """Draw the distribution of absolute errors on held-out links, by model.
-
-    Args:
-        validation: The validation.
-
-    Returns:
-        The figure.
-    """
+    """Draw the distribution of absolute errors on held-out links, by model."""
     figure, axes = plain_figure("Absolute error of held-out links [dB]", "Share of links up to this error")
     judged, reach = validation.block >= 0, 0.0
     for name, color in _colors(validation):
@@ -141,14 +127,7 @@ def held_out_errors(validation: Validation) -> Figure:
 
 @styled()
 def held_out_blocks(validation: Validation) -> Figure:
-    """Draw the RMSE of every model on every block.
-
-    Args:
-        validation: The validation.
-
-    Returns:
-        The figure.
-    """
+    """Draw the RMSE of every model on every block."""
     count = len(validation.labels)
     figure, axes = plain_figure("Block", "Held-out RMSE [dB]")
     for name, color in _colors(validation):
@@ -179,14 +158,7 @@ def _rmse(error: NDArray[np.float64]) -> float:
 
 @styled()
 def power(table: pd.DataFrame) -> Figure:
-    """Draw power by material and type of interaction.
-
-    Args:
-        table: The diagnostics' table "power".
-
-    Returns:
-        The figure.
-    """
+    """Draw power by material and type of interaction."""
     shown = table.head(ROWS)
     names = [f"{row.material} {row.interaction}".strip() for row in shown.itertuples()]
     figure, axes = plain_figure("Mean share of a link's power [%]", "", height=1.2 + 0.3 * len(shown))
@@ -200,14 +172,7 @@ def power(table: pd.DataFrame) -> Figure:
 
 @styled()
 def neighbours(table: pd.DataFrame) -> Figure:
-    """Draw the semivariance of residuals over the distance between links.
-
-    Args:
-        table: The diagnostics' table "neighbours".
-
-    Returns:
-        The figure.
-    """
+    """Draw the semivariance of residuals over the distance between links."""
     figure, axes = plain_figure("Distance between links [m]", "Semivariance of residuals [dB²]")
     axes.plot(table["distance_m"], table["semivariance_db2"], "o-", color=BLUE)
     axes.set(xlim=(0, None), ylim=(0, None))
@@ -216,14 +181,7 @@ def neighbours(table: pd.DataFrame) -> Figure:
 
 @styled()
 def leverage(table: pd.DataFrame) -> Figure:
-    """Draw the residual of every link over its leverage.
-
-    Args:
-        table: The diagnostics' table "leverage".
-
-    Returns:
-        The figure.
-    """
+    """Draw the residual of every link over its leverage."""
     figure, axes = residual_figure("Leverage")
     size = 40 if len(table) <= 100 else 16 if len(table) <= 1000 else 5
     axes.scatter(table["leverage"], table["residual_db"], s=size, c=BLUE, alpha=0.7, lw=0,
@@ -234,14 +192,7 @@ def leverage(table: pd.DataFrame) -> Figure:
 
 @styled()
 def by_depth(table: pd.DataFrame) -> Figure:
-    """Draw the mean residual by the number of interactions of the strongest path, with two standard errors.
-
-    Args:
-        table: The diagnostics' table "depth".
-
-    Returns:
-        The figure.
-    """
+    """Draw the mean residual by the number of interactions of the strongest path, with two standard errors."""
     figure, axes = residual_figure("Interactions of the strongest path")
     error = table["standard_deviation_db"] / np.sqrt(table["links"])
     axes.errorbar(table["depth"], table["mean_db"], 2 * error, fmt="o", color=BLUE, capsize=3)

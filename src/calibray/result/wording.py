@@ -31,9 +31,6 @@ NOT_JUDGED: Final = (
 def interval_text(interval: Interval) -> str:
     """The ends of an interval, of each piece while they are few.
 
-    Args:
-        interval: The interval.
-
     Returns:
         The ends, as "2.1 to 3.4".
     """
@@ -45,9 +42,6 @@ def interval_text(interval: Interval) -> str:
 def reason_text(reason: Reason | None) -> str:
     """Why a verdict is what it is.
 
-    Args:
-        reason: The reason.
-
     Returns:
         A clause without a full stop; empty without a reason.
     """
@@ -56,9 +50,6 @@ def reason_text(reason: Reason | None) -> str:
 
 def explanation_text(interval: Interval) -> str:
     """Why a verdict is what it is, and what would narrow the interval.
-
-    Args:
-        interval: The interval.
 
     Returns:
         Clauses separated by semicolons, without a full stop; empty if nothing is known.
@@ -142,14 +133,7 @@ _REASONS: Final[dict[ReasonKind, Callable[[dict[str, Any], tuple[tuple[float, ..
 
 
 def remark_text(remark: Remark) -> str:
-    """A warning or advice.
-
-    Args:
-        remark: The remark.
-
-    Returns:
-        One or several sentences.
-    """
+    """A warning or advice."""
     return _REMARKS[remark.kind](remark.values)
 
 
@@ -296,14 +280,7 @@ _REMARKS: Final[dict[RemarkKind, Callable[[dict[str, Any]], str]]] = {
 
 
 def judgement_text(judgement: Judgement) -> str:
-    """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly.
-
-    Args:
-        judgement: The comparison.
-
-    Returns:
-        A sentence.
-    """
+    """Whether calibration helped on held-out links, by how much compared with the best baseline, and how certainly."""
     error = f"RMSE {judgement.rmse_db:.2f} dB on {judgement.links} held-out links"
     certainty = "no bootstrap error: one cluster of links"
     if judgement.error_db is not None:
@@ -337,9 +314,6 @@ def choice_text(chosen: str, best: str) -> str:
 def chosen_model_text(record: Record) -> str:
     """The held-out accuracy of the prediction model, where it is not the calibrated one.
 
-    Args:
-        record: The result.
-
     Returns:
         A sentence; empty where predictions use the calibrated model.
     """
@@ -353,14 +327,7 @@ def chosen_model_text(record: Record) -> str:
 
 
 def prediction_text(record: Record) -> str:
-    """What predictions use.
-
-    Args:
-        record: The result.
-
-    Returns:
-        A sentence.
-    """
+    """What predictions use."""
     model = record.prediction.model
     if model.parameters is None:
         source = "no materials" if model.name == Model.OBSTRUCTION else "no scene"
@@ -384,9 +351,6 @@ def prediction_text(record: Record) -> str:
 
 def scene_alone_text(record: Record) -> str:
     """How far the exported scene alone is from the predictions.
-
-    Args:
-        record: The result.
 
     Returns:
         One or two sentences; empty if the scene gives the predictions.
@@ -420,14 +384,7 @@ def scene_alone_text(record: Record) -> str:
 
 
 def held_out_text(record: Record) -> str:
-    """How many links were held out.
-
-    Args:
-        record: The result.
-
-    Returns:
-        A clause.
-    """
+    """How many links were held out."""
     held_out = record.held_out
     if held_out is None:
         return f"{record.counts['held_out']:,} of them held out"
@@ -435,14 +392,7 @@ def held_out_text(record: Record) -> str:
 
 
 def block_sentence(held_out: HeldOutErrors) -> str:
-    """How many blocks were held out.
-
-    Args:
-        held_out: The held-out errors.
-
-    Returns:
-        A sentence.
-    """
+    """How many blocks were held out."""
     return f"{len(held_out.labels)} blocks of links were held out in turn."
 
 

@@ -142,14 +142,7 @@ def region_effects(
     parameters: Parameters,
     paths: Paths,
 ) -> Effects:
-    """The extra loss of paths through regions.
-
-    Args:
-        sections: The sections by name.
-        regions: Their polygons by name.
-        parameters: The study's parameters.
-        paths: The paths.
-    """
+    """The extra loss of paths through regions."""
     # JAX is slow to import, and every study file that is read imports this module.
     from calibray.fields import ExtraLoss
 

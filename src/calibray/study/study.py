@@ -91,12 +91,6 @@ class Study(StudyModel):
     def load(cls, path: str | Path) -> Study:
         """Read a study file.
 
-        Args:
-            path: The TOML file.
-
-        Returns:
-            The study.
-
         Raises:
             InputError: The file does not exist, is not TOML, has an unknown key or an impossible value, or names a
                 file that does not exist; one line for each error.
