@@ -17,8 +17,8 @@ from calibray.measurements import links_from_frame
 from calibray.prediction.cost import LOG, announce
 from calibray.prediction.fallback import fill_missing
 from calibray.prediction.map_files import figure
+from calibray.reporting.wording import prediction_text
 from calibray.result import RemarkKind
-from calibray.result.wording import prediction_text
 from small_scenes import block, write_scene
 
 BEHIND = 9

@@ -15,7 +15,7 @@ import two_ray
 from calibray.errors import InputError
 from calibray.fields import path_loss
 from calibray.measurements import SourceTable, links_from_frame
-from calibray.reporting.direction_figure import residuals_by_direction
+from calibray.reporting.trust_figures import residuals_by_direction
 from calibray.result.remark import RemarkKind
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study

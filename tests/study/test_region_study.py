@@ -12,7 +12,7 @@ from calibray.calibration.calibrate import calibrate
 from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.measurements import links_from_frame
-from calibray.result.wording import scene_alone_text
+from calibray.reporting.wording import scene_alone_text
 from calibray.study import Setup, Study
 
 TREES = "region:trees.specific_attenuation"

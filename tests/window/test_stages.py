@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibray.cli.progress_bars import line
-from calibray.window.stages import Stage, stages
+from calibray.window.jobs import Stage, stages
 
 
 def test_lines_of_progress_are_read_back_and_the_last_of_a_stage_counts():

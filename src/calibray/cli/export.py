@@ -26,7 +26,7 @@ def export(
     """Write the calibrated scene for Sionna RT, a script that loads it, and its materials as tables."""
     from calibray.calibration.result import Result
     from calibray.reporting.export import export as write
-    from calibray.result.wording import scene_alone_text
+    from calibray.reporting.wording import scene_alone_text
 
     result = Result.load(folder)
     names = write(result, out, copy, overwrite)

@@ -76,7 +76,7 @@ def predict(
         from calibray.prediction.batches import predict_batches
         from calibray.prediction.observables import observable_columns
         from calibray.prediction.predict import as_links, as_measured
-        from calibray.support.output_files import check_table, growing_table
+        from calibray.support.output_tables import check_table, growing_table
 
         print_costs()
         result = Result.load(folder, allow_changed_inputs=allow_changed_inputs)
@@ -113,7 +113,7 @@ def predict(
 @contextmanager
 def _printer() -> Iterator[Callable[[pd.DataFrame], None]]:
     """A function that prints tables as CSV, with a header before the first."""
-    from calibray.support.output_files import csv_text
+    from calibray.support.output_tables import csv_text
 
     header = True
 

@@ -45,7 +45,7 @@ def suggest(
         from calibray.prediction.predict import as_links
         from calibray.prediction.suggestion import suggest as suggest_links
         from calibray.prediction.suggestion_tables import suggestion_tables
-        from calibray.support.output_files import check_table, write_table
+        from calibray.support.output_tables import check_table, write_table
         from calibray.tables.text import render
 
         print_costs()

@@ -19,7 +19,7 @@ from calibray.comparison.method_runs import BudgetedMethod, MethodRun
 from calibray.optimizers import METHODS, label
 from calibray.support.figure_style import COLORS, PALETTE, logarithmic, plain_figure, styled
 from calibray.support.figure_style import write as write_figure
-from calibray.support.output_files import write_table
+from calibray.support.output_tables import write_table
 from calibray.tables import Column, Table, display, numbers
 
 CALLS: Final = (30, 60, 225)

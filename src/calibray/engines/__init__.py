@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers as Workers
     from calibray.engines.cluster.workers import open_workers as open_workers
     from calibray.engines.compression import compress as compress
+    from calibray.engines.external.command import Command as Command
     from calibray.engines.external.exchange import Request as Request
-    from calibray.engines.external.program import Command as Command
     from calibray.engines.ledger.database import LedgerEntry as LedgerEntry
     from calibray.engines.ledger.database import key as key
     from calibray.engines.ledger.ledger import LEDGER_FILE as LEDGER_FILE
@@ -50,7 +50,7 @@ _HOMES = {
     "Answering": "calibray.engines.protocol",
     "Chunked": "calibray.engines.protocol",
     "ChunkedReplay": "calibray.engines.cluster.chunked_replay",
-    "Command": "calibray.engines.external.program",
+    "Command": "calibray.engines.external.command",
     "Differentiable": "calibray.engines.protocol",
     "Engine": "calibray.engines.protocol",
     "InProcess": "calibray.engines.cluster.workers",

@@ -12,9 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from calibray.optimizers import label
-from calibray.reporting.direction_figure import residuals_by_direction
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity
-from calibray.reporting.trust_figures import trust_figures
+from calibray.reporting.trust_figures import residuals_by_direction, trust_figures
 from calibray.result.record import Record
 from calibray.support.figure_style import (
     BLUE,

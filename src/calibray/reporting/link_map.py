@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,10 @@ STEEP: Final = 0.1
 
 RAMP: Final = ("#1f5fa8", "#5b94cf", "#a9b4bd", "#e0953f", "#b34a00")
 """Colours from negative to positive residuals; colour-blind people can distinguish the ends."""
+
+
+OUTLINED: Final = 400
+"""Most links that the map draws with an outline each."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,32 @@ def lay_out(ends: NDArray[np.float64], triangles: Triangles | None) -> Plan:
     if triangles is None:
         return layout
     return replace(layout, buildings=_buildings(triangles, layout), walls=_walls(triangles, layout))
+
+
+def marks(links: Survey, layout: Plan) -> dict[str, Any]:
+    """What the map shows of links: discs at the ends with more positions, triangles at the others."""
+    residuals = links.residual_db
+    limit = ramp_limit(residuals)
+    by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
+    moving, fixed = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
+    count = len(residuals)
+    position = layout.project(moving).round(1).tolist()
+    color, held_out, lost = ramp(residuals, limit), links.table["held_out"].to_numpy(bool), ~links.has_path
+    # The largest residuals are drawn last, on top.
+    order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
+    return {
+        "width": WIDTH,
+        "radius": 6.5 if count <= OUTLINED else 4.0 if count <= 10 * OUTLINED else 2.5,
+        "limit": f"{limit:g}",
+        "ramp": ", ".join(RAMP),
+        "ends": ("receivers", "transmitters") if by_rx else ("transmitters", "receivers"),
+        "links": [
+            (*position[link], color[link], "lost" if lost[link] else "held" if held_out[link] else "")
+            for link in order
+        ],
+        "masts": np.unique(layout.project(fixed).round(1), axis=0).tolist(),
+        "bar": layout.bar * layout.scale,
+    }
 
 
 def ramp(value: NDArray[np.float64], limit: float) -> list[str]:

@@ -28,14 +28,14 @@ from calibray.errors import EngineError, InputError
 from calibray.reporting import result_tables as tables
 from calibray.reporting.diagnostics import diagnostics_table
 from calibray.reporting.figures import result_figures
-from calibray.reporting.link_map import RAMP, WIDTH, Plan, plan, ramp, ramp_limit
+from calibray.reporting.link_map import Plan, marks, plan, ramp, ramp_limit
 from calibray.reporting.link_survey import Survey, in_measured_quantity, measured_quantity, residual, survey
 from calibray.reporting.summary import summary
 from calibray.reporting.viewer import TRIANGLES, Rays, packed, rays
+from calibray.reporting.wording import held_out_text
 from calibray.result.held_out import Model
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
-from calibray.result.wording import held_out_text
 from calibray.scenes import Scene, Triangles, read_scene, read_triangles
 from calibray.support import figure_style as style
 from calibray.support.output_files import check_file, check_outputs, write_text
@@ -49,9 +49,6 @@ FILE: Final = "report.html"
 FIGURES: Final = "figures"
 WORST: Final = 10
 """Links with the largest residuals that are listed."""
-
-OUTLINED: Final = 400
-"""Most links that the map draws with an outline each."""
 
 CAPTIONS: Final = {
     "convergence": "Best RMSE over RT calls (runs of the ray tracer over all links).",
@@ -212,7 +209,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
         captions=CAPTIONS,
         worst=_worst(result, data.links),
         map=layout,
-        marks=None if data.links is None or layout is None else _marks(data.links, layout),
+        marks=None if data.links is None or layout is None else marks(data.links, layout),
         rays=data.rays,
         missing=data.missing,
         triangles=data.triangles,
@@ -318,32 +315,6 @@ def _worst(result: Record, links: Survey | None) -> Table:
         marks = ("yes" if row[name] else "no" for name in ("held_out", "has_path"))
         rows.append((str(row["row"]), *group, *cells, *marks))
     return Table("", columns, tuple(rows))
-
-
-def _marks(links: Survey, layout: Plan) -> dict[str, Any]:
-    """What the map shows of links: discs at the ends with more positions, triangles at the others."""
-    residuals = links.residual_db
-    limit = ramp_limit(residuals)
-    by_rx = len(np.unique(links.rx, axis=0)) >= len(np.unique(links.tx, axis=0))
-    moving, fixed = (links.rx, links.tx) if by_rx else (links.tx, links.rx)
-    count = len(residuals)
-    position = layout.project(moving).round(1).tolist()
-    color, held_out, lost = ramp(residuals, limit), links.table["held_out"].to_numpy(bool), ~links.has_path
-    # The largest residuals are drawn last, on top.
-    order = np.argsort(np.nan_to_num(np.abs(residuals), nan=-1.0), kind="stable")
-    return {
-        "width": WIDTH,
-        "radius": 6.5 if count <= OUTLINED else 4.0 if count <= 10 * OUTLINED else 2.5,
-        "limit": f"{limit:g}",
-        "ramp": ", ".join(RAMP),
-        "ends": ("receivers", "transmitters") if by_rx else ("transmitters", "receivers"),
-        "links": [
-            (*position[link], color[link], "lost" if lost[link] else "held" if held_out[link] else "")
-            for link in order
-        ],
-        "masts": np.unique(layout.project(fixed).round(1), axis=0).tolist(),
-        "bar": layout.bar * layout.scale,
-    }
 
 
 def _commands(result: Record) -> str:

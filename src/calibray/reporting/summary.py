@@ -8,15 +8,10 @@ from typing import Final, Literal
 
 from calibray.optimizers.methods import label
 from calibray.parameters.laws import PARAMETER_BOUNDS
+from calibray.reporting.wording import block_sentence, prediction_text, scene_alone_text
 from calibray.result.record import Record
 from calibray.result.verdict import Verdict
-from calibray.result.wording import (
-    NOT_JUDGED,
-    block_sentence,
-    judgement_text,
-    prediction_text,
-    scene_alone_text,
-)
+from calibray.result.wording import NOT_JUDGED, judgement_text
 from calibray.tables.display import hertz, named
 from calibray.tables.text import rows_text
 from calibray.validation.validation import Validation

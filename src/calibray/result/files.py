@@ -34,12 +34,12 @@ from calibray.support.messages import shortened
 from calibray.support.output_files import (
     check_outputs,
     check_unchanged,
-    csv_text,
     exists,
     file_digest,
     is_unchanged_output,
     write_text,
 )
+from calibray.support.output_tables import csv_text
 from calibray.support.strict_models import Section
 
 VERSION: Final = 1

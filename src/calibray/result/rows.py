@@ -9,7 +9,8 @@ import numpy as np
 import pandas as pd
 
 from calibray.errors import InputError
-from calibray.support.output_files import exists, without_formula_mark
+from calibray.support.output_files import exists
+from calibray.support.output_tables import without_formula_mark
 
 LINKS: Final = {
     "row": "i", "measured_db": "f", "before_db": "f", "after_db": "f", "log_distance_db": "f", "has_path": "b",

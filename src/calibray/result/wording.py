@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
-
-from calibray.result.held_out import WITHOUT_MATERIALS, HeldOutErrors, Judgement, Model
+from calibray.result.held_out import WITHOUT_MATERIALS, Judgement, Model
 from calibray.result.record import Record
 from calibray.result.remark import Remark, RemarkKind
 from calibray.result.verdict import Cause, Interval, Reason, ReasonKind
@@ -15,9 +13,6 @@ from calibray.support.messages import percent
 
 MOST_ODDS: Final = 1000.0
 """Largest odds that are reported as a number."""
-
-SCENE_ALONE_DB: Final = 0.05
-"""Difference between the exported scene and the predictions that is not reported."""
 
 SHOWN_PIECES: Final = 3
 """Most pieces of an interval that are listed one by one."""
@@ -324,76 +319,6 @@ def chosen_model_text(record: Record) -> str:
         f"On held-out links the prediction model {str(model.name)!r} has an RMSE of {model.residual_db:.2f} dB, the "
         f"calibrated model {calibrated_db:.2f} dB."
     )
-
-
-def prediction_text(record: Record) -> str:
-    """What predictions use."""
-    model = record.prediction.model
-    if model.parameters is None:
-        source = "no materials" if model.name == Model.OBSTRUCTION else "no scene"
-    elif model.parameters == record.parameters:
-        source = "the calibrated materials"
-    else:
-        source = (
-            "other values than the calibrated ones"
-            if model.name != Model.INITIAL
-            else "the initial materials"
-        )
-    terms = [term.name for term in model.terms]
-    added = f" and the fitted {', '.join(terms)}" if terms else ""
-    fallback = record.prediction.fallback
-    text = f"Predictions, maps and exports use the model {str(model.name)!r}: {source}{added}."
-    if fallback is None:
-        return text
-    error = "" if fallback.residual_db is None else f", with an error of {fallback.residual_db:.1f} dB (RMS)"
-    return f"{text} Where no path leads, predictions use the log-distance model{error}, and are marked."
-
-
-def scene_alone_text(record: Record) -> str:
-    """How far the exported scene alone is from the predictions.
-
-    Returns:
-        One or two sentences; empty if the scene gives the predictions.
-    """
-    links, model = record.links, record.prediction.model
-    scene_db, predicted_db = (links[name].to_numpy(float) for name in ("scene_db", "predicted_db"))
-    both = np.isfinite(scene_db) & np.isfinite(predicted_db)
-    difference = scene_db[both] - predicted_db[both]
-    rms_db = float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
-    field = record.prediction.residual_field
-    near = (
-        ""
-        if field is None
-        else f" Within some {field.range_m:.3g} m of measured links, predictions also add what "
-        f"their residuals have in common ({field.shared_db:.2f} dB RMS), which no scene contains."
-    )
-    if rms_db < SCENE_ALONE_DB:
-        return near.lstrip()
-    missing = [*(f"the region {name}" for name in record.study.regions), *(term.name for term in model.terms)]
-    cause = ", ".join(missing) or "its ceiling"
-    if model.parameters is None:
-        return (
-            f"Predictions use the model {str(model.name)!r}, which uses no scene. The exported scene has the "
-            f"calibrated materials; its path loss differs from the predictions by {rms_db:.2f} dB (RMS over "
-            f"{len(difference)} links).{near}"
-        )
-    return (
-        f"The exported scene alone differs from the predictions by {rms_db:.2f} dB (RMS over {len(difference)} links): "
-        f"a scene cannot contain {cause}.{near}"
-    )
-
-
-def held_out_text(record: Record) -> str:
-    """How many links were held out."""
-    held_out = record.held_out
-    if held_out is None:
-        return f"{record.counts['held_out']:,} of them held out"
-    return f"{np.count_nonzero(held_out.block >= 0):,} of them held out in turn, in {len(held_out.labels)} blocks"
-
-
-def block_sentence(held_out: HeldOutErrors) -> str:
-    """How many blocks were held out."""
-    return f"{len(held_out.labels)} blocks of links were held out in turn."
 
 
 def remarks(record: Record, choice: str = "") -> tuple[str, ...]:

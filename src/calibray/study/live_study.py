@@ -15,7 +15,8 @@ from calibray.errors import InputError
 from calibray.materials import Material
 from calibray.scenes import write_scene
 from calibray.study.toml_file import study_text
-from calibray.support.output_files import check_folder, write_table, write_text
+from calibray.support.output_files import check_folder, write_text
+from calibray.support.output_tables import write_table
 
 if TYPE_CHECKING:
     from calibray.tracing.sionna.live_scene import LiveScene

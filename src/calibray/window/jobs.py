@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -28,6 +29,13 @@ from calibray.support.output_files import write_text
 FOLDER: Final = ".calibray-window"
 TAIL: Final = 16_384
 """Bytes of a log that are shown: some screens full."""
+
+
+_LINE: Final = re.compile(
+    r"(?P<name>[A-Za-z][^,/]*?)(?: (?P<done>\d+)(?:/(?P<total>\d+))?)?(?:, \d+ %)?(?:, [\d.e+-]+/s)?"
+    r", (?P<seconds>\d+) s(?:, about (?P<left>\d+) s left)?(?:, (?P<found>.+))?"
+)
+"""A line of progress in a log (`calibray.cli.progress_bars.line`)."""
 
 
 @dataclass(frozen=True)
@@ -164,3 +172,40 @@ def _tail(file: Path) -> str:
             return stream.read(TAIL).decode("utf-8", errors="replace")
     except OSError:
         return ""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of a command.
+
+    Attributes:
+        name: Its name.
+        share: How much of it is done, 0 to 1; None if unknown.
+        seconds: How long it has taken [s].
+        left: How long it takes yet [s]; None if unknown.
+        best: The best value so far, as "best RMSE 3.10 dB"; empty if it says nothing.
+    """
+
+    name: str
+    share: float | None
+    seconds: int
+    left: int | None
+    best: str
+
+
+def stages(log: str) -> list[Stage]:
+    r"""The stages that a log shows, in their order; stages of less than some seconds print no line.
+
+    Example:
+        >>> stages("tracing 3/4, 75 %, 1/s, 3 s, about 1 s left\nWritten to result")
+        [Stage(name='tracing', share=0.75, seconds=3, left=1, best='')]
+    """
+    latest: dict[str, Stage] = {}
+    for text in log.splitlines():
+        if (match := _LINE.fullmatch(text.strip())) is None:
+            continue
+        name, done, total, seconds, left, value = match.groups()
+        share = min(int(done) / int(total), 1.0) if total and int(total) else None
+        latest.pop(name, None)
+        latest[name] = Stage(name, share, int(seconds), int(left) if left else None, value or "")
+    return list(latest.values())

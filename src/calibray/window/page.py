@@ -9,7 +9,7 @@ from nicegui import events, ui
 
 from calibray.window import view_3d
 from calibray.window.desk import Desk
-from calibray.window.stages import Stage, stages
+from calibray.window.jobs import Stage, stages
 from calibray.window.steps import measurements, parameters, prediction, result, run, scene
 
 STEPS: Final = (
@@ -131,7 +131,7 @@ def activity(desk: Desk) -> None:
 def progress(shown: list[Stage]) -> None:
     """The stages of a running command: those of before, how much of the last is done, and the best value so far."""
     for stage in shown[:-1]:
-        ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.found)))).classes("quiet")
+        ui.label(" · ".join(filter(None, (stage.name, f"{stage.seconds} s", stage.best)))).classes("quiet")
     last = shown[-1] if shown else None
     share = None if last is None else last.share
     bar = ui.linear_progress(share or 0.0, show_value=False)
@@ -142,5 +142,5 @@ def progress(shown: list[Stage]) -> None:
     done = "" if share is None else f"{100 * share:.0f} %"
     left = "" if last.left is None else f"about {last.left} s left"
     ui.label(" · ".join(filter(None, (last.name, done, f"{last.seconds} s", left)))).classes("stage")
-    if last.found:
-        ui.label(last.found).classes("best")
+    if last.best:
+        ui.label(last.best).classes("best")

@@ -13,7 +13,7 @@ from calibray.support.strict_models import Text
 
 if TYPE_CHECKING:
     from calibray.engines.cluster.workers import Workers
-    from calibray.engines.external.program import Command
+    from calibray.engines.external.command import Command
     from calibray.paths import Paths
 
 
@@ -63,7 +63,8 @@ class CommandSection(EngineSection):
         workers: Workers | None,
     ) -> Command:
         """The program over a study's links; see `EngineSection.open`."""
-        from calibray.engines.external.program import Command, ExternalProgram
+        from calibray.engines.external.command import Command
+        from calibray.engines.external.program import ExternalProgram
 
         folder = study.source.resolve().parent
         program = ExternalProgram(self.command, folder, self.timeout, self.retries, self.format, self.rays)

@@ -14,7 +14,8 @@ import pandas as pd
 from calibray.errors import InputError
 from calibray.measurements import SourceTable, read_table
 from calibray.support.messages import shortened
-from calibray.support.output_files import check_file, exists, replacing, write_table, write_text
+from calibray.support.output_files import check_file, exists, replacing, write_text
+from calibray.support.output_tables import write_table
 
 LARGEST_JSON: Final = 2**26
 """Largest JSON file [bytes]; in memory, its numbers take some twenty times as much."""

@@ -10,7 +10,7 @@ import pandas as pd
 from nicegui import ui
 
 from calibray.errors import InputError
-from calibray.support.output_files import write_table
+from calibray.support.output_tables import write_table
 from calibray.window.desk import Desk
 
 PLACE, PREDICTED = "place.csv", "place-predicted.csv"

@@ -1,0 +1,159 @@
+"""Accuracy on held-out links, chosen by a filter or in blocks, and the prediction model that they choose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.fitting.problem import Problem
+from calibray.fitting.search import Trail
+from calibray.measurements import Measurements
+from calibray.result.held_out import Model
+from calibray.result.record import Accuracy
+from calibray.validation.baselines import has_obstruction, obstructed, without_scene
+from calibray.validation.choice import HeldOutResiduals
+from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
+from calibray.validation.observables import held_out_gaps, observable_errors
+from calibray.validation.validate import DEFAULT_BLOCKS
+from calibray.validation.validation import Validation
+from calibray.validation.variants import add_nuisance, initial_objective
+
+FEWEST_HELD_OUT: Final = 8
+"""Held-out links from which a standard deviation of residuals is computed; with fewer, that of the fit is used."""
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """Path loss at all links by each model [links], [dB].
+
+    Attributes:
+        initial: Initial materials, no nuisance.
+        nuisance_only: Initial materials with fitted nuisances.
+        calibrated: Calibrated materials with fitted nuisances.
+        log_distance: The log-distance model.
+    """
+
+    initial: NDArray[np.float64]
+    nuisance_only: NDArray[np.float64]
+    calibrated: NDArray[np.float64]
+    log_distance: NDArray[np.float64]
+
+
+def rmse_of(problem: Problem, model: NDArray[np.float64], mask: NDArray[np.bool_]) -> float:
+    """Weighted RMSE of modelled path loss [L] over a mask [L], [dB]."""
+    weight = problem.setup.links.weight[mask]
+    return float(np.sqrt(np.average((model - problem.objective.measured)[mask] ** 2, weights=weight)))
+
+
+def on_held_out_links(
+    problem: Problem, trail: Trail, models: Models
+) -> tuple[Accuracy, str, HeldOutResiduals]:
+    """Accuracy on the links that a filter holds out, the model that they choose, and its residuals."""
+    objective, links = problem.objective, problem.setup.links
+    fitted = bool(objective.nuisance.terms)
+    reached = np.isfinite(problem.before) & np.isfinite(trail.best_modelled)
+    judged = problem.setup.held_out & (reached | (objective.ceiling_db is not None))
+    if links.censored is not None:
+        judged &= ~links.censored
+    errors = (models.calibrated - objective.measured)[judged]
+    judgement = None
+    if judged.any():
+        baselines = {
+            "the initial materials with fitted nuisances"
+            if fitted
+            else "the initial materials": models.nuisance_only,
+            "a log-distance model": models.log_distance,
+        }
+        others = {name: (model - objective.measured)[judged] for name, model in baselines.items()}
+        judgement = compare(errors, others, links.rx[judged])
+        # No link has a residual in all models.
+        judgement = judgement if judgement.links else None
+    name, residuals = _choice(problem, trail, models, judged)
+
+    def rmse(model: NDArray[np.float64]) -> float | None:
+        return rmse_of(problem, model, judged) if judged.any() else None
+
+    accuracy = Accuracy(
+        holdout_rmse_db=rmse(models.calibrated),
+        initial_holdout_rmse_db=rmse(models.initial),
+        nuisance_only_holdout_rmse_db=rmse(models.nuisance_only) if fitted else None,
+        log_distance_holdout_rmse_db=rmse(models.log_distance),
+        judgement=judgement,
+        observables=observable_errors(held_out_gaps(problem, trail.best, judged), problem.setup.study),
+    )
+    return accuracy, name, residuals
+
+
+def _choice(
+    problem: Problem, trail: Trail, models: Models, judged: NDArray[np.bool_]
+) -> tuple[str, HeldOutResiduals]:
+    """The model that held-out links choose, and its residuals there; the calibrated model if they are too few."""
+    objective, setup = problem.objective, problem.setup
+    modelled = {
+        Model.INITIAL: add_nuisance(initial_objective(objective, setup), problem.before),
+        Model.CALIBRATED: models.calibrated,
+        Model.LOG_DISTANCE: models.log_distance,
+    }
+    if has_obstruction(setup.links):
+        known_db = without_scene(setup.study, setup.links)
+        modelled[Model.OBSTRUCTION] = obstructed(setup.links, objective, known_db)
+    errors: dict[str, NDArray[np.float64]] = {
+        name: (path_loss_db - objective.measured)[judged] for name, path_loss_db in modelled.items()
+    }
+    finite = np.isfinite(np.stack(list(errors.values()))).all(axis=0)
+    errors, count = {name: each[finite] for name, each in errors.items()}, int(finite.sum())
+    if count >= FEWEST_HELD_OUT:
+        name = choose(errors, setup.links.rx[judged][finite])
+        rms_db, basis = float(np.sqrt(np.mean(errors[name] ** 2))), f"errors of {count} links held out"
+        basis = basis if name == Model.CALIBRATED else f"{name}, {basis}"
+        position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
+        block = spatial_blocks(position[:, 3:5], DEFAULT_BLOCKS)
+        levels = two_levels(errors[name], block, position)
+        return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
+    rms_db = None
+    if problem.freedom >= 1:
+        rms_db = float(trail.best_rmse_db * np.sqrt(objective.num_counted / problem.freedom))
+    basis = f"errors of {objective.num_counted} calibration links"
+    freedom = max(objective.num_counted - len(problem.parameters), 1)
+    return Model.CALIBRATED, HeldOutResiduals(rms_db, basis, freedom, np.zeros(0))
+
+
+def log_distance_errors(
+    problem: Problem, models: Models, validation: Validation | None
+) -> tuple[NDArray[np.float64], str]:
+    """Residuals of the log-distance model on held-out links with a path [n], [dB], and what these links are."""
+    if validation is not None:
+        basis = f"errors on {len(validation.labels)} blocks held out in turn"
+        return validation.errors[Model.LOG_DISTANCE][validation.judged], basis
+    links = problem.setup.links
+    judged = problem.setup.held_out & np.isfinite(models.calibrated)
+    judged &= True if links.censored is None else ~links.censored
+    errors = (models.log_distance - problem.objective.measured)[judged]
+    return errors, f"errors of {len(errors)} links held out"
+
+
+def on_blocks(
+    validation: Validation, links: Measurements, initial_db: float | None, fitted: bool
+) -> tuple[Accuracy, str, HeldOutResiduals]:
+    """Accuracy on blocks that were held out in turn, the model that they choose, and its residuals."""
+    rmse = validation.table["rmse_db"]
+    name = validation.chosen
+    residuals = HeldOutResiduals(
+        validation.scale(name),
+        f"{name}, errors on {len(validation.labels)} blocks held out in turn",
+        int(np.count_nonzero(validation.judged)),
+        validation.errors[name][validation.judged],
+        validation.levels(name, links),
+    )
+    accuracy = Accuracy(
+        holdout_rmse_db=float(rmse[Model.CALIBRATED]),
+        initial_holdout_rmse_db=initial_db,
+        nuisance_only_holdout_rmse_db=float(rmse[Model.INITIAL]) if fitted else None,
+        log_distance_holdout_rmse_db=float(rmse[Model.LOG_DISTANCE]),
+        judgement=validation.judgement,
+        observables=validation.observables,
+    )
+    return accuracy, name, residuals
