@@ -73,7 +73,13 @@ def test_no_files_import_each_other():
 WRITERS = {"write_text", "write_bytes", "to_csv", "tofile", "savefig", "copyfile", "copy", "copytree"}
 """Methods and functions that write a file, or a CSV text."""
 
-PRIVATE = ("support/output_files.py", "engines/external/", "engines/ledger/", "scenes/shapes.py")
+PRIVATE = (
+    "support/output_files.py",
+    "support/output_tables.py",
+    "engines/external/",
+    "engines/ledger/",
+    "scenes/shapes.py",
+)
 """Where files are written otherwise: the writer itself, exchange in private folders, and SQLite."""
 
 
@@ -97,7 +103,7 @@ def foreign_writes(source: str) -> list[int]:
 
 
 def test_files_are_written_in_one_way():
-    """Everything goes through `support.output_files`: no link is followed, and no foreign file replaced."""
+    """Everything goes through `support.output_files` and `support.output_tables`: no link is followed, and no foreign file replaced."""
     written = {
         str(path.relative_to(SOURCES)): foreign_writes(path.read_text()) for path in SOURCES.rglob("*.py")
     }

@@ -13,8 +13,9 @@ from typer.testing import CliRunner
 
 from calibray import engines
 from calibray.cli.app import app
-from calibray.comparison import experiment as module
-from calibray.comparison.experiment import FIGURES, MAPPING, METHODS, run_demo, trust, write_demo
+from calibray.comparison import demo as module
+from calibray.comparison.demo import FIGURES, run_demo, write_demo
+from calibray.comparison.experiment import MAPPING, METHODS, trust
 from calibray.fitting.problem import Problem
 from calibray.scenarios import demo_study_path
 from calibray.study import Setup, Study
@@ -130,7 +131,7 @@ def test_files_exist_and_open(demo):
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("calibray.comparison.experiment.run_demo", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr("calibray.comparison.demo.run_demo", lambda *_: pytest.fail("it was run"))
     outcome = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "file" / "demo")])
     assert outcome.exit_code == 2
     assert "output folder" in outcome.stderr

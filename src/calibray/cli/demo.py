@@ -31,7 +31,7 @@ def demo(
     from calibray.cli.progress_bars import progress_bars
 
     with progress_bars(log()) as progress:
-        from calibray.comparison.experiment import FILES, run_demo, write_demo
+        from calibray.comparison.demo import FILES, run_demo, write_demo
         from calibray.support.output_files import check_outputs
         from calibray.tables.text import render
 
