@@ -103,7 +103,7 @@ def foreign_writes(source: str) -> list[int]:
 
 
 def test_files_are_written_in_one_way():
-    """Everything goes through `support.output_files` and `output_tables`: no link followed, no foreign file replaced."""
+    """All goes through `support.output_files` and `output_tables`: no link followed, no foreign file replaced."""
     written = {
         str(path.relative_to(SOURCES)): foreign_writes(path.read_text()) for path in SOURCES.rglob("*.py")
     }
