@@ -226,24 +226,26 @@ def _block(corner: np.ndarray, size: np.ndarray, random: np.random.Generator, fi
 
 
 def _links(count: int, streets: Streets, random: np.random.Generator) -> pd.DataFrame:
-    stations = np.column_stack([_in_streets(3, streets, random), random.uniform(3, 20, 3)])
+    stations = np.column_stack([_in_streets(3, streets, random)[0], random.uniform(3, 20, 3)])
     stations = stations[: random.integers(1, 4)]
-    place = _in_streets(count, streets, random)
+    place, street = _in_streets(count, streets, random)
     near = np.linalg.norm(place[:, None] - stations[None, :, :2], axis=2)
     tx = stations[near.argmin(axis=1)]
     table = np.column_stack([tx, place, np.full(count, 1.5)]).round(2)
-    return pd.DataFrame(table, columns=["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]).assign(loss_db=100.0)
+    links = pd.DataFrame(table, columns=["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"])
+    return links.assign(loss_db=100.0, street=street)
 
 
-def _in_streets(count: int, streets: Streets, random: np.random.Generator) -> np.ndarray:
-    """Places in the streets [count, 2], [m]."""
+def _in_streets(count: int, streets: Streets, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Places in the streets [count, 2], [m], and the names of these streets [count]."""
     blocks, pitch, extent = streets.blocks, streets.pitch, streets.extent
     along = random.random(count) < 0.5
     line = np.where(along, random.integers(0, blocks[0] + 1, count), random.integers(0, blocks[1] + 1, count))
     across = line * np.where(along, pitch[0], pitch[1]) + streets.width * random.uniform(0.15, 0.85, count)
     other = random.uniform(0, 1, count) * np.where(along, extent[1], extent[0])
     found = np.where(along[:, None], np.stack([across, other], 1), np.stack([other, across], 1))
-    return found - extent / 2
+    names = np.array([f"{'x' if north else 'y'}{number}" for north, number in zip(along, line, strict=True)])
+    return found - extent / 2, names
 
 
 def _constants(material: Material) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
-from calibray.measurements import Measurements
 from calibray.result.held_out import Model
 from calibray.result.record import Accuracy
 from calibray.validation.baselines import has_obstruction, obstructed, without_scene
@@ -136,17 +135,21 @@ def log_distance_errors(
 
 
 def on_blocks(
-    validation: Validation, links: Measurements, initial_db: float | None, fitted: bool
+    validation: Validation, problem: Problem, initial_db: float | None, fitted: bool
 ) -> tuple[Accuracy, str, HeldOutResiduals]:
     """Accuracy on blocks that were held out in turn, the model that they choose, and its residuals."""
     rmse = validation.table["rmse_db"]
-    name = validation.chosen
+    name, judged = validation.chosen, validation.judged
+    levels = validation.levels(name, problem.setup.links)
+    if levels is not None:
+        spread_db = problem.objective.nuisance.new_group_spread(validation.block)[judged]
+        levels = replace(levels, groups_db=float(np.sqrt(np.mean(spread_db**2))))
     residuals = HeldOutResiduals(
         validation.scale(name),
         f"{name}, errors on {len(validation.labels)} blocks held out in turn",
-        int(np.count_nonzero(validation.judged)),
-        validation.errors[name][validation.judged],
-        validation.levels(name, links),
+        int(np.count_nonzero(judged)),
+        validation.errors[name][judged],
+        levels,
     )
     accuracy = Accuracy(
         holdout_rmse_db=float(rmse[Model.CALIBRATED]),

@@ -131,7 +131,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         accuracy, name, residuals = on_held_out_links(problem, trail, models)
     else:
         accuracy, name, residuals = on_blocks(
-            validation, links, rmse_of(problem, models.initial, validation.judged), fitted
+            validation, problem, rmse_of(problem, models.initial, validation.judged), fitted
         )
     chosen = fit_prediction_model(problem, trail, name, residuals)
     table = table.assign(predicted_db=chosen.path_loss_db, scene_db=chosen.scene_db, basis=str(name))
@@ -232,17 +232,14 @@ def _residual_field(
 def _nuisance(problem: Problem, coefficients: NDArray[np.float64]) -> Nuisance:
     """Coefficients by term and group, and the groups whose offset no calibration link determines."""
     objective = problem.objective
-    by_term: dict[str, dict[str, float]] = {}
-    without_path: list[str] = []
-    first = 0
-    for term in objective.nuisance.terms:
-        last = first + len(term.labels)
-        determined = objective.determined[first:last]
-        values = zip(term.labels, coefficients[first:last].tolist(), determined, strict=True)
-        by_term[term.name] = {label: value for label, value, is_determined in values if is_determined}
-        if term.name == OFFSET:
-            without_path += [label for label in term.labels if label not in by_term[term.name]]
-        first = last
+    by_term = objective.nuisance.by_term(coefficients, objective.determined)
+    without_path = [
+        label
+        for term in objective.nuisance.terms
+        if term.name == OFFSET
+        for label in term.labels
+        if label not in by_term[term.name]
+    ]
     centres = {term.name: term.centre for term in objective.nuisance.terms if term.centre}
     return Nuisance(by_term, centres, tuple(without_path))
 

@@ -31,6 +31,9 @@ UNKNOWN_DB: Final = 10.0
 """Assumed standard deviation between groups if only one is measured [dB per unit of the column]; wide, because one
 group says nothing about the spread."""
 
+START_SPREAD: Final = 6.0
+"""Standard deviation between the groups of a random effect before it is estimated [dB per unit of the column]."""
+
 UNBOUNDED: Final = (-np.inf, np.inf)
 
 
@@ -49,6 +52,7 @@ class Term:
         prior: Standard deviation of the coefficients' Gaussian prior around zero, in the same unit; +inf for none.
         centre: Value subtracted from the column: the mean of log10(distance / 1 m) over the links that the term was
             made for, else 0.
+        around: Name of the term with the mean that these coefficients deviate from, for a random effect; else "".
     """
 
     name: str
@@ -59,6 +63,7 @@ class Term:
     bounds: tuple[float, float] = UNBOUNDED
     prior: float = np.inf
     centre: float = 0.0
+    around: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -141,6 +146,22 @@ def make_term(
         groups = tuple(map(str, distinct))
     prior = np.inf if prior is None else float(prior)
     return Term(name, by, value - centre, group, groups, (float(lower), float(upper)), prior, centre)
+
+
+def random_effect(links: Measurements, name: str, by: str, labels: ArrayLike) -> tuple[Term, Term]:
+    """Make the terms of a random effect: a coefficient that all links share, and the deviation of each group from it.
+
+    Args:
+        links: The links.
+        name: Name of the term.
+        by: The column, as for `make_term`.
+        labels: Labels of the links' groups [L].
+
+    Returns:
+        The shared coefficient, and the deviations, whose prior `estimate_noise` replaces by the estimated spread.
+    """
+    deviations = make_term(links, f"{name}, deviation", by, labels=labels, prior=START_SPREAD)
+    return make_term(links, name, by), replace(deviations, around=name)
 
 
 def transmitters(links: Measurements) -> NDArray[np.str_]:
@@ -261,6 +282,8 @@ class Nuisance:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Fill in the coefficients of unmeasured groups: the mean over the measured groups of the term.
 
+        Deviations of a random effect have the mean 0 and its spread.
+
         Args:
             coefficients: Coefficients fitted to some links [n, q].
             counted: Mask of these links [L].
@@ -275,12 +298,50 @@ class Nuisance:
             columns = np.arange(first, first + len(term.labels))
             first += len(term.labels)
             fitted, missing = columns[measured[columns]], columns[~measured[columns]]
-            if len(fitted) and len(missing):
+            if term.around:
+                filled[:, missing], deviation[missing] = 0.0, term.prior
+            elif len(fitted) and len(missing):
                 filled[:, missing] = coefficients[:, fitted].mean(axis=1, keepdims=True)
                 # Variance between groups, plus that of their mean.
                 spread = np.std(coefficients[0, fitted], ddof=1) if len(fitted) > 1 else UNKNOWN_DB
                 deviation[missing] = spread * np.sqrt(1 + 1 / len(fitted))
         return filled, deviation
+
+    def new_group_spread(self, block: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Standard deviation of random effects at links whose group lies in one block, once that is left out [L], [dB].
+
+        Args:
+            block: Block of every link [L]; -1 for a link that is not used.
+        """
+        variance = np.zeros(self.num_links)
+        for term in self.terms:
+            pairs = np.unique(np.stack([term.group, block])[:, block >= 0], axis=1)
+            alone = np.bincount(pairs[0], minlength=len(term.labels)) == 1
+            variance += (
+                np.where(alone[term.group], (term.value * term.prior) ** 2, 0.0) if term.around else 0.0
+            )
+        return np.sqrt(variance)
+
+    def by_term(
+        self, coefficients: NDArray[np.float64], determined: NDArray[np.bool_]
+    ) -> dict[str, dict[str, float]]:
+        """Determined coefficients by term and group; a random effect counts as one term, with its groups' sums.
+
+        Args:
+            coefficients: The coefficients [q].
+            determined: Mask of those that the links determine [q].
+        """
+        found: dict[str, dict[str, float]] = {}
+        first = 0
+        for term in self.terms:
+            last = first + len(term.labels)
+            shared = found.get(term.around, {}).get("", 0.0)
+            values = zip(term.labels, coefficients[first:last].tolist(), determined[first:last], strict=True)
+            found[term.around or term.name] = {
+                label: shared + value for label, value, known in values if known
+            }
+            first = last
+        return found
 
     def _per_column(self, values: list[float]) -> NDArray[np.float64]:
         return np.repeat(np.array(values, dtype=np.float64), [len(term.labels) for term in self.terms])

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.errors import InputError
+from calibray.fitting.group_spread import group_spread
+from calibray.fitting.nuisance import Nuisance
 from calibray.fitting.objective import Objective
 from calibray.fitting.observed import with_errors
 from calibray.fitting.problem import Problem
@@ -37,6 +39,9 @@ TOLERANCE: Final = 0.02
 
 LEAST_NOISE_DB: Final = 1e-3
 """Lower limit of the noise estimate, so that data without noise keep a finite weight of the priors [dB]."""
+
+LEAST_SPREAD_DB: Final = 0.05
+"""Lower limit of the spread between groups, so that the prior stays finite [dB per unit of the column]."""
 
 SEARCHES: Final = 32
 """Local searches of the first fit; later fits continue from its minima."""
@@ -88,21 +93,23 @@ def _determines_as_much(problem: Problem, selected: Objective) -> bool:
 
 
 def estimate_noise(problem: Problem, progress: Progress | None = None) -> Problem:
-    """Estimate the noise level that scales the priors, unless the study declares it.
+    """Estimate the noise level that scales the priors, unless the study declares it, and the spread of random effects.
 
     Args:
         problem: The problem.
         progress: Called with the stage "estimating noise" after every estimate.
 
     Returns:
-        The problem with the standard deviation of a link's error in its objective; unchanged without priors.
+        The problem with the standard deviation of a link's error and the spreads in its objective; unchanged without
+        priors.
 
     Raises:
         InputError: The noise is not declared and cannot be estimated.
     """
     study = problem.setup.study
     stated = study.noise.std_db is not None or study.links.std is not None
-    if not problem.has_priors or (stated and not problem.observed):
+    random_effects = any(term.around for term in problem.objective.nuisance.terms)
+    if not problem.has_priors or (stated and not problem.observed and not random_effects):
         return problem
     if not stated and (not problem.differentiable or problem.freedom < 1):
         cause = (
@@ -123,14 +130,57 @@ def estimate_noise(problem: Problem, progress: Progress | None = None) -> Proble
         if progress is not None:
             progress("estimating noise", turn + 1, NOISE_ESTIMATES)
         before, links, errors = noise_db, problem.objective.num_counted, problem.observed
-        problem = with_estimated_errors(problem, fit.best.x)
+        old_spreads, point = problem.objective.nuisance.prior, fit.best.x
+        problem = with_estimated_errors(problem, point)
+        within_db = None
+        if random_effects:
+            problem, within_db = with_estimated_spreads(problem, point)
         if not stated:
-            noise_db = float(problem.squares(fit.best.x[None]).rmse_db[0] * np.sqrt(links / problem.freedom))
+            in_sample = float(
+                problem.squares(point[None]).rmse_db[0] * np.sqrt(links / max(problem.freedom, 1))
+            )
+            noise_db = in_sample if within_db is None else within_db
         changes = [abs(noise_db / before - 1)]
+        spreads = problem.objective.nuisance.prior
+        changes += np.abs(spreads[spreads < np.inf] / old_spreads[spreads < np.inf] - 1).tolist()
         changes += [abs(each.std / old.std - 1) for each, old in zip(problem.observed, errors, strict=True)]
         if max(changes) <= TOLERANCE:
             break
     return _with_noise(problem, noise_db)
+
+
+def with_estimated_spreads(problem: Problem, point: NDArray[np.float64]) -> tuple[Problem, float]:
+    """The problem with the spreads of its random effects estimated at a point of the search space [d].
+
+    Args:
+        problem: The problem.
+        point: The point.
+
+    Returns:
+        The problem, and the standard deviation of a link's error within the groups of the last effect [dB].
+    """
+    objective = problem.objective
+    counted = np.flatnonzero(objective.weight > 0)
+    scale = np.sqrt(objective.weight[counted] * len(counted) / objective.weight.sum())
+    terms, within_db = list(objective.nuisance.terms), 0.0
+    for index, term in enumerate(terms):
+        if not term.around:
+            continue
+        others = Nuisance(len(objective.weight), (*terms[:index], *terms[index + 1 :]))
+        without = replace(problem, objective=replace(objective, nuisance=others))
+        evaluation = without.evaluate(point[None], derivatives=problem.differentiable)
+        columns = [others.design[counted].toarray() * scale[:, None]]
+        if evaluation.jacobian is not None:
+            columns.append(evaluation.jacobian[0][: len(counted)])
+        between, within_db = group_spread(
+            evaluation.residuals[0][: len(counted)],
+            np.hstack(columns),
+            term.value[counted] * scale,
+            term.group[counted],
+        )
+        terms[index] = replace(term, prior=max(between, LEAST_SPREAD_DB))
+    nuisance = Nuisance(len(objective.weight), tuple(terms))
+    return replace(problem, objective=replace(objective, nuisance=nuisance)), within_db
 
 
 def with_estimated_errors(problem: Problem, point: NDArray[np.float64]) -> Problem:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibray.engines.protocol import PATH_LOSS, Chunked, Differentiable, Engine, Observable, Reduced
 from calibray.errors import InputError
-from calibray.fitting.nuisance import OFFSET, Nuisance, make_term
+from calibray.fitting.nuisance import OFFSET, Nuisance, make_term, random_effect
 from calibray.fitting.objective import Objective, make_objective
 from calibray.fitting.observed import Observed, observed
 from calibray.fitting.sums_of_squares import Share, rows, total
@@ -325,6 +325,9 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
         )
     for name, term in study.nuisance.items():
         labels = None if term.per is None else links.table.labels(term.per)
+        if term.prior == "auto" and labels is not None:
+            terms += random_effect(links, name, term.by, labels)
+            continue
         terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
     return Nuisance(len(links), tuple(terms))
 

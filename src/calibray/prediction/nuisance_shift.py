@@ -27,12 +27,14 @@ class TermAtLinks:
         column: Its column [links].
         labels: Labels of the links' groups [links]; None for a term without groups.
         coefficients: Coefficient by group, [dB] per unit of the column.
+        spread_db: Standard deviation between groups in the same unit; that of the coefficients if None.
     """
 
     name: str
     column: NDArray[np.float64]
     labels: NDArray[np.str_] | None
     coefficients: dict[str, float]
+    spread_db: float | None
 
 
 class Shift(NamedTuple):
@@ -67,7 +69,8 @@ def model_terms(model: PredictionModel, links: Measurements) -> Iterator[TermAtL
             labels = links.group
         else:
             labels = links.table.labels(term.per) if term.per else None
-        yield TermAtLinks(term.name, _column(links, term.by, term.centre), labels, term.coefficients)
+        column = _column(links, term.by, term.centre)
+        yield TermAtLinks(term.name, column, labels, term.coefficients, term.spread_db)
 
 
 def nuisance_shift(
@@ -115,7 +118,9 @@ def nuisance_shift(
             )
         mean = coefficients.mean(axis=1, keepdims=True)
         value += term.column * np.where(group >= 0, coefficients[:, group], mean)
-        spread = np.std(best, ddof=1) if len(best) > 1 else UNKNOWN_DB
+        spread = term.spread_db
+        if spread is None:
+            spread = np.std(best, ddof=1) if len(best) > 1 else UNKNOWN_DB
         variance += np.where(group >= 0, 0.0, (term.column * spread) ** 2 * (1 + 1 / len(best)))
     return Shift(value, np.sqrt(variance))
 

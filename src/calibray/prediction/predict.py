@@ -252,7 +252,8 @@ def _residual_db(result: Record, links: Measurements) -> NDArray[np.float64]:
     """Standard deviation of the prediction model's errors at new links [links], [dB].
 
     Beyond the distance that held-out links kept from the others, the error between blocks counts up to twice: a place
-    that far away differs from the blocks as these differ from each other.
+    that far away differs from the blocks as these differ from each other. What random effects add to these errors is
+    taken out, because `nuisance_shift` adds their spread where a link's group is new.
     """
     model = result.prediction.model
     if model.blocks is None or not set(POSITION_COLUMNS) <= set(result.links):
@@ -261,7 +262,8 @@ def _residual_db(result: Record, links: Measurements) -> NDArray[np.float64]:
     measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
     distance = KDTree(measured).query(np.hstack([links.tx, links.rx]))[0]
     beyond = np.clip(distance / max(model.blocks.reach_m, 1e-9) - 1.0, 0.0, 1.0)
-    return np.sqrt(model.blocks.within_db**2 + model.blocks.between_db**2 * (1.0 + beyond))
+    within, between = model.blocks.within_db**2, model.blocks.between_db**2
+    return np.sqrt(np.maximum(within + between * (1.0 + beyond) - model.blocks.groups_db**2, within))
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:

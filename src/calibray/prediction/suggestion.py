@@ -279,20 +279,19 @@ class _ReplayedDraws:
         if term.name == OFFSET:
             labels = links.group if study.offset is not None and study.offset.per is not None else None
         else:
-            per = study.nuisance[term.name].per
-            labels = None if per is None else links.table.labels(per)
+            per = study.nuisance[term.around or term.name].per
+            labels = None if per is None or term.labels == ("",) else links.table.labels(per)
         coefficients = self.result.nuisance.coefficients.get(term.name, {})
         at_links = term.at(links, labels)
-        # A group without measurements gets the mean of the others.
-        share = np.where(
-            at_links.group[:, None] < 0, 1.0 / len(term.labels), np.eye(len(term.labels))[at_links.group]
-        )
+        # A group without measurements gets the mean of the others, or deviates from it as they do.
+        others = 0.0 if term.around else 1.0 / len(term.labels)
+        share = np.where(at_links.group[:, None] < 0, others, np.eye(len(term.labels))[at_links.group])
         new = np.flatnonzero(at_links.group < 0)
         new_labels = np.asarray([] if labels is None else labels)[new]
         new_groups, group = np.unique(new_labels, return_inverse=True)
         unknown = np.zeros((len(links), len(new_groups)))
         spread = np.std(list(coefficients.values()), ddof=1) if len(coefficients) > 1 else UNKNOWN_DB
-        unknown[new, group] = at_links.value[new] * spread
+        unknown[new, group] = at_links.value[new] * (term.prior if term.around else spread)
         return share * at_links.value[:, None], unknown
 
     def _correlation(self) -> Correlation | None:

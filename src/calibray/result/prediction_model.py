@@ -19,6 +19,8 @@ class FittedTerm:
         per: Its groups: "offset" for those of the study's offset, "transmitter", a column, or "" for none.
         coefficients: Coefficient by group, [dB] per unit of the column; groups without data have the others' mean.
         centre: What is subtracted from the column.
+        spread_db: Standard deviation between groups of a random effect, [dB] per unit of the column; None for the
+            standard deviation of the coefficients.
     """
 
     name: str
@@ -26,6 +28,7 @@ class FittedTerm:
     per: str
     coefficients: dict[str, float]
     centre: float = 0.0
+    spread_db: float | None = None
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,14 @@ class BlockErrors:
         between_db: Standard deviation of the error that a new block's links have in common [dB].
         freedom: Degrees of freedom of both together.
         reach_m: Distance to the nearest calibration link that nine of ten held-out links kept [m].
+        groups_db: Root mean square of what random effects of groups without other links add to these errors [dB].
     """
 
     within_db: float
     between_db: float
     freedom: float
     reach_m: float
+    groups_db: float = 0.0
 
 
 @dataclass(frozen=True)

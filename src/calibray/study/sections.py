@@ -418,13 +418,14 @@ class NuisanceTerm:
             "walls_crossed", "obstruction_m", "knife_edge_db"), or a numeric column of the links.
         per: Columns whose joined labels are the groups; one coefficient for all links if there are none.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" around the
+            mean of the groups, its standard deviation estimated.
     """
 
     by: str
     per: tuple[str, ...]
     bounds: tuple[float, float] | None
-    prior: float | None
+    prior: float | Literal["auto"] | None
 
 
 class OffsetSection(Section):
@@ -456,15 +457,22 @@ class NuisanceSection(Section):
             "walls_crossed", "obstruction_m", "knife_edge_db"), or a numeric column of the links.
         per: Column of group labels; one coefficient for all links if absent.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
-        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent.
+        prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior
+            around the mean of the groups, whose standard deviation is estimated (a random effect).
     """
 
     by: Text
     per: Text | None = None
     bounds: tuple[float, float] | None = None
-    prior: Annotated[float, Field(gt=0)] | None = None
+    prior: Literal["auto"] | Annotated[float, Field(gt=0)] | None = None
 
     _ordered = field_validator("bounds")(_ordered)
+
+    @model_validator(mode="after")
+    def _random_effect(self) -> Self:
+        if self.prior == "auto" and (self.per is None or self.bounds is not None):
+            raise InputError("prior = 'auto' needs per, the column of the groups, and no bounds")
+        return self
 
     def term(self) -> NuisanceTerm:
         """The nuisance term."""

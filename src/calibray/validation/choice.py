@@ -168,20 +168,16 @@ def fitted_terms(
         The terms. Groups whose coefficient no link determines are left out.
     """
     coefficients = objective.coefficients(path_loss_db[None])[0]
-    terms, first = [], 0
-    for term in objective.nuisance.terms:
-        last = first + len(term.labels)
-        rows = zip(
-            term.labels, coefficients[first:last].tolist(), objective.determined[first:last], strict=True
-        )
-        by_group = {label: value for label, value, determined in rows if determined}
-        first = last
+    found, terms = objective.nuisance.by_term(coefficients, objective.determined), []
+    spreads = {term.around: term.prior for term in objective.nuisance.terms if term.around}
+    grouped = {term.around or term.name: term for term in objective.nuisance.terms}
+    for name, term in grouped.items():
         if term.labels == ("",):
             per = ""
-        elif term.name == TX_OFFSET:
+        elif name == TX_OFFSET:
             per = "transmitter"
         else:
-            per = OFFSET if term.name == OFFSET else str(study.nuisance[term.name].per)
-        if by_group:
-            terms.append(FittedTerm(term.name, term.by, per, by_group, term.centre))
+            per = OFFSET if name == OFFSET else str(study.nuisance[name].per)
+        if found[name]:
+            terms.append(FittedTerm(name, term.by, per, found[name], term.centre, spreads.get(name)))
     return tuple(terms)

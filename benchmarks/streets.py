@@ -1,0 +1,127 @@
+"""Planted differences between streets: do intervals of predictions hold links of streets that were never measured?
+
+    python benchmarks/streets.py --districts development --repetitions 2
+    python benchmarks/streets.py --districts judging --repetitions 5
+
+Links out of sight lose 5 dB more than the district's materials give, and in every street further dB of their own, drawn
+with a standard deviation of 6 dB; the noise is 3 dB. Two streets are kept apart. Two studies of the others are
+calibrated: one that states a random effect of the streets (`prior = "auto"`) and holds out street by street, and one
+that states nothing and holds out four blocks. The table says how many links kept apart lie in the 90 % intervals, how
+wide these are, and how the RMSE of the predictions compares with that of the log-distance model with obstruction, which
+knows what blocks the direct line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import calibray as cb
+import districts
+import misfit_worlds
+from calibray.fitting.problem import Problem
+from calibray.study import Study
+from calibray.validation.baselines import obstructed, without_scene
+from districts import District
+
+NOISE_DB, LOSS_DB, SPREAD_DB = 3.0, 5.0, 6.0
+APART, LEAST = 2, 3
+"""Streets kept apart, and the least number of other streets."""
+CHEAP = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
+"""Errors as planted: draws of other errors would only take time, for held-out links give the intervals."""
+STUDIES: dict[str, dict[str, Any]] = {
+    "random effect, streets held out": {
+        "nuisance": {"street": {"by": "out_of_sight", "per": "street", "prior": "auto"}},
+        "holdout": {"by": "street"},
+    },
+    "nothing stated, four blocks held out": {"holdout": {"blocks": 4}},
+}
+
+
+def repetition(district: District, seed: int) -> list[dict[str, Any]]:
+    """Plant one truth, and predict the streets kept apart with each study."""
+    problem = district.problem
+    links = problem.setup.with_obstruction().links
+    street, blocked = links.frame["street"].to_numpy(str), links.table.numbers("out_of_sight")
+    random = np.random.default_rng([seed, len(links), 29])
+    names, index = np.unique(street, return_inverse=True)
+    if len(names) < APART + LEAST:
+        return []
+    effect = LOSS_DB + SPREAD_DB * random.standard_normal(len(names))
+    loss = district.path_loss(
+        problem.parameters.from_search(random.uniform(*problem.parameters.search_bounds))
+    )
+    loss = loss + blocked * effect[index] + NOISE_DB * random.standard_normal(len(loss))
+    apart = np.isin(street, random.choice(names, APART, replace=False))
+    table = problem.setup.links.frame.assign(loss_db=loss)
+    rows = []
+    for name, sections in STUDIES.items():
+        content = problem.setup.study.content()
+        file = problem.setup.study.path.parent / "planted.csv"
+        table[~apart].to_csv(file, index=False)
+        content |= {"noise": CHEAP, **sections}
+        content["links"]["file"] = file.name
+        result = cb.calibrate(Study.from_content(content, problem.setup.study.path))
+        found = result.predict_interval(table[apart].reset_index(drop=True))
+        measured = loss[apart]
+        rows.append({
+            "study": name,
+            "inside": (found["lower_db"] <= measured) & (measured <= found["upper_db"]),
+            "blocked": blocked[apart] > 0,
+            "half": (found["upper_db"] - found["lower_db"]) / 2,
+            "square": (found["path_loss_db"] - measured) ** 2,
+            "rival": (_rival(problem, loss, apart) - measured) ** 2,
+        })  # fmt: skip
+    return rows
+
+
+def _rival(problem: Problem, loss: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """Path loss at the links kept apart by the log-distance model with obstruction, fitted to the others [dB]."""
+    links = problem.setup.with_obstruction().links
+    objective = replace(
+        problem.objective, measured=loss, weight=np.where(apart, 0.0, problem.objective.weight)
+    )
+    return obstructed(links, objective, without_scene(problem.setup.study, links))[apart]
+
+
+def main() -> None:
+    """Run the repetitions and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--districts", default="development", help="names, or development or judging")
+    parser.add_argument("--repetitions", type=int, default=2)
+    given = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in misfit_worlds.named(given.districts, Path(folder)):
+            district = districts.make(name, Path(folder))
+            for seed in range(given.repetitions):
+                found = repetition(district, seed)
+                rows += found
+                shares = ", ".join(f"{np.mean(each['inside']):.2f}" for each in found)
+                print(f"{name}, {seed}: {shares}", file=sys.stderr)
+    summary = []
+    for study in STUDIES:
+        mine = [row for row in rows if row["study"] == study]
+        inside, blocked, half, square, rival = (
+            np.concatenate([np.asarray(row[key]) for row in mine])
+            for key in ("inside", "blocked", "half", "square", "rival")
+        )
+        summary.append({
+            "study": study, "runs": len(mine), "links": len(inside), "inside": inside.mean(),
+            "inside, mean of runs": np.mean([np.mean(row["inside"]) for row in mine]),
+            "out of sight": inside[blocked].mean(), "in sight": inside[~blocked].mean(),
+            "half width, out of sight": half[blocked].mean(), "in sight, half width": half[~blocked].mean(),
+            "RMSE": np.sqrt(square.mean()), "RMSE of the rival": np.sqrt(rival.mean()),
+        })  # fmt: skip
+    print(pd.DataFrame(summary).set_index("study").T.round(2).to_string())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Random effects: a coefficient per group around a mean, with a spread that is estimated."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import planted
+from calibray.calibration.calibrate import calibrate
+from calibray.errors import InputError
+from calibray.fitting.group_spread import group_spread
+from calibray.fitting.nuisance import Nuisance, random_effect
+from calibray.fitting.objective import make_objective
+from calibray.fitting.preliminary_fits import estimate_noise
+from calibray.fitting.problem import Problem
+from calibray.measurements import Measurements
+from fitting.test_preliminary_fits import Ramp
+
+GROUPS, EACH = 40, 6
+GROUP = np.repeat(np.arange(GROUPS), EACH)
+SPREAD_DB, NOISE_DB = 6.0, 2.0
+
+
+def shifted(seed: int, spread_db: float = SPREAD_DB) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts of the groups, and errors of all links that contain them."""
+    random = np.random.default_rng(seed)
+    shift = spread_db * random.standard_normal(GROUPS)
+    return shift, shift[GROUP] + NOISE_DB * random.standard_normal(GROUPS * EACH)
+
+
+def test_restricted_likelihood_of_a_balanced_design_is_the_analysis_of_variance():
+    _, errors = shifted(1, 3.0)
+    means = errors.reshape(GROUPS, EACH).mean(axis=1)
+    within = np.sum((errors - means[GROUP]) ** 2) / (GROUPS * (EACH - 1))
+    between = means.var(ddof=1) - within / EACH
+    found = group_spread(errors, np.ones((len(errors), 1)), np.ones(len(errors)), GROUP)
+    # The ratio of variances is taken from a grid in steps of 12 %.
+    assert found.between**2 == pytest.approx(between, rel=0.08)
+    assert found.within**2 == pytest.approx(within, rel=0.01)
+
+
+def test_groups_that_do_not_differ_have_no_spread():
+    alternating = np.tile([1.0, -1.0], GROUPS * EACH // 2)
+    assert group_spread(alternating, np.ones((len(GROUP), 1)), np.ones(len(GROUP)), GROUP).between == 0
+    # Nor is there a spread left where each group has a coefficient of its own.
+    _, errors = shifted(2)
+    own = (GROUP[:, None] == np.arange(GROUPS)).astype(float)
+    assert group_spread(errors, own, np.ones(len(GROUP)), GROUP).within == pytest.approx(NOISE_DB, rel=0.2)
+
+
+def test_spread_noise_and_shrinkage_follow_from_the_data():
+    shift, errors = shifted(3)
+    way = np.random.default_rng(4).uniform(0.0, 10.0, len(GROUP))
+    place = np.column_stack([way, np.zeros((len(way), 2))])
+    links = Measurements(tx=place + 1.0, rx=place, path_loss_db=80.0 + 5.0 * way + 4.0 + errors)
+    nuisance = Nuisance(
+        len(way), random_effect(links, "street", "constant", [f"{each:02d}" for each in GROUP])
+    )
+    every = np.ones(len(way), dtype=bool)
+    engine = Ramp(way)
+    before = engine.path_loss(engine.parameters.start[None])[0]
+    study = SimpleNamespace(noise=SimpleNamespace(std_db=None), links=SimpleNamespace(std=None))
+    setup = SimpleNamespace(links=links, study=study)
+    objective = make_objective(links, every, every, nuisance=nuisance, noise_db=1.0)
+    fitted = estimate_noise(Problem(setup, engine, objective, before))  # type: ignore[arg-type]
+    spread = fitted.objective.nuisance.terms[1].prior
+    assert spread == pytest.approx(shift.std(), rel=0.12)
+    assert fitted.objective.noise_db == pytest.approx(NOISE_DB, rel=0.12)
+    coefficients = fitted.objective.coefficients((80.0 + 5.0 * way)[None])[0]
+    sums = fitted.objective.nuisance.by_term(coefficients, fitted.objective.determined)
+    # The best linear unbiased prediction of a balanced design shrinks the means of the groups.
+    means = (4.0 + errors).reshape(GROUPS, EACH).mean(axis=1)
+    share = spread**2 / (spread**2 + fitted.objective.noise_db**2 / EACH)
+    expected = means.mean() + share * (means - means.mean())
+    assert list(sums) == ["street"]
+    assert list(sums["street"].values()) == pytest.approx(expected.tolist(), abs=1e-6)
+    # A group that is left out has the mean 0 and the spread.
+    filled, deviation = fitted.objective.nuisance.filled(coefficients[None], GROUP > 0)
+    assert filled[0, 1] == 0
+    assert deviation[1] == spread
+    block = np.where(GROUP < 3, 0, 1 + GROUP % 2)
+    alone = fitted.objective.nuisance.new_group_spread(block)
+    assert alone[GROUP < 3] == pytest.approx(spread)
+    split = np.arange(len(GROUP)) % 2
+    assert not fitted.objective.nuisance.new_group_spread(split).any()
+
+
+def test_a_new_street_is_predicted_with_the_mean_and_the_spread(tmp_path):
+    street = np.array([f"s{number % 4}" for number in range(planted.LINKS)])
+    shift = {"s0": 6.0, "s1": -2.0, "s2": 1.0, "s3": 9.0}
+    table = planted.campaign(noise_db=0.5).assign(street=street)
+    table = table.assign(path_loss_db=table.path_loss_db + [shift[name] for name in street])
+    effect = {"street": {"by": "constant", "per": "street", "prior": "auto"}}
+    fixed = {
+        name: {"bounds": [value - 0.1, value + 0.1], "start": value} for name, value in planted.TRUTH.items()
+    }
+    study = planted.study(tmp_path, table, nuisance=effect, parameters=fixed)
+    result = calibrate(study)
+    (term,) = result.prediction.model.terms
+    assert term.spread_db == pytest.approx(np.std(list(shift.values()), ddof=1), rel=0.3)
+    assert result.nuisance.coefficients["street"] == pytest.approx(shift, abs=1.0)
+    known, new = table.head(1), table.head(1).assign(street="elsewhere")
+    one, other = result.predict_interval(known), result.predict_interval(new)
+    mean = np.mean(list(term.coefficients.values()))
+    assert other.path_loss_db[0] - one.path_loss_db[0] == pytest.approx(
+        mean - term.coefficients["s0"], abs=1e-6
+    )
+    assert (
+        other.upper_db[0] - other.lower_db[0] > 2 * 1.6 * term.spread_db > one.upper_db[0] - one.lower_db[0]
+    )
+    result.save(tmp_path / "out")
+    loaded = type(result).load(tmp_path / "out")
+    assert loaded.prediction.model.terms == result.prediction.model.terms
+
+
+@pytest.mark.parametrize("keys", [{}, {"per": "half", "bounds": [-3.0, 3.0]}])
+def test_a_random_effect_needs_groups_and_no_bounds(tmp_path, keys):
+    with pytest.raises(
+        InputError, match=r"prior = 'auto' needs per, the column of the groups, and no bounds"
+    ):
+        planted.study(
+            tmp_path, planted.campaign(), nuisance={"x": {"by": "constant", "prior": "auto", **keys}}
+        )
