@@ -324,11 +324,11 @@ def study_nuisance(study: Study, links: Measurements) -> Nuisance:
             make_term(links, OFFSET, labels=links.group, bounds=offset.bounds, prior=offset.prior_db)
         )
     for name, term in study.nuisance.items():
-        labels = None if term.per is None else links.table.labels(term.per)
-        if term.prior == "auto" and labels is not None:
-            terms += random_effect(links, name, term.by, labels)
-            continue
-        terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
+        if isinstance(term.prior, str):
+            terms += random_effect(links, name, term.by, links.table.labels(str(term.per)))
+        else:
+            labels = None if term.per is None else links.table.labels(term.per)
+            terms.append(make_term(links, name, term.by, labels=labels, bounds=term.bounds, prior=term.prior))
     return Nuisance(len(links), tuple(terms))
 
 
