@@ -21,7 +21,9 @@ from calibray.prediction import batches
 from calibray.prediction.map_files import CoverageMap, geotiff
 from calibray.reporting.link_map import footprints
 from calibray.result import FittedTerm, PredictionModel
-from calibray.scenes import Triangles, ground_heights
+from calibray.result.held_out import Model
+from calibray.scenes import Triangles, ground_heights, read_triangles
+from calibray.scenes.obstruction import obstruction
 from changed import changed
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -85,6 +87,24 @@ def test_a_cell_equals_the_prediction_at_its_centre(result, coverage):
     assert (np.isfinite(coverage.lower_db) <= predicted).all()
     inside = np.isfinite(coverage.upper_db)
     assert (coverage.lower_db < coverage.path_loss_db)[inside].all()
+
+
+def test_cells_of_the_model_with_obstruction_have_what_blocks_their_line(result):
+    coefficients = {"constant": 50.0, "log_distance": 30.0, "out_of_sight": 9.0, "obstruction_m": 0.3}
+    terms = tuple(FittedTerm(name, name, "", {"": value}) for name, value in coefficients.items())
+    model = replace(result.prediction.model, name=Model.OBSTRUCTION, parameters=None, terms=terms)
+    rival = replace(result, prediction=replace(result.prediction, model=model, materials=None))
+    coverage = cb.coverage_map(rival, TX, cell=30.0, bounds=AREA, columns=WEST, level=None)
+    row, column = np.nonzero(np.isfinite(coverage.path_loss_db))
+    receivers = np.column_stack([coverage.x[column], coverage.y[row], coverage.z[row, column]])
+    start = np.tile(TX, (len(row), 1))
+    triangles = read_triangles(cb.Setup.open(result.study, links=result.study.measurements()).scene)
+    found = obstruction(triangles, start, receivers)
+    assert 0 < found.out_of_sight.sum() < len(row)
+    assert found.length_m.max() > 5
+    law = 50 + 30 * np.log10(np.linalg.norm(receivers - start, axis=1))
+    expected = law + 9 * found.out_of_sight + 0.3 * found.length_m
+    assert coverage.path_loss_db[row, column] == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_geotiff_has_the_position_of_the_scene(result, coverage, tmp_path):

@@ -26,6 +26,7 @@ from calibray.scenes.authoring import (
     read_openstreetmap,
     read_terrain,
 )
+from calibray.scenes.authoring.canopy import read_canopy
 from planted_maps import FRAME, write_extract
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]
@@ -489,3 +490,47 @@ def test_a_missing_library_is_named_with_its_extra(extract, package, monkeypatch
         InputError, match=rf"{package} is not installed .*pip install 'calibray\[(scenes|geo)\]'"
     ):
         read_openstreetmap(extract)
+
+
+# Canopies
+
+
+def canopy(path: Path, heights: np.ndarray, **changes) -> Path:
+    """A raster of cells of 10 m around the origin of the frame, north up."""
+    origin = Frame.utm(11.5755, 48.1374)
+    rows, columns = heights.shape
+    place = Affine(10.0, 0, origin.easting - 5 * columns, 0, -10.0, origin.northing + 5 * rows)
+    profile = {
+        "driver": "GTiff",
+        "width": columns,
+        "height": rows,
+        "count": 1,
+        "dtype": "float32",
+        "nodata": -1.0,
+    }
+    with rasterio.open(path, "w", **profile | {"crs": "EPSG:32632", "transform": place} | changes) as model:
+        model.write(heights.astype("float32"), 1)
+    return path
+
+
+def test_a_canopy_becomes_polygons_of_equal_height(tmp_path):
+    heights = np.zeros((20, 20))
+    heights[4:6, 10:15] = 12.4  # 50 m east of the origin, 40 to 60 m north of it
+    heights[4, 15], heights[10, 2], heights[0, 0], heights[19, 19] = 7.0, 1.9, -1.0, 30.0
+    frame = Frame.utm(11.5755, 48.1374)
+    outline, top = read_canopy(canopy(tmp_path / "c.tif", heights), frame, np.array([-60, -60, 99, 99]))
+    assert sorted(top) == [7.0, 12.0]
+    big = outline[np.argmax(top)]
+    assert big.bounds == pytest.approx((0, 40, 50, 60), abs=1e-6)
+    assert shapely.area(outline).sum() == pytest.approx(1100, rel=1e-6)
+
+
+def test_a_canopy_without_trees_in_the_scene_or_of_another_format_is_refused(tmp_path):
+    frame, bounds = Frame.utm(11.5755, 48.1374), np.array([-60, -60, 99, 99])
+    with pytest.raises(InputError, match="has no trees of 2 m or more within the scene"):
+        read_canopy(canopy(tmp_path / "c.tif", np.ones((20, 20))), frame, bounds)
+    (tmp_path / "c.vrt").write_text("<VRTDataset rasterXSize='1' rasterYSize='1'></VRTDataset>")
+    with pytest.raises(InputError, match="give a GeoTIFF"):
+        read_canopy(tmp_path / "c.vrt", frame, bounds)
+    with pytest.raises(InputError, match="no height on land"):
+        read_canopy(canopy(tmp_path / "d.tif", np.full((20, 20), 60_000.0)), frame, bounds)

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
+from calibray.errors import InputError
 from calibray.scenes import Triangles
+from calibray.scenes.clutter import clutter_loss_db
 from calibray.scenes.obstruction import obstruction
 
 
@@ -98,3 +101,23 @@ def test_a_scene_without_obstacles_blocks_nothing():
     found = obstruction(scene(), np.array([[0, 0, 10.0]]), np.array([[200, 0, 10.0]]))
     assert (found.length_m[0], found.walls[0], found.knife_edge_db(0.1)[0]) == (0.0, 0, 0.0)
     assert not found.out_of_sight.any()
+
+
+def test_clutter_loss_is_that_of_the_recommendation():
+    # Values of the ITU's test table for p % of locations: the median minus sigma_cb times the normal quantile.
+    for carrier, distance, percent, expected in (
+        (0.5e9, 250.0, 50, 17.4),
+        (0.5e9, 250.0, 1, 3.9),
+        (26.6e9, 15_800.0, 45, 32.5),
+        (3.5e9, 1000.0, 0.1, 16.8),
+    ):
+        ghz, kilometres = carrier / 1e9, min(distance / 1e3, 2.0)
+        long_db = -2 * np.log10(10 ** (-5 * np.log10(ghz) - 12.5) + 10**-16.5)
+        short_db = 32.98 + 23.9 * np.log10(kilometres) + 3 * np.log10(ghz)
+        weight = 10 ** (-0.2 * np.array([long_db, short_db]))
+        sigma_db = np.sqrt(weight @ [16, 36] / weight.sum())
+        found = clutter_loss_db([distance], carrier)[0] + sigma_db * norm.ppf(percent / 100)
+        assert found == pytest.approx(expected, abs=0.051)
+    assert clutter_loss_db([249.0, 2000.0, 9000.0], 3.5e9) == pytest.approx([0.0, 30.3849, 30.3849], abs=1e-3)
+    with pytest.raises(InputError, match="not 70 GHz"):
+        clutter_loss_db([300.0, 300.0], [3e9, 70e9])

@@ -37,6 +37,24 @@ def test_overlapping_polygons_count_once_and_heights_apart():
         np.array([8.0, 3.0]),
     )
     assert stacked.length_inside(start, end) == pytest.approx([20.0])
+    # A tree of 8 m in a wood of 3 m: above 3 m it counts alone, below both count once.
+    mixed = Region(
+        np.array([shapely.box(10, -5, 30, 5), shapely.box(20, -5, 40, 5)]),
+        np.array([0.0, 0.0]),
+        np.array([8.0, 3.0]),
+    )
+    low, high = np.array([[0, 0, 2.0]]), np.array([[60, 0, 2.0]])
+    assert mixed.length_inside(start, end) == pytest.approx([20.0])
+    assert mixed.length_inside(low, high) == pytest.approx([30.0])
+    upright = np.array([[25, 0, 0.0]]), np.array([[25, 0, 10.0]])
+    assert mixed.length_inside(*upright) == pytest.approx([8.0])
+
+
+def test_a_polygon_with_a_hole_and_an_inlet_counts_every_piece():
+    ring = shapely.difference(shapely.box(0, -20, 40, 20), shapely.box(10, -5, 20, 5))
+    inlet = shapely.difference(ring, shapely.box(30, -5, 35, 20))
+    start, end = np.array([[-10, 0, 4.0]]), np.array([[50, 0, 4.0]])
+    assert region(inlet).length_inside(start, end) == pytest.approx([25.0])
 
 
 def test_random_lines_agree_with_points_along_them():

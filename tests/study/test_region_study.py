@@ -13,7 +13,10 @@ from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.measurements import links_from_frame
 from calibray.reporting.wording import scene_alone_text
+from calibray.scenes.checks import SceneSurfaces
+from calibray.scenes.clutter import clutter_loss_db
 from calibray.study import Setup, Study
+from calibray.study.regions import Place, RegionSection, dense_trees, region_effects
 
 TREES = "region:trees.specific_attenuation"
 BOX = [5.0, -10.0, 15.0, 10.0]
@@ -101,10 +104,20 @@ def test_a_file_of_polygons_gives_the_same_as_a_box(tmp_path, opened, engine):
     ("sections", "message"),
     [
         ({"regions": {}}, r"no \[regions\.trees\]"),
-        ({"regions": {"trees": REGIONS["trees"] | {"boxes": []}}}, "file or by boxes"),
+        ({"regions": {"trees": REGIONS["trees"] | {"boxes": []}}}, "by a canopy or by boxes"),
+        ({"regions": {"trees": REGIONS["trees"] | {"canopy": "c.tif"}}}, "give one of them"),
+        ({"regions": {"trees": {"boxes": [BOX], "specific_attenuation": 0.3}}}, r"needs top \[m\]"),
         ({"regions": {"trees": REGIONS["trees"] | {"boxes": [[5, 0, 1, 2]]}}}, "west less than east"),
         ({"regions": {"trees": REGIONS["trees"] | {"bottom": 9.0}}}, "must be less than top"),
         ({"regions": {"trees": REGIONS["trees"] | {"top": "h"}}}, "columns need a file"),
+        (
+            {
+                "regions": {},
+                "parameters": {"marble.relative_permittivity": PARAMETERS["marble.relative_permittivity"]},
+                "nuisance": {"trees": {"by": "region_m"}},
+            },
+            r"no \[regions\]",
+        ),
         ({"engine": {"name": "retrace"}}, "needs engine.name = 'replay'"),
         ({"engine": {"name": "replay", "compress_db": 0.1}}, "compress_db"),
         ({"parameters": {"region:trees.colour": {"bounds": [0, 1]}}}, "no field 'colour'"),
@@ -126,6 +139,45 @@ def test_files_and_columns_that_cannot_be_used_are_named(tmp_path):
     opened = Setup.open(study(tmp_path, regions={"trees": section}), links=links_from_frame(planted.links()))
     with pytest.raises(InputError, match="none of its 1 features is a polygon"):
         opened.effects(planted.engine().paths)
+
+
+def test_heights_above_the_ground_follow_a_slope():
+    slope = np.array([[[0, 0, 0], [100, 0, 50], [0, 100, 0]], [[100, 0, 50], [100, 100, 50], [0, 100, 0]]])
+    surfaces = SceneSurfaces(slope.astype(float), np.zeros((0, 3, 3)), np.array([0, 0, 0, 100, 100, 50.0]))
+    boxes = ((10, 10, 20, 20), (60, 10, 70, 20), (90, 10, 190, 20), (400, 0, 410, 9))
+    heights = {"bottom": 2.0, "top": 8.0, "heights": "ground"}
+    section = RegionSection(boxes=boxes, specific_attenuation=0.3, **heights)
+    region = section.region(None, Place(None, lambda: surfaces))
+    # The third box is cut at the edge of the ground, the fourth has none.
+    assert region.bottom == pytest.approx([2 + 7.5, 2 + 32.5, 2 + 47.5])
+    assert region.top == pytest.approx(region.bottom + 6)
+
+
+def test_attenuation_rises_with_the_carrier(opened, engine):
+    twice = engine.paths.at(2 * engine.paths.frequency)
+    arguments = opened.study.regions, opened.regions, opened.parameters
+    (effect,) = region_effects(*arguments, twice, engine.paths.frequency)
+    (stated,) = opened.effects(engine.paths)
+    assert effect.length == pytest.approx(2**0.284 * stated.length)
+    assert dense_trees(2e9) == pytest.approx(0.45 * 2**0.284)
+
+
+def test_nuisances_by_region_and_clutter_have_their_columns(tmp_path):
+    nuisance = {"trees": {"by": "region_m"}, "clutter": {"by": "clutter_db", "bounds": [0.0, 1.0]}}
+    table = planted.links()
+    table.loc[0, "rx_x"] = -900.0
+    setup = Setup.open(study(tmp_path, nuisance=nuisance), links=links_from_frame(table))
+    # The straight line from (0, 0) to a receiver at x > 15 crosses the box from x = 5 to 15.
+    far = (table["rx_x"] > 15).to_numpy()
+    rise = np.linalg.norm(setup.links.rx - setup.links.tx, axis=1) / table["rx_x"]
+    assert setup.links.table.numbers("region_m")[far] == pytest.approx(10 * rise[far])
+    clutter = setup.links.table.numbers("clutter_db")
+    assert clutter[0] == pytest.approx(clutter_loss_db(setup.links.distance[:1], 3.5e9)[0])
+    assert clutter[0] > 20
+    assert not clutter[1:].any()
+    # Other links get them too, and a study without such a nuisance has neither.
+    assert {"region_m", "clutter_db"} <= set(setup.at(links_from_frame(planted.links())).links.frame)
+    assert "region_m" not in Setup.open(study(tmp_path), links=links_from_frame(table)).links.frame
 
 
 def test_a_study_without_regions_has_no_effects():

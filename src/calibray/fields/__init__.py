@@ -9,7 +9,7 @@ Programs are in double precision by default, single on request. Functions comput
 
 from calibray.fields.coefficient_tables import FINEST, table_intervals
 from calibray.fields.combining import COMBINING, Combining, path_loss_of_gains
-from calibray.fields.effects import Effect, Effects, ExtraLoss
+from calibray.fields.effects import Effect, Effects, ExtraLoss, RoughSurfaces
 from calibray.fields.evaluation import (
     path_gains,
     path_loss,
@@ -34,6 +34,7 @@ __all__ = [
     "ExtraLoss",
     "GroupedProgram",
     "Layout",
+    "RoughSurfaces",
     "jax_settings",
     "layout",
     "link_statistics",

@@ -46,7 +46,8 @@ class ExtraLoss:
     """Loss of paths through regions such as woodland: it saturates with the length of the path in them.
 
     Attributes:
-        length: Length of every path inside the regions [P], [m].
+        length: Length of every path inside the regions, times the specific attenuation at the paths' carrier over
+            that at the study's [P], [m].
         maximum_db: Loss of a very long path [dB].
         index: Number of the parameter that is the specific attenuation [dB/m]; None if it is fixed.
         fixed: The specific attenuation if it is fixed [dB/m].
@@ -67,6 +68,39 @@ class ExtraLoss:
         # A = A_m (1 - exp(-d gamma / A_m)), ITU-R P.833-10 equation 1
         loss_db = self.maximum_db * -jnp.expm1(-jnp.asarray(self.length) * specific / self.maximum_db)
         return scaled(program, jnp.exp(-np.log(10) / 20 * loss_db))
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["exponent", "fixed"], meta_fields=["index"])
+@dataclass(frozen=True, eq=False)
+class RoughSurfaces:
+    """Loss of specular reflections on M rough materials: Rayleigh's roughness factor.
+
+    Attributes:
+        exponent: 8 (pi / lambda)^2 times the sum of cos^2 theta over the specular reflections of each path on each
+            material [P, M], [1/mm^2].
+        fixed: Standard deviation of the surface heights of each material, where it is fixed [M], [mm].
+        index: Number of the parameter that is this standard deviation, for each material; None where it is fixed.
+    """
+
+    exponent: jax.Array | NDArray[np.float64]
+    fixed: jax.Array | NDArray[np.float64]
+    index: tuple[int | None, ...]
+
+    def ordered(self, order: NDArray[np.int64]) -> RoughSurfaces:
+        """See `Effect.ordered`."""
+        return replace(self, exponent=np.asarray(self.exponent)[order])
+
+    def apply(self, program: GroupedProgram, values: jax.Array) -> GroupedProgram:
+        """See `Effect.apply`."""
+        heights = jnp.stack(
+            [
+                jnp.asarray(fixed) if index is None else values[index]
+                for fixed, index in zip(self.fixed, self.index, strict=True)
+            ]
+        )
+        # The mean field of heights with standard deviation s: exp(-8 (pi s cos theta / lambda)^2), W. S. Ament, Proc.
+        # IRE 41(1), 1953; its square is the share of the power that stays in the specular direction.
+        return scaled(program, jnp.exp(-jnp.asarray(self.exponent) @ heights**2))
 
 
 def scaled(program: GroupedProgram, amplitude: jax.Array) -> GroupedProgram:

@@ -44,6 +44,9 @@ EFFECTS: Final[Mapping[str, Mapping[str, Bound]]] = MappingProxyType(
 """Kinds of things other than materials that have parameters, as in "region:trees.specific_attenuation", with the
 physical bounds of each field."""
 
+ROUGHNESS: Final = "roughness_mm"
+"""Field of a material that acts as an effect on paths, not as a constant: the height of its roughness."""
+
 PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
     {
         **BOUNDS,
@@ -51,6 +54,7 @@ PARAMETER_BOUNDS: Final[Mapping[str, Bound]] = MappingProxyType(
         "itu_b": Bound(-10.0, 10.0, "1"),
         "itu_c": Bound(0.0, inf, "S/m"),
         "itu_d": Bound(-10.0, 10.0, "1"),
+        ROUGHNESS: Bound(0.0, 1000.0, "mm"),
         **{field: bound for fields in EFFECTS.values() for field, bound in fields.items()},
     }
 )

@@ -22,6 +22,7 @@ from calibray.parameters.laws import (
     EFFECTS,
     LAWS,
     PARAMETER_BOUNDS,
+    ROUGHNESS,
     frequency_independent_law,
 )
 from calibray.support.messages import did_you_mean
@@ -38,8 +39,9 @@ class Parameter:
 
     Attributes:
         name: Material and field, joined by the last dot: "walls.relative_permittivity". Fields are the constants of a
-            material and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b, sigma = c f^d [S/m], f in GHz. An
-            effect has its kind before a colon: "region:trees.specific_attenuation".
+            material, its `roughness_mm`, and `itu_a` to `itu_d` of ITU-R P.2040's law: eps_r = a f^b,
+            sigma = c f^d [S/m], f in GHz. Another effect has its kind before a colon:
+            "region:trees.specific_attenuation".
         lower: Lower bound, in the field's unit.
         upper: Upper bound, in the field's unit.
         start: Value before calibration, within the bounds, in the field's unit.
@@ -137,7 +139,14 @@ def is_effect(name: str) -> bool:
     Example:
         >>> is_effect("region:trees.specific_attenuation"), is_effect("walls.thickness")
         (True, False)
+        >>> is_effect("walls.roughness_mm")
+        True
     """
+    return _of_kind(name) or name.endswith(f".{ROUGHNESS}")
+
+
+def _of_kind(name: str) -> bool:
+    """Whether a name begins with the kind of an effect."""
     kind, colon, _ = name.partition(":")
     return bool(colon) and kind in EFFECTS
 
@@ -153,7 +162,7 @@ def split_name(name: str) -> tuple[str, str]:
         ('block.7', 'thickness')
     """
     material, _, field = name.rpartition(".")
-    allowed = EFFECTS[name.partition(":")[0]] if is_effect(name) else CONSTANT_OF_FIELD
+    allowed = EFFECTS[name.partition(":")[0]] if _of_kind(name) else (*CONSTANT_OF_FIELD, ROUGHNESS)
     if not material:
         raise InputError(
             f"parameter {name!r}: must be a material and a field, as 'walls.relative_permittivity'"

@@ -24,8 +24,8 @@ from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model
 from calibray.result.record import Record
-from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
 from calibray.study import Setup, Study
+from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.mounting import PORT_POWER, states_port_power
 from calibray.support.progress import Progress
 from calibray.validation.baselines import without_scene

@@ -56,7 +56,16 @@ def scene_alone_text(record: Record) -> str:
     )
     if rms_db < SCENE_ALONE_DB:
         return near.lstrip()
-    missing = [*(f"the region {name}" for name in record.study.regions), *(term.name for term in model.terms)]
+    rough = [
+        name.removesuffix(".roughness_mm")
+        for name in model.parameters or {}
+        if name.endswith(".roughness_mm")
+    ]
+    missing = [
+        *(f"the region {name}" for name in record.study.regions),
+        *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
+        *(term.name for term in model.terms),
+    ]
     cause = ", ".join(missing) or "its ceiling"
     if model.parameters is None:
         return (

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibray.scenes.regions import united
 from calibray.scenes.triangles import LEVEL, Triangles
 
 OUT_OF_SIGHT: Final = "out_of_sight"
@@ -105,7 +106,7 @@ def obstruction(triangles: Triangles, start: NDArray[np.float64], end: NDArray[n
         np.maximum.at(clearance, line, parameter)
         inside = below[:, 1] > below[:, 0]
         spans.append(np.column_stack([line.astype(np.float64), below])[inside])
-    for line, lower, upper in _united(np.concatenate([np.zeros((0, 3)), *spans])):
+    for line, lower, upper in united(np.concatenate([np.zeros((0, 3)), *spans])):
         np.add.at(length, line, upper - lower)
     length *= np.linalg.norm(end - start, axis=1)
     crossings = [
@@ -205,27 +206,6 @@ def _under(
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _united(
-    spans: NDArray[np.float64],
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-    """The union of spans (line, lower, upper) that may overlap, line by line.
-
-    Yields:
-        Line, lower and upper end of each piece.
-    """
-    count = len(spans)
-    if not count:
-        return
-    event = np.concatenate([spans[:, [0, 1]], spans[:, [0, 2]]])
-    change = np.repeat([1, -1], count)
-    order = np.lexsort((-change, event[:, 1], event[:, 0]))
-    depth = np.cumsum(change[order])
-    begins = (depth == 1) & (change[order] == 1)
-    ends = depth == 0
-    line = event[order][begins, 0].astype(np.int64)
-    yield line, event[order][begins, 1], event[order][ends, 1]
 
 
 def _crossing(

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -16,9 +16,19 @@ from calibray.engines.kinds import AnyEngine, default
 from calibray.engines.kinds.replay import ReplaySection
 from calibray.errors import InputError
 from calibray.materials import DEFAULT_REVISION, ItuLaw, Material, itu_material
-from calibray.parameters import LogNormal, Parameter, Parameters, is_effect, itu_start, make_parameter
-from calibray.parameters.laws import frequency_independent_law
-from calibray.scenes.obstruction import COLUMNS as OBSTRUCTION
+from calibray.parameters import (
+    LogNormal,
+    Parameter,
+    Parameters,
+    is_effect,
+    itu_start,
+    make_parameter,
+    split_name,
+)
+from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
+from calibray.parameters.parameter import check_material
+from calibray.study.link_obstruction import CLUTTER, REGION
+from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.observables import ObservableSection
 from calibray.study.regions import PREFIX, RegionSection
 from calibray.study.sections import (
@@ -103,7 +113,7 @@ class StudyModel(Section, ABC):
                 "counted as if their errors were independent; leave one of them out"
             )
         self._check_rays()
-        self._check_regions()
+        self._check_losses()
         self._check_poses()
         self._check_position_errors()
         if OFFSET in self.nuisance:
@@ -139,19 +149,29 @@ class StudyModel(Section, ABC):
                     f"{key}; remove one of them"
                 )
 
-    def _check_regions(self) -> None:
+    def _check_losses(self) -> None:
         for name in self.parameters:
             region = name.removeprefix(PREFIX).rpartition(".")[0]
             if name.startswith(PREFIX) and region not in self.regions:
                 raise InputError(
                     f"parameters: {name!r}: no [regions.{region}]; {did_you_mean(region, self.regions)}"
                 )
-        if self.regions and self.engine.name != "replay":
-            raise InputError(
-                f"[regions] needs engine.name = 'replay'; the engine {self.engine.name!r} knows no regions"
-            )
-        if self.regions and getattr(self.engine, "compress_db", None) is not None:
-            raise InputError("engine.compress_db: few weighted paths have no place in [regions]; remove it")
+        for name, section in self.nuisance.items():
+            if section.by == REGION and not self.regions:
+                raise InputError(
+                    f"nuisance.{name}.by = {REGION!r}: there are no [regions] that lines could cross"
+                )
+        rough = [name for name in self.parameters if name.endswith(f".{ROUGHNESS}")]
+        rough += [f"materials.{name}.{ROUGHNESS}" for name in self.roughness_mm]
+        for key, used in (("[regions]", bool(self.regions)), (rough[0] if rough else "", bool(rough))):
+            if used and self.engine.name != "replay":
+                raise InputError(
+                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} knows no such loss"
+                )
+            if used and getattr(self.engine, "compress_db", None) is not None:
+                raise InputError(
+                    f"engine.compress_db: few weighted paths do not go with {key}; remove one of them"
+                )
 
     def _check_position_errors(self) -> None:
         links = self.links
@@ -247,7 +267,7 @@ class StudyModel(Section, ABC):
     def region_paths(self) -> dict[str, Path | None]:
         """The file of every region by name; None for one of boxes."""
         return {
-            name: None if section.file is None else self._resolve(f"regions.{name}.file", section.file)
+            name: section.source and self._resolve(f"regions.{name}.{section.source[0]}", section.source[1])
             for name, section in self.regions.items()
         }
 
@@ -281,7 +301,16 @@ class StudyModel(Section, ABC):
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
         """The constants that ``[materials]`` states, by material name."""
-        return {name: material.model_dump(exclude_none=True) for name, material in self.materials.items()}
+        return {
+            name: material.model_dump(exclude_none=True, exclude={ROUGHNESS})
+            for name, material in self.materials.items()
+        }
+
+    @property
+    def roughness_mm(self) -> dict[str, float]:
+        """Standard deviation of the surface heights by material, where ``[materials]`` states it [mm]."""
+        stated = {name: material.roughness_mm for name, material in self.materials.items()}
+        return {name: height for name, height in stated.items() if height is not None}
 
     @property
     def nuisance_terms(self) -> dict[str, NuisanceTerm]:
@@ -293,6 +322,11 @@ class StudyModel(Section, ABC):
     def uses_obstruction(self) -> bool:
         """Whether a nuisance is by a column that follows from the scene."""
         return any(section.by in OBSTRUCTION for section in self.nuisance.values())
+
+    @property
+    def uses_clutter(self) -> bool:
+        """Whether a nuisance is by the clutter loss of ITU-R P.2108."""
+        return any(section.by == CLUTTER for section in self.nuisance.values())
 
     @property
     def offset_groups(self) -> tuple[str, ...]:
@@ -325,7 +359,7 @@ class StudyModel(Section, ABC):
         frequency = self.scene.frequency
         try:
             items = tuple(
-                self._effect_parameter(name)
+                self._effect_parameter(name, base)
                 if is_effect(name)
                 else make_parameter(name, entry.bounds, base, frequency, entry.start, entry.scale, laws)
                 for name, entry in self.parameters.items()
@@ -341,9 +375,15 @@ class StudyModel(Section, ABC):
             raise InputError(f"{self._path}: {error}") from None
         return parameters
 
-    def _effect_parameter(self, name: str) -> Parameter:
-        """The parameter of a region, or of a transmit antenna, whose stated pose is the start value 0."""
+    def _effect_parameter(self, name: str, materials: Collection[str]) -> Parameter:
+        """The parameter of a region or rough surface, or of a transmit antenna, whose stated pose is the start 0."""
         entry = self.parameters[name]
+        if name.endswith(f".{ROUGHNESS}"):
+            check_material(name, materials)
+            stated = self.roughness_mm.get(split_name(name)[0], 0.0)
+            return Parameter(
+                name, *entry.bounds, stated if entry.start is None else float(entry.start), entry.scale
+            )
         region = self.regions.get(name.removeprefix(PREFIX).rpartition(".")[0]) if PREFIX in name else None
         start = 0.0 if region is None else region.specific_attenuation
         return Parameter(
@@ -392,7 +432,8 @@ class StudyModel(Section, ABC):
             ("engine.rays", getattr(self.engine, "rays", None), self.rays_path),
         ]
         for name, path in self.region_paths.items():
-            files.append((f"regions.{name}.file", self.regions[name].file, path))
+            key, stated = self.regions[name].source or ("boxes", None)
+            files.append((f"regions.{name}.{key}", stated, path))
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))
         written = [("tx", self.antennas.tx), ("rx", self.antennas.rx)]

@@ -11,9 +11,12 @@ from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
 from calibray.study.model import StudyModel
 from calibray.study.mounting import PORT_POWER, mounting_columns, port_power, states_port_power
+from calibray.study.regions import Place
 
 if TYPE_CHECKING:
     from calibray.measurements import Ground, MoveOutside
+    from calibray.scenes.checks import SceneSurfaces
+    from calibray.scenes.regions import Region
 
 _COLUMN_KEYS: Final = {"tx", "rx", "value", "quantity", "weight", "std", "tx_power_dbm", "frequency"}
 """Keys of ``[links]`` that are fields of `LinkColumns`."""
@@ -90,9 +93,7 @@ def position_steps(study: StudyModel) -> Preparation:
 
 
 def _ground(study: StudyModel) -> Ground:
-    from calibray.scenes.checks import SceneSurfaces
-
-    return SceneSurfaces.read(study.scene_source).ground_height
+    return _surfaces(study.scene_source).ground_height
 
 
 def _move_outside(study: StudyModel) -> MoveOutside:
@@ -133,3 +134,23 @@ def known_frame(study: StudyModel) -> Frame | None:
     from calibray.scenes import read_frame
 
     return read_frame(study.scene_source)
+
+
+def study_regions(study: StudyModel) -> dict[str, Region]:
+    """The regions of a study by name.
+
+    Raises:
+        InputError: A file cannot be read, or the scene's place on the globe is unknown.
+    """
+    if not study.regions:
+        return {}
+
+    place = Place(known_frame(study), partial(_surfaces, study.scene_source))
+    paths = study.region_paths
+    return {name: section.region(paths[name], place) for name, section in study.regions.items()}
+
+
+def _surfaces(source: str) -> SceneSurfaces:
+    from calibray.scenes.checks import SceneSurfaces
+
+    return SceneSurfaces.read(source)

@@ -65,6 +65,7 @@ class MaterialSection(Section):
         alpha_r: Exponent [1] of the lobe around the specular direction.
         alpha_i: Exponent [1] of the lobe back towards the source.
         lambda_: Share [1] of the diffuse energy in the lobe around the specular direction.
+        roughness_mm: Standard deviation of the heights of the surface [mm], which weakens specular reflections.
     """
 
     itu: Text | None = None
@@ -78,6 +79,7 @@ class MaterialSection(Section):
     alpha_r: float | None = None
     alpha_i: float | None = None
     lambda_: float | None = None
+    roughness_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -85,7 +87,7 @@ class MaterialSection(Section):
             raise InputError(
                 f"revision = {self.revision!r} without itu; name the ITU-R material, or leave it out"
             )
-        stated = self.model_dump(exclude_none=True, exclude={"itu", "revision"})
+        stated = self.model_dump(exclude_none=True, exclude={"itu", "revision", "roughness_mm"})
         Material(**{"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 1.0, **stated})
         return self
 

@@ -43,7 +43,8 @@ from calibray.study.model import StudyModel
 from calibray.study.mounting import check_poses, link_mountings, pose_effects
 from calibray.study.position_errors import averaged, displaced, mounted_at_displaced, spread_db
 from calibray.study.regions import region_effects
-from calibray.study.row_steps import known_frame, link_columns, position_steps, row_steps, row_track
+from calibray.study.roughness import roughness_effects
+from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track, study_regions
 from calibray.study.sections import AntennasSection
 from calibray.study.summary import summary
 from calibray.study.toml_file import read_content, refuse_unquoted_names, split_engine_keys
@@ -293,9 +294,8 @@ class Setup:
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
         if held_out is None:
             held_out = np.zeros(len(links), dtype=bool)
-        if study.uses_obstruction:
-            links = with_obstruction(links, scene, study.scene.frequency)
-        return cls(study, links, scene, parameters, held_out, tracer)
+        setup = cls(study, links, scene, parameters, held_out, tracer)
+        return setup.with_obstruction() if study.uses_obstruction else setup
 
     def opened(self) -> Setup:
         """Itself, so that functions can take a study, opened or not."""
@@ -311,17 +311,19 @@ class Setup:
 
     def at(self, links: Measurements) -> Setup:
         """The same with other links, none of them held out; no file is read again."""
-        if self.study.uses_obstruction:
-            links = with_obstruction(links, self.scene, self.study.scene.frequency)
-        return self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
+        setup = self._with_tracer(replace(self, links=links, held_out=np.zeros(len(links), dtype=bool)))
+        return setup.with_obstruction() if self.study.uses_obstruction else setup
 
     def with_obstruction(self) -> Setup:
-        """The same with the columns that the scene gives in the links' table (`scenes.obstruction.COLUMNS`)."""
-        links = with_obstruction(self.links, self.scene, self.study.scene.frequency)
+        """The same with the columns that the scene gives in the links' table (`link_obstruction.COLUMNS`)."""
+        study = self.study
+        links = with_obstruction(
+            self.links, self.scene, study.scene.frequency, self.regions, study.uses_clutter
+        )
         return self if links is self.links else self._with_tracer(replace(self, links=links))
 
     def effects(self, paths: Paths, links: NDArray[np.int64] | None = None) -> Effects:
-        """Effects on paths that no material has: wrong directions of antennas, and regions.
+        """Effects on paths that no constant has: wrong directions of antennas, regions, and rough surfaces.
 
         Args:
             paths: The paths of some links.
@@ -329,13 +331,14 @@ class Setup:
         """
         chosen = np.arange(len(self.links)) if links is None else links
         poses = pose_effects(self.study, self.mountings, self.links.table, self.parameters, (paths, chosen))
-        return poses + region_effects(self.study.regions, self._regions, self.parameters, paths)
+        study, parameters = self.study, self.parameters
+        extra = region_effects(study.regions, self.regions, parameters, paths, study.scene.frequency)
+        return poses + extra + roughness_effects(study.roughness_mm, parameters, paths)
 
     @cached_property
-    def _regions(self) -> dict[str, Region]:
-        frame = known_frame(self.study) if self.study.regions else None
-        paths = self.study.region_paths
-        return {name: section.region(paths[name], frame) for name, section in self.study.regions.items()}
+    def regions(self) -> dict[str, Region]:
+        """The regions of extra loss by name."""
+        return study_regions(self.study)
 
     @property
     def radio(self) -> RadioSettings:
@@ -528,6 +531,8 @@ class Setup:
     def _with_tracer(self, changed: Setup) -> Setup:
         """A changed setup with the same tracer, which depends neither on links nor on methods."""
         changed.__dict__["_loaded"] = self._loaded
+        if "regions" in self.__dict__:
+            changed.__dict__["regions"] = self.regions
         return changed
 
     def _scene_at(self, frequency: float) -> Scene:

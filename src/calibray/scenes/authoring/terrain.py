@@ -97,7 +97,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     sample_x, sample_y = np.meshgrid(west + (east - west) * share, south + (north - south) * share)
     with open_height_model(path) as model:
         dataset, affine = model.dataset, model.dataset.transform
-        column, row = _pixels(sample_x, sample_y, frame, model.crs, affine)
+        column, row = pixels(sample_x, sample_y, frame, model.crs, affine)
         inside = (column >= 0) & (row >= 0) & (column <= dataset.width - 1) & (row <= dataset.height - 1)
         if not inside.all():
             centre = frame.to_geographic([(west + east) / 2, (south + north) / 2, 0])[:2]
@@ -123,7 +123,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
         )
     x, y = np.linspace(west, east, columns), np.linspace(south, north, rows)
     grid_x, grid_y = np.meshgrid(x, y)
-    column, row = _pixels(grid_x, grid_y, frame, crs, affine)
+    column, row = pixels(grid_x, grid_y, frame, crs, affine)
     axes = tuple(np.arange(low, high + 1, dtype=float) for low, high in zip(first, last, strict=True))
     points = np.stack(
         [np.clip(value, axis[0], axis[-1]) for value, axis in zip((row, column), axes, strict=True)], axis=-1
@@ -131,7 +131,7 @@ def read_terrain(path: str | Path, frame: Frame, bounds: ArrayLike, spacing: flo
     return Terrain(x, y, RegularGridInterpolator(axes, filled)(points) - frame.height, repairs)
 
 
-def _pixels(
+def pixels(
     x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, crs: str, affine: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Column and row of a raster at positions in the frame; integers at the centres of cells."""
