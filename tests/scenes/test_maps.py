@@ -25,9 +25,10 @@ from calibray.scenes.authoring import (
     read_footprints,
     read_openstreetmap,
     read_terrain,
+    read_trees,
 )
 from calibray.scenes.authoring.canopy import read_canopy
-from planted_maps import FRAME, write_extract
+from planted_maps import FRAME, write_extract, write_park
 
 SQUARE = [(0, 0), (20, 0), (20, 20), (0, 20)]
 
@@ -534,3 +535,34 @@ def test_a_canopy_without_trees_in_the_scene_or_of_another_format_is_refused(tmp
         read_canopy(tmp_path / "c.vrt", frame, bounds)
     with pytest.raises(InputError, match="no height on land"):
         read_canopy(canopy(tmp_path / "d.tif", np.full((20, 20), 60_000.0)), frame, bounds)
+
+
+# Trees
+
+
+def test_trees_of_an_extract_have_crowns_and_heights(tmp_path):
+    trees = read_trees(write_park(tmp_path / "park.osm"), FRAME)
+    assert len(trees) == 6
+    near = trees.within(np.array([-50, -50, 110, 110]))
+    assert near.counts == {
+        "trees": 2,
+        "tree rows": 1,
+        "woods": 1,
+        "forests": 1,
+        "of them with an assumed height": 2,
+    }
+    by = {
+        (kind, top): (shape, low)
+        for kind, top, shape, low in zip(near.kind, near.top, near.outline, near.bottom, strict=True)
+    }
+    assert {key: low for key, (_, low) in by.items()} == {
+        ("tree", 12.0): 2.5, ("tree", 10.0): 2.5, ("tree row", 4.0): 2.0, ("wood", 18.0): 0.0, ("forest", 15.0): 0.0,
+    }  # fmt: skip
+    # A crown of 8 m and an assumed one of 6 m; a row 50 m long with round ends; a wood; a forest with a clearing.
+    areas = {key: shapely.area(shape) for key, (shape, _) in by.items()}
+    assert areas["tree", 12.0] == pytest.approx(np.pi * 16, rel=0.01)
+    assert areas["tree", 10.0] == pytest.approx(np.pi * 9, rel=0.01)
+    assert areas["tree row", 4.0] == pytest.approx(300 + np.pi * 9, rel=0.01)
+    assert areas["wood", 18.0] == pytest.approx(400, rel=0.01)
+    assert areas["forest", 15.0] == pytest.approx(1800 - 200, rel=0.01)
+    assert shapely.centroid(by["tree", 12.0][0]).coords[0] == pytest.approx((30, 5), abs=0.02)

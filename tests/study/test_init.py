@@ -100,6 +100,38 @@ def test_metres_and_a_distance_tell_where_the_transmitter_stands(scene, tmp_path
     assert given.study.links.tx == (1.0, 2.0, 3.0)
 
 
+def test_trees_next_to_the_scene_become_a_region(scene, tmp_path):
+    rows = {
+        "rx_x": [-30.0, -20.0, 5.0],
+        "rx_y": [0.0, 30.0, 20.0],
+        "rx_z": 1.5,
+        "path_loss_db": [70.0, 80.0, 75.0],
+    }
+    given = {"tx": [10.0, 0.0, 6.0], "frequency": 3.5e9}
+    ring = shapely.transform(
+        shapely.box(-5, -3, 0, 3), lambda xy: FRAME.to_geographic(np.c_[xy, 0 * xy[:, 0]])[:, :2]
+    )
+    feature = {"type": "Feature", "properties": {"kind": "wood", "bottom": 0.0, "top": 9.0}}
+    feature["geometry"] = json.loads(shapely.to_geojson(ring))
+    trees = {"type": "FeatureCollection", "features": [feature]}
+    (Path(scene).parent / "trees.geojson").write_text(json.dumps(trees))
+    found = draft(scene, table(tmp_path, **rows), tmp_path / "study.toml", **given)
+    section = found.study.regions["trees"]
+    assert (section.file, section.heights, section.top) == ("town/trees.geojson", "ground", "top")
+    assert section.specific_attenuation == pytest.approx(0.45 * 3.5**0.284, abs=0.005)
+    assert "region:trees.specific_attenuation" in found.study.parameters
+    assert any("on the straight line of 1 of 3 links" in each.reason for each in found.assumptions)
+    assert found.study.regions["trees"].file in found.text
+    # Without trees on the straight line of a link, their attenuation is no parameter.
+    elsewhere = draft(
+        scene, table(tmp_path, **rows), tmp_path / "study.toml", **given | {"tx": [-40.0, 20.0, 6.0]}
+    )
+    assert list(elsewhere.study.regions) == ["trees"]
+    assert "region:trees.specific_attenuation" not in elsewhere.study.parameters
+    (Path(scene).parent / "trees.geojson").unlink()
+    assert not draft(scene, table(tmp_path, **rows), tmp_path / "study.toml", **given).study.regions
+
+
 def test_a_column_named_with_any_character_makes_a_study_that_reads(scene, tmp_path):
     """TOML forbids DEL in texts, JSON allows it."""
     columns = {"rx_x_m\x7f": [5.0, 9.0], "rx_y_m": [1.0, 2.0], "rx_z_m": 1.5, "path_loss_db": [70.0, 80.0]}

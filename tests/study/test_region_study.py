@@ -13,10 +13,12 @@ from calibray.calibration.result import Result
 from calibray.errors import InputError
 from calibray.measurements import links_from_frame
 from calibray.reporting.wording import scene_alone_text
+from calibray.scenes.authoring import make_scene, read_openstreetmap, read_trees
 from calibray.scenes.checks import SceneSurfaces
 from calibray.scenes.clutter import clutter_loss_db
 from calibray.study import Setup, Study
 from calibray.study.regions import Place, RegionSection, dense_trees, region_effects
+from planted_maps import FRAME, write_park
 
 TREES = "region:trees.specific_attenuation"
 BOX = [5.0, -10.0, 15.0, 10.0]
@@ -139,6 +141,32 @@ def test_files_and_columns_that_cannot_be_used_are_named(tmp_path):
     opened = Setup.open(study(tmp_path, regions={"trees": section}), links=links_from_frame(planted.links()))
     with pytest.raises(InputError, match="none of its 1 features is a polygon"):
         opened.effects(planted.engine().paths)
+
+
+def test_trees_are_written_next_to_a_scene_and_read_as_a_region(tmp_path):
+    wooded = write_park(tmp_path / "park.osm")
+    buildings, frame = read_openstreetmap(wooded, FRAME)
+    trees = read_trees(wooded, frame)
+    made = make_scene(buildings, tmp_path / "scene", frame, trees=trees)
+    assert made.counts["trees"] == 2
+    file = tmp_path / "scene" / "trees.geojson"
+    content = {
+        "file": file.name,
+        "heights": "ground",
+        "bottom": "bottom",
+        "top": "top",
+        "specific_attenuation": 0.5,
+    }
+    section = RegionSection(**content)
+    place = Place(frame, lambda: SceneSurfaces.read(made.path))
+    region = section.region(file, place)
+    # Through the crown of 8 m at 6 m, and under it at 2 m; through the wood.
+    start = np.array([[30, 5, 0.0], [25, 5, 6.0], [25, 5, 2.0], [35, 10, 9.0]])
+    end = np.array([[30, 5, 20.0], [35, 5, 6.0], [35, 5, 2.0], [70, 10, 9.0]])
+    assert region.length_inside(start, end) == pytest.approx([9.5, 8.0, 0.0, 20.0], abs=0.1)
+    # A scene without trees in the same folder has no file of them.
+    make_scene(buildings, tmp_path / "scene", frame)
+    assert not file.exists()
 
 
 def test_heights_above_the_ground_follow_a_slope():

@@ -12,7 +12,7 @@ from calibray.errors import InputError
 
 if TYPE_CHECKING:
     from calibray.coordinates import Frame
-    from calibray.scenes.authoring import Footprints, MadeScene, SurfaceMaterial
+    from calibray.scenes.authoring import Footprints, MadeScene, SurfaceMaterial, Trees
     from calibray.support.progress import Progress
 
 SUMMARY: Final = "Make a scene from an OpenStreetMap extract, building footprints or a floor plan."
@@ -94,12 +94,12 @@ def osm(
     per_building: PerBuilding = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make a scene from the buildings of an OpenStreetMap extract."""
+    """Make a scene from the buildings of an OpenStreetMap extract, with a file of its trees."""
     from calibray.cli.progress_bars import progress_bars
-    from calibray.scenes.authoring import SCENE_FILES, HeightRule, read_openstreetmap
+    from calibray.scenes.authoring import SCENE_FILES, TREES_FILE, HeightRule, read_openstreetmap, read_trees
     from calibray.support.output_files import check_outputs
 
-    check_outputs(out, SCENE_FILES, [extract, *([terrain] if terrain else [])], overwrite)
+    check_outputs(out, (*SCENE_FILES, TREES_FILE), [extract, *([terrain] if terrain else [])], overwrite)
     with progress_bars(log()) as progress:
         progress("reading", 0, None)
         buildings, frame = read_openstreetmap(
@@ -108,7 +108,7 @@ def osm(
         _check_origin(origin, buildings)
         made = _make(
             buildings, frame, out, terrain, spacing, wall, roof, ground, window_share, margin, per_building,
-            overwrite, progress,
+            overwrite, progress, read_trees(extract, frame),
         )  # fmt: skip
     _print(made)
 
@@ -226,6 +226,7 @@ def _make(
     per_building: bool,
     overwrite: bool,
     progress: Progress,
+    trees: Trees | None = None,
 ) -> MadeScene:
     """Make a scene from footprints."""
     import numpy as np
@@ -254,6 +255,7 @@ def _make(
         margin,
         per_building=per_building,
         overwrite=overwrite,
+        trees=trees,
     )
 
 

@@ -5,6 +5,7 @@ Names of columns, groups and files come from foreign tables; `study_text` quotes
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,13 +15,16 @@ from typing import Any, Final
 import numpy as np
 
 from calibray.errors import InputError
-from calibray.scenes import Scene, read_scene
+from calibray.scenes import Scene, read_frame, read_scene
+from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
 from calibray.study.draft_antennas import add_antennas
 from calibray.study.draft_links import Assumption, LinksDraft
-from calibray.study.model import VERSION
+from calibray.study.model import BUNDLED, VERSION
+from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study
 from calibray.study.toml_file import study_text
+from calibray.support.output_files import exists
 
 INDOOR_DEPTHS: Final = (3, 5)
 """Smallest and largest number of interactions of an indoor study."""
@@ -96,6 +100,7 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
     # Behind buildings most links have no other path.
     trace["refraction" if indoors else "diffraction"] = True
     scene, constants = _scene(links)
+    regions, attenuation = _trees(links)
     return {
         "version": VERSION,
         "scene": {"file": links.scene_file, "frequency": links.frequency},
@@ -103,7 +108,8 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
         "links": section,
         "antennas": antenna_section,
         "trace": trace,
-        "parameters": _parameters(links, scene, indoors),
+        "parameters": _parameters(links, scene, indoors) | attenuation,
+        **({"regions": regions} if regions else {}),
         "offset": {"per": links.groups} if links.groups else {},
         # Refracted paths are sampled by the materials, so every new trace changes some links: one is enough.
         **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),
@@ -150,6 +156,24 @@ def _scene(links: LinksDraft) -> tuple[Scene, dict[str, dict[str, float]]]:
     reason = f"ITU-R P.2040 does not cover {links.frequency / 1e9:g} GHz: the constants at the nearest that it covers"
     links.assume("materials", ", ".join(constants), reason)
     return read_scene(links.scene, links.frequency, constants), constants
+
+
+def _trees(links: LinksDraft) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The region of the trees next to the scene, and its parameter if they are on the straight line of a link."""
+    file = Path(links.scene).parent / TREES_FILE
+    frame = None if links.scene.startswith(BUNDLED) else read_frame(links.scene)
+    if frame is None or not exists(file):
+        return {}, {}
+    specific = round(dense_trees(links.frequency), 2)
+    heights = {"heights": "ground", "bottom": "bottom", "top": "top"}
+    content = {"file": links.relative(file), **heights, "specific_attenuation": specific}
+    section = RegionSection.model_validate_json(json.dumps(content))
+    region, measured = section.region(file, Place(frame, lambda: links.overhead)), links.measurements()
+    crossing = int((region.length_inside(measured.tx, measured.rx) > 0).sum())
+    reason = f"trees are on the straight line of {crossing} of {len(measured)} links; dense trees in leaf attenuate so"
+    links.assume("regions", f"trees, {specific:g} dB/m", reason)
+    parameter = {"region:trees.specific_attenuation": {"bounds": [0.0, 3.0]}} if crossing else {}
+    return {"trees": content}, parameter
 
 
 def _parameters(links: LinksDraft, scene: Scene, indoors: bool) -> dict[str, dict[str, Any]]:

@@ -417,7 +417,8 @@ class NuisanceTerm:
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
-            "walls_crossed", "obstruction_m", "knife_edge_db"), or a numeric column of the links.
+            "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
+            links.
         per: Columns whose joined labels are the groups; one coefficient for all links if there are none.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if None.
         prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if None; "auto" around the
@@ -456,7 +457,8 @@ class NuisanceSection(Section):
 
     Attributes:
         by: "constant", "log_distance" (decades of distance), a column that follows from the scene ("out_of_sight",
-            "walls_crossed", "obstruction_m", "knife_edge_db"), or a numeric column of the links.
+            "walls_crossed", "obstruction_m", "knife_edge_db", "region_m", "clutter_db"), or a numeric column of the
+            links.
         per: Column of group labels; one coefficient for all links if absent.
         bounds: Lower and upper bound of the coefficient, [dB] per unit of the column; unbounded if absent.
         prior: Standard deviation of a Gaussian prior around zero, in the same unit; flat if absent. "auto" is a prior

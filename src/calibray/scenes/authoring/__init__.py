@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from calibray.scenes.authoring.terrain import Terrain as Terrain
     from calibray.scenes.authoring.terrain import lower_origin as lower_origin
     from calibray.scenes.authoring.terrain import read_terrain as read_terrain
+    from calibray.scenes.authoring.trees import TREES_FILE as TREES_FILE
+    from calibray.scenes.authoring.trees import Trees as Trees
+    from calibray.scenes.authoring.trees import read_trees as read_trees
     from calibray.scenes.authoring.wall_faces import merge_faces as merge_faces
 
 _MODULES = {
@@ -40,6 +43,7 @@ _MODULES = {
     "footprints": ("WIDEST", "Footprints", "HeightRule", "HeightSource", "clean_footprints"),
     "made_scene": ("SCENE_FILES", "MadeScene", "Palette", "SurfaceMaterial", "material_name"),
     "terrain": ("Terrain", "lower_origin", "read_terrain"),
+    "trees": ("TREES_FILE", "Trees", "read_trees"),
     "wall_faces": ("merge_faces",),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}

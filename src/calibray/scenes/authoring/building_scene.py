@@ -29,6 +29,7 @@ from calibray.scenes.authoring.extrusion import (
 from calibray.scenes.authoring.footprints import WIDEST, Footprints
 from calibray.scenes.authoring.made_scene import SCENE_FILES, MadeScene, Palette, write_made_scene
 from calibray.scenes.authoring.terrain import Terrain, make_level_ground
+from calibray.scenes.authoring.trees import TREES_FILE, Trees
 from calibray.scenes.authoring.wall_alignment import align
 from calibray.scenes.meshes import MeshObject, weld
 from calibray.support.lazy_imports import library
@@ -49,6 +50,7 @@ def make_scene(
     ground: bool = True,
     per_building: bool = False,
     overwrite: bool = False,
+    trees: Trees | None = None,
 ) -> MadeScene:
     """Make a scene of buildings and ground.
 
@@ -65,6 +67,7 @@ def make_scene(
         per_building: One mesh per building and material, named `BUILDING-MATERIAL`, instead of one per material.
             Calibray can then give some buildings a separate material. Tracing many meshes takes longer.
         overwrite: Replace files that Calibray did not write.
+        trees: Trees, of which those over the ground are written next to the scene as `TREES_FILE`; needs a frame.
 
     Returns:
         The scene.
@@ -73,7 +76,7 @@ def make_scene(
         InputError: There is no building, the margin is out of range, the folder cannot be written, or a file there must
             not be replaced.
     """
-    folder = check_outputs(folder, SCENE_FILES, overwrite=overwrite)
+    folder = check_outputs(folder, (*SCENE_FILES, TREES_FILE), overwrite=overwrite)
     palette = palette or Palette()
     if not len(footprints):
         raise InputError("there is no building to make a scene of; check the file and its columns")
@@ -86,15 +89,23 @@ def make_scene(
     if ground:
         sheet = terrain or make_level_ground(footprints.bounds + margin * np.array([-1, -1, 1, 1]))
         objects.append(MeshObject("ground-surface", palette.ground.name, sheet.mesh()))
+    if trees is not None:
+        trees = trees.within(footprints.bounds + margin * np.array([-1, -1, 1, 1]))
     counts = {
         "buildings": len(footprints),
+        **(trees.counts if trees is not None else {}),
         **footprints.repairs,
         **({"sharing ground with another, cut": overlapping} if overlapping else {}),
         **(terrain.repairs if terrain is not None else {}),
     }
     guessed = {source: names for source, names in footprints.guessed().items() if names}
     materials = [palette.wall, palette.window, palette.roof or palette.wall, palette.ground]
-    return write_made_scene(folder, objects, materials, frame, counts, guessed, overwrite)
+    scene = write_made_scene(folder, objects, materials, frame, counts, guessed, overwrite)
+    # The trees of a scene that this one replaces are no longer here.
+    (folder / TREES_FILE).unlink(missing_ok=True)
+    if trees is not None and frame is not None and len(trees):
+        trees.write(folder, frame)
+    return scene
 
 
 def _base_heights(footprints: Footprints, terrain: Terrain | None) -> NDArray[np.float64]:

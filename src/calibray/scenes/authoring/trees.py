@@ -1,0 +1,162 @@
+"""Trees of an OpenStreetMap extract: single trees, tree rows, woods and forests as polygons with heights."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibray.coordinates import WGS84, Frame
+from calibray.errors import InputError
+from calibray.scenes.authoring.footprints import parse_length, project
+from calibray.support.lazy_imports import library
+from calibray.support.output_files import write_text
+
+TREES_FILE: Final = "trees.geojson"
+"""Name of the file of trees next to a scene."""
+
+KINDS: Final = {
+    ("natural", "tree"): "tree",
+    ("natural", "tree_row"): "tree row",
+    ("natural", "wood"): "wood",
+    ("landuse", "forest"): "forest",
+}
+"""Kinds of trees by the tag of OpenStreetMap."""
+
+HEIGHTS: Final = {"tree": 10.0, "tree row": 10.0, "wood": 15.0, "forest": 15.0}
+"""Assumed heights [m]: 15 m is the mean of the wood that ITU-R P.833's largest loss was measured in; few maps state
+any."""
+
+CROWN: Final = 6.0
+"""Assumed diameter of a crown [m]."""
+
+CLEARANCE: Final = 2.5
+"""Height at which crowns of single trees and rows begin [m], where people walk below; woods begin at the ground."""
+
+TALLEST: Final = 120.0
+"""Largest height of a tree [m]; the tallest stands 116 m."""
+
+WIDEST_CROWN: Final = 60.0
+"""Largest diameter of a crown [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Trees as upright prisms.
+
+    Attributes:
+        outline: Shapely polygons in the scene's frame [n], [m].
+        kind: A value of `KINDS` [n].
+        bottom: Height above the ground at which each begins [n], [m].
+        top: Height at which it ends [n], [m].
+        assumed: Whether its height is an assumption [n].
+    """
+
+    outline: NDArray[Any]
+    kind: NDArray[np.str_]
+    bottom: NDArray[np.float64]
+    top: NDArray[np.float64]
+    assumed: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.outline)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of polygons by kind, and of those with an assumed height."""
+        assumed = {"of them with an assumed height": int(self.assumed.sum())} if self.assumed.any() else {}
+        return dict(Counter(f"{name}s" for name in self.kind.tolist())) | assumed
+
+    def within(self, bounds: NDArray[np.float64]) -> Trees:
+        """The trees that reach into west, south, east and north [4], [m]."""
+        shapely = library("shapely", "scenes")
+        here = shapely.intersects(self.outline, shapely.box(*bounds)) if len(self) else slice(None)
+        return replace(self, **{item.name: getattr(self, item.name)[here] for item in fields(self)})
+
+    def write(self, folder: Path, frame: Frame) -> None:
+        """Write `TREES_FILE`: longitude and latitude, with the kind and both heights of each polygon."""
+        shapely = library("shapely", "scenes")
+
+        def degrees(corner: NDArray[np.float64]) -> NDArray[np.float64]:
+            return frame.to_geographic(np.column_stack([corner, np.zeros(len(corner))]))[:, :2].round(7)
+
+        features = [
+            {
+                "type": "Feature",
+                "properties": {"kind": str(kind), "bottom": bottom, "top": top},
+                "geometry": json.loads(geometry),
+            }
+            for kind, bottom, top, geometry in zip(
+                self.kind,
+                self.bottom.tolist(),
+                self.top.tolist(),
+                shapely.to_geojson(shapely.transform(self.outline, degrees)).tolist(),
+                strict=True,
+            )
+        ]
+        write_text(
+            folder / TREES_FILE, json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
+        )
+
+
+def read_trees(path: str | Path, frame: Frame) -> Trees:
+    """Read the trees of an extract: nodes, ways and areas with a tag of `KINDS`.
+
+    The tags `height` and `diameter_crown` are used where they are stated, else `HEIGHTS` and `CROWN`.
+
+    Args:
+        path: The extract, .osm or .osm.pbf.
+        frame: The scene's frame.
+
+    Returns:
+        The trees, possibly none.
+
+    Raises:
+        InputError: The file cannot be read, or pyosmium is not installed.
+    """
+    osmium, shapely = library("osmium", "scenes"), library("shapely", "scenes")
+    chosen = osmium.filter.TagFilter(*KINDS)
+    geometry = osmium.geom.WKBFactory()
+    shapes, tags, kinds = [], [], []
+    try:
+        for item in osmium.FileProcessor(path).with_areas(chosen).with_filter(chosen):
+            kind = next((name for (key, value), name in KINDS.items() if item.tags.get(key) == value), "")
+            if kind == "tree" and item.is_node():
+                shape = geometry.create_point(item)
+            elif kind == "tree row" and item.is_way():
+                shape = geometry.create_linestring(item)
+            elif kind in ("wood", "forest") and item.is_area():
+                shape = geometry.create_multipolygon(item)
+            else:
+                continue
+            shapes.append(shapely.from_wkb(shape))
+            tags.append({tag.k: tag.v for tag in item.tags})
+            kinds.append(kind)
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
+        raise InputError(f"extract {path}: cannot be read ({error}); give an .osm or .osm.pbf file") from None
+    heights = [_stated(each, "height", TALLEST) for each in tags]
+    crowns = [_stated(each, "diameter_crown", WIDEST_CROWN) for each in tags]
+    top = np.array(
+        [height or HEIGHTS[kind] for height, kind in zip(heights, kinds, strict=True)], dtype=float
+    )
+    kind, narrow = np.array(kinds, dtype=str), np.isin(kinds, ("tree", "tree row"))
+    radius = np.where(narrow, [0.5 * (crown or CROWN) for crown in crowns], 0.0)
+    outline = np.array(shapes, dtype=object)
+    if len(outline):
+        outline = shapely.make_valid(project(outline, frame, WGS84))
+        outline = np.where(narrow, shapely.buffer(outline, radius), outline)
+    # A low tree keeps half of its height as a crown.
+    bottom = np.where(narrow, np.minimum(CLEARANCE, top / 2), 0.0)
+    return Trees(outline, kind, bottom, top, np.array([height is None for height in heights], dtype=bool))
+
+
+def _stated(tags: Mapping[str, str], key: str, largest: float) -> float | None:
+    """A length of a map [m]; None if it is not stated, cannot be read or is impossible."""
+    length = parse_length(tags.get(key))
+    return length if length is not None and 0 < length <= largest else None
