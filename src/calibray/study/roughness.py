@@ -47,4 +47,5 @@ def roughness_effects(stated: Mapping[str, float], parameters: Parameters, paths
     ]
     per_mm = 8 * (np.pi * 1e-3 * paths.frequency / speed_of_light) ** 2
     heights = np.array([stated.get(name, 0.0) for name in rough])
-    return (RoughSurfaces(per_mm * np.stack(square, axis=1), heights, tuple(map(number.get, rough))),)
+    exponent = np.asarray(per_mm * np.stack(square, axis=1), dtype=np.float64)
+    return (RoughSurfaces(exponent, heights, tuple(map(number.get, rough))),)
