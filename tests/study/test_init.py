@@ -346,6 +346,24 @@ def test_a_carrier_that_no_law_of_itu_covers_gets_the_constants_of_the_nearest(s
     assert stated["walls"].relative_permittivity == at_1_ghz.relative_permittivity
 
 
+@pytest.mark.parametrize(("places", "held_out"), [(24, True), (18, False), (24, False)])
+def test_blocks_are_held_out_if_links_suffice(scene, tmp_path, places, held_out):
+    columns = {
+        "x": np.arange(24.0) % places,
+        "y": 20.0,
+        "pathloss": np.arange(80, 104),
+        "tx_x": -30.0,
+        "tx_y": 0.0,
+    }
+    if not held_out and places == 24:  # as many offsets as there are links for five each
+        columns = {**columns, "tx_x": -30.0 - np.arange(24.0) // 4, "cell": np.arange(24) // 4}
+        columns["rsrp"] = -columns.pop("pathloss")
+    drafted = draft(scene, table(tmp_path, **columns), tmp_path / "study.toml", frequency=3.5e9)
+    assert (drafted.study.holdout is not None) == held_out
+    assert ("holdout.blocks" in assumed(drafted)) == held_out
+    assert not held_out or drafted.study.holdout.blocks == 4
+
+
 def test_averages_fit_the_site_and_few_links_are_warned_of(tmp_path):
     plan = tmp_path / "plan.csv"
     plan.write_text("x0,y0,x1,y1,type\n0,0,12,0,brick\n12,0,12,8,brick\n12,8,0,8,brick\n0,8,0,0,brick\n")

@@ -20,6 +20,7 @@ from calibray.scenes.authoring import TREES_FILE
 from calibray.scenes.checks import count_crossings
 from calibray.study.draft_antennas import add_antennas
 from calibray.study.draft_links import Assumption, LinksDraft
+from calibray.study.link_checks import LINKS_PER_UNKNOWN, count_unknowns
 from calibray.study.model import BUNDLED, VERSION
 from calibray.study.regions import Place, RegionSection, dense_trees
 from calibray.study.study import Study
@@ -34,6 +35,10 @@ METAL_CONDUCTIVITY: Final = 1e6
 
 MOST_MATERIALS: Final = 6
 """Materials that are calibrated at most; links seldom identify more."""
+
+
+BLOCKS: Final = 4
+"""Number of blocks that are held out in turn, the default of `calibray validate`."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,7 @@ def draft(
     sites, route = (Path(file) if file else None for file in (transmitters, track))
     drafted = LinksDraft(scene, Path(links), Path(target), sites, route, frequency, tx)
     content = _content(drafted, Path(antennas) if antennas else None)
+    _hold_out_blocks(drafted, content)
     text = study_text(content, {assumption.what: assumption.reason for assumption in drafted.assumptions})
     study = Study.from_content(tomllib.loads(text), target)
     return Draft(text, study, tuple(drafted.assumptions))
@@ -115,6 +121,20 @@ def _content(links: LinksDraft, antennas: Path | None) -> dict[str, Any]:
         **({"fidelity": {"tolerance_db": 2.0, "rounds": 1}} if indoors else {}),
         "method": {"name": "auto", "seed": 0},
     }
+
+
+def _hold_out_blocks(links: LinksDraft, content: dict[str, Any]) -> None:
+    """Hold blocks of neighbours out in turn, if there are enough links and places to fit to three of four blocks."""
+    study = Study.from_content(content, links.target)
+    measured = study.measurements()
+    places = len(np.unique(measured.rx[:, :2], axis=0))
+    if count_unknowns(study, measured) or places < BLOCKS * LINKS_PER_UNKNOWN:
+        return
+    content["holdout"] = {"blocks": BLOCKS}
+    reason = (
+        "each block of neighbours is predicted from the others; predictions use the model that does it best"
+    )
+    links.assume("holdout.blocks", BLOCKS, reason)
 
 
 def _indoors(links: LinksDraft) -> bool:

@@ -172,7 +172,7 @@ def _divide(problem: Problem, count: int | None, by: str | None) -> tuple[NDArra
     if len(labels) < 2 or counted.sum() < len(labels) or fewest <= problem.unknowns:
         raise InputError(
             f"{links.source}: {int(counted.sum())} links in {len(labels)} blocks leave {fewest} links to calibrate "
-            f"{problem.unknowns} unknowns; use at least two blocks with fewer links each"
+            f"{problem.unknowns} unknowns; use at least two blocks with fewer links each, or remove [holdout]"
         )
     return block, labels
 
