@@ -23,6 +23,7 @@ from calibray.prediction.observables import Replayed, further_observables
 from calibray.prediction.position_checks import POSITION_COLUMNS, remarks
 from calibray.prediction.residual_field import calibration_residuals, krige_residuals
 from calibray.result.held_out import Model
+from calibray.result.prediction_model import PredictionModel
 from calibray.result.record import Record
 from calibray.study import Setup, Study
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
@@ -219,17 +220,16 @@ def interval(
     modelled = _modelled(result, links, replayed) + shift.value_db
     best, reached = modelled[0], np.isfinite(modelled).all(axis=0)
     deviation = np.where(reached, modelled[1:] - np.where(reached, best, 0.0), 0.0)
-    variance = shift.spread_db**2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
+    factor, between = _quantiles(model, level)
+    variance = (between * shift.spread_db) ** 2 + (np.mean(deviation**2, axis=0) if draws else 0.0)
     best = np.where(reached, best, np.inf)
     basis = model.basis
     if result.held_out is None and model.parameters is not None and not draws:
         basis += ", without uncertainty of the parameters"
     # Near measured links the residual field is known, and only the uncorrelated part of the residual is left.
-    far_db = _residual_db(result, links)
+    far_db = _residual_db(result, links, between)
     near_db = far_db if field is None else np.minimum(field.own_db, far_db)
     total_db = np.sqrt((1.0 - known_share) * far_db**2 + known_share * near_db**2 + variance)
-    freedom = model.links if model.blocks is None else model.blocks.freedom
-    factor = float(stdtrit(freedom, (1 + level) / 2))
     link_basis = np.where(shift.spread_db > 0, f"{basis}, group without measurements", basis)
     link_basis = np.where(
         known_share > NEAR_SHARE, np.char.add(link_basis, ", near measured links"), link_basis
@@ -248,8 +248,19 @@ def interval(
     return fill_missing(result.prediction, result.study, links, table, level, half_width)
 
 
-def _residual_db(result: Record, links: Measurements) -> NDArray[np.float64]:
-    """Standard deviation of the prediction model's errors at new links [links], [dB].
+def _quantiles(model: PredictionModel, level: float) -> tuple[float, float]:
+    """Quantile of Student's t for errors of links, and that for errors of blocks, relative to it.
+
+    Both are estimates with their own degrees of freedom. Blocks have as many as there are blocks, because their mean
+    errors count from zero.
+    """
+    count = 0 if model.blocks is None else model.blocks.blocks
+    factor = float(stdtrit(max(model.links - count, 1), (1 + level) / 2))
+    return factor, float(stdtrit(count, (1 + level) / 2)) / factor if count else 1.0
+
+
+def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[np.float64]:
+    """Standard deviation of the prediction model's errors at new links [links], [dB]; between blocks times a ratio.
 
     Beyond the distance that held-out links kept from the others, the error between blocks counts up to twice: a place
     that far away differs from the blocks as these differ from each other. What random effects add to these errors is
@@ -262,8 +273,8 @@ def _residual_db(result: Record, links: Measurements) -> NDArray[np.float64]:
     measured = result.links[list(POSITION_COLUMNS)].to_numpy(float)[rows]
     distance = KDTree(measured).query(np.hstack([links.tx, links.rx]))[0]
     beyond = np.clip(distance / max(model.blocks.reach_m, 1e-9) - 1.0, 0.0, 1.0)
-    within, between = model.blocks.within_db**2, model.blocks.between_db**2
-    return np.sqrt(np.maximum(within + between * (1.0 + beyond) - model.blocks.groups_db**2, within))
+    within, between = model.blocks.within_db**2, model.blocks.between_db**2 * (1.0 + beyond)
+    return np.sqrt(within + ratio**2 * np.maximum(between - model.blocks.groups_db**2, 0.0))
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:

@@ -38,14 +38,14 @@ class BlockErrors:
     Attributes:
         within_db: Standard deviation of a link's own error [dB].
         between_db: Standard deviation of the error that a new block's links have in common [dB].
-        freedom: Degrees of freedom of both together.
+        blocks: Number of blocks.
         reach_m: Distance to the nearest calibration link that nine of ten held-out links kept [m].
         groups_db: Root mean square of what random effects of groups without other links add to these errors [dB].
     """
 
     within_db: float
     between_db: float
-    freedom: float
+    blocks: int
     reach_m: float
     groups_db: float = 0.0
 
