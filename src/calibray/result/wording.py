@@ -302,7 +302,7 @@ def choice_text(chosen: str, best: str) -> str:
     reason = "uses the scene" if best in WITHOUT_MATERIALS else "keeps the initial materials"
     return (
         f"Predictions use the model {str(chosen)!r}: it {reason} and is worse than {str(best)!r} by no more than the "
-        "bootstrap error."
+        "bootstrap error or 5 %."
     )
 
 
