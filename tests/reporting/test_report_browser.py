@@ -164,6 +164,15 @@ def test_the_list_chooses_by_keyboard_and_sorts(opened):
     assert sizes == sorted(sizes, reverse=True)
 
 
+def test_values_and_verdicts_fit_a_phone(opened):
+    page = opened("phone")
+    ends = page.evaluate(
+        "[...document.querySelectorAll('.values td')].map((cell) => cell.getBoundingClientRect().right)"
+    )
+    assert ends
+    assert max(ends) <= SIZES["phone"][0]
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_outlines_and_walls_are_drawn_on_the_map(opened, scheme):
     page = opened(scheme=scheme)

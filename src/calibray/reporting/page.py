@@ -195,6 +195,7 @@ def page(result: Record, data: PageData, figures: Mapping[str, Figure]) -> str:
     return environment.get_template("report.html.jinja").render(
         name=_title(result.study.path),
         heading=tables.heading(result),
+        sources=(Path(result.study.links.file).name, "/".join(Path(result.study.scene.file).parts[-2:])),
         date=date.today().isoformat(),
         quantity=measured_quantity(result).name,
         css=Markup(_asset("report.css")),
