@@ -2,6 +2,10 @@
 
     python benchmarks/certainty_cost.py
     python benchmarks/certainty_cost.py STUDY ...
+    python benchmarks/certainty_cost.py --seeds 3 STUDY ...
+
+With `--seeds`, only the draws, from several seeds: their time, the widths of the 90 % sets, and how many independent
+draws they are worth. Members of a population are counted by how much the mean over a member's kept states scatters.
 
 Processor seconds of this process and replays, on the study's own paths, compiled before anything is timed. The script
 fails where all of it together costs more than ten times the calibration.
@@ -13,6 +17,9 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from calibray import engines
 from calibray.fitting.methods import choose
@@ -24,10 +31,14 @@ from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
+from calibray.uncertainty.credible_sets import credible
+from calibray.uncertainty.draws import Draws
+from calibray.uncertainty.sequential_monte_carlo import KEPT, LAST_SWEEPS, SIZE
 from calibray.validation.choice import HeldOutResiduals, fit_prediction_model
 from calibray.validation.validate import validate_problem
 
 LIMIT = 10.0
+LEVEL = 0.9
 
 
 def costs(problem: Problem) -> dict[str, tuple[float, int]]:
@@ -52,14 +63,62 @@ def costs(problem: Problem) -> dict[str, tuple[float, int]]:
     return found
 
 
+def seeds(problem: Problem, count: int) -> Table:
+    """Draws from several seeds: time, replays, effective draws, widths of the 90 % sets as shares of the range."""
+    trail, study = search(problem, choose(problem)), problem.setup.study
+    lower, upper = problem.parameters.search_bounds
+    rows, widths = [], []
+    for seed in range(count):
+        method = study.method.model_copy(update={"seed": seed})
+        setup = replace(problem.setup, study=study.model_copy(update={"method": method}))
+        started = time.process_time()
+        found = certainty(replace(problem, setup=setup), trail)
+        spent = time.process_time() - started
+        if found.posterior is None:
+            sys.exit(f"no draws: {found.remarks}")
+        draws = found.posterior.means
+        widths.append([
+            sum(high - low for low, high in credible(draws.point[:, k], draws.weight, lower[k], upper[k], LEVEL))
+            for k in range(len(lower))
+        ])  # fmt: skip
+        shares = (f"{share:.2f}" for share in widths[-1] / (upper - lower))
+        agree = "yes" if draws.agree else "no"
+        rows.append(
+            (str(seed), f"{spent:.1f}", f"{found.calls:,}", agree, f"{effective(draws):.0f}", *shares)
+        )
+    apart = np.ptp(widths, axis=0) / np.mean(widths, axis=0)
+    rows.append(("apart", "", "", "", "", *(f"{share:.0%}".replace("%", " %") for share in apart)))
+    columns = (
+        Column("seed"), numbers("processor", "s"), numbers("replays"), Column("agree"), numbers("effective"),
+        *(numbers(name) for name in problem.parameters.names),
+    )  # fmt: skip
+    return Table(study.path.name, columns, tuple(rows))
+
+
+def effective(draws: Draws) -> float:
+    """Independent draws that the draws are worth, for the parameter for which they are worth least."""
+    states = LAST_SWEEPS // KEPT
+    for populations in (2, 4):
+        size = len(draws.point) // (populations * states)
+        if size <= SIZE[1]:
+            break
+    point = draws.point.reshape(populations, states, size, -1)
+    scatter = point.mean(axis=1).var(axis=(0, 1)) / point.var(axis=(0, 1, 2))
+    return populations * size / float(scatter.max())
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("studies", nargs="*", default=[str(demo_study_path())], help="study files")
+    parser.add_argument("--seeds", type=int, default=0, help="seeds of draws to compare; 0 for the costs")
     options, expensive = parser.parse_args(), False
     columns = (Column("part"), numbers("processor", "s"), numbers("replays"), numbers("ratio"))
     for file in options.studies:
         setup = Study.load(file).opened()
+        if options.seeds:
+            print(render(seeds(Problem.of(setup, engines.make(setup)), options.seeds)))
+            continue
         found = costs(Problem.of(setup, engines.make(setup)))
         own = found["calibration"][0]
         rows = [

@@ -122,13 +122,20 @@ class Streets:
         return self.blocks * self.pitch + self.width
 
 
-def make(name: str, folder: Path, missing: float = 0.0) -> District:
+def named(words: str) -> list[str]:
+    """Names of districts from names and groups, separated by commas."""
+    groups = {"all": (DEMO, *DEVELOPMENT, *JUDGING), "development": DEVELOPMENT, "judging": JUDGING}
+    return [name for word in words.split(",") for name in groups.get(word, (word,))]
+
+
+def make(name: str, folder: Path, missing: float = 0.0, links: int | None = None) -> District:
     """Make a district and trace it; the package's cache keeps its paths.
 
     Args:
         name: "demo", or "district-SEED".
         folder: Folder for the scene and its links.
         missing: Share of the buildings that the scene lacks; the links are those of the complete district.
+        links: Number of links; drawn from 20 to 200 if None.
     """
     if name == DEMO:
         setup = Study.load(demo_study_path()).opened()
@@ -136,11 +143,13 @@ def make(name: str, folder: Path, missing: float = 0.0) -> District:
     else:
         # A folder for each process: another one may be writing the same district.
         seed = int(name.removeprefix("district-"))
-        setup, footprints = _drawn(seed, folder / f"{name}-{missing:g}-{os.getpid()}", missing)
+        setup, footprints = _drawn(seed, folder / f"{name}-{missing:g}-{os.getpid()}", missing, links)
     return District(name, Problem.of(setup, engines.make(setup, "replay")), footprints)
 
 
-def _drawn(seed: int, folder: Path, missing: float) -> tuple[Setup, tuple[np.ndarray, ...]]:
+def _drawn(
+    seed: int, folder: Path, missing: float, links: int | None
+) -> tuple[Setup, tuple[np.ndarray, ...]]:
     random = np.random.default_rng([seed, 77])
     blocks, width = random.integers(2, 5, 2), random.uniform(14, 30)
     block = random.uniform(50, 130, 2)
@@ -169,7 +178,7 @@ def _drawn(seed: int, folder: Path, missing: float) -> tuple[Setup, tuple[np.nda
     }
     if random.random() < 0.5:
         bounds["walls.conductivity"] = {"bounds": [1e-3, 3.0], "scale": "log"}
-    count = round(float(np.exp(random.uniform(np.log(20), np.log(200)))))
+    count = links or round(float(np.exp(random.uniform(np.log(20), np.log(200)))))
     table = _links(4 * count, streets, random)
     table.to_csv(folder / "links.csv", index=False)
     content = {

@@ -9,7 +9,7 @@ import pytest
 
 import synthetic
 from calibray.engines import Replay
-from calibray.engines.compression import MIN_PATHS, compress, sparse_weights
+from calibray.engines.compression import MIN_PATHS, compress, sparse_weights, strongest
 from calibray.errors import InputError
 from calibray.parameters import Parameter, Parameters
 from calibray.paths import Kind, Paths, take
@@ -100,3 +100,19 @@ def test_weights_that_cannot_exist_are_not_made_up() -> None:
 def test_a_tolerance_that_is_none_is_refused(paths, parameters, tolerance_db: float) -> None:
     with pytest.raises(InputError, match="tolerance_db"):
         compress(paths, parameters, tolerance_db)
+
+
+def test_paths_left_out_carry_less_than_their_share(paths, parameters) -> None:
+    share = 0.05
+    kept = strongest(paths, parameters, share)
+    assert kept.num_paths < 0.95 * paths.num_paths
+    assert kept.num_links == paths.num_links
+    candidates = parameters.from_unit(np.random.default_rng(4).random((50, 3)))
+    full, fewer = (Replay(some, parameters, dtype=np.float64).path_loss(candidates) for some in (paths, kept))
+    loss_db = fewer - full
+    assert loss_db.min() >= -1e-9
+    assert loss_db.max() < -10 * np.log10(1 - share)
+    assert np.mean(loss_db) < 0.05
+    # Without a share to lose, only paths without power go.
+    every = strongest(paths, parameters, 0.0)
+    assert Replay(every, parameters, dtype=np.float64).path_loss(candidates) == pytest.approx(full, abs=1e-9)

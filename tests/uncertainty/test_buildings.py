@@ -17,6 +17,7 @@ from calibray.parameters import Parameter
 from calibray.result.verdict import Cause
 from calibray.scenes import Triangles, building_numbers
 from calibray.study import Setup, Study
+from calibray.uncertainty import buildings
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.buildings import split_replay
 from calibray.uncertainty.joint_model import joint_model
@@ -150,3 +151,14 @@ def test_logarithms_of_factors_act_on_the_gaps(problem):
         by_factor = model.gaps(model.parameters.to_unit(value)[None], logarithms)
         assert by_factor == pytest.approx(model.gaps(model.parameters.to_unit(scaled)[None], none), abs=1e-9)
         assert np.abs(by_factor - model.gaps(model.parameters.to_unit(value)[None], none)).max() > 0.1
+
+
+def test_weak_paths_are_left_out_of_large_programs(problem, monkeypatch):
+    values = problem.parameters.from_unit(np.random.default_rng(6).random((20, 3)))
+    whole = problem.engine.path_loss(values)
+    monkeypatch.setattr(buildings, "MANY", 0)
+    replay = split_replay(problem, problem.parameters, by_building=True)
+    assert 0 < replay.engine.interactions < problem.engine.interactions
+    fewer = replay.path_loss(values, np.ones((20, len(replay.parameter_of))))
+    assert 0.0 < np.abs(fewer - whole).max() < 0.2
+    assert np.mean(np.abs(fewer - whole)) < 0.02

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
@@ -9,13 +11,15 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from scipy.stats import t as student
 
+import planted
+from calibray.engines import Replay
+from calibray.fitting.problem import Problem
+from calibray.measurements import links_from_frame
+from calibray.paths import take
+from calibray.study import Setup, Study
 from calibray.uncertainty import heavy_tails as tails
-from calibray.uncertainty.noise_models import (
-    OFFSET_DB,
-    Marginal,
-    NoiseModel,
-    noise_models,
-)
+from calibray.uncertainty.link_features import link_features
+from calibray.uncertainty.noise_models import IMPROBABLE, OFFSET_DB, Marginal, NoiseModel, noise_models
 from calibray.uncertainty.whitening import whitener
 
 RANDOM = np.random.default_rng(1)
@@ -24,10 +28,10 @@ POSITION = RANDOM.uniform(0, 100, (COUNT, 3))
 GAP = RANDOM.normal(0, 2, COUNT)
 
 
-def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0) -> Marginal:
+def marginal(models, design=None, ridge=None, position=POSITION, noise_db=2.0, features=None) -> Marginal:
     design = np.zeros((len(position), 0)) if design is None else design
     ridge = np.zeros(design.shape[1]) if ridge is None else ridge
-    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models)
+    return Marginal.of(design, ridge, np.ones(len(position)), position, noise_db, models, None, features)
 
 
 def integral(log_density) -> float:
@@ -42,7 +46,7 @@ def integral(log_density) -> float:
     [
         (NoiseModel("gaussian", 1.0), np.eye(COUNT)),
         (
-            NoiseModel("correlated", 1.0, range_m=50.0, share=0.7),
+            NoiseModel("correlated", 1.0, range=50.0, share=0.7),
             0.7 * np.exp(-cdist(POSITION, POSITION) / 50) + 0.3 * np.eye(COUNT),
         ),
     ],
@@ -155,22 +159,23 @@ def test_nearest_neighbours_approximate_the_exact_whitener():
     )
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "correlated", "student-t"])
+@pytest.mark.parametrize("kind", ["gaussian", "correlated", "structured", "student-t"])
 def test_planted_errors_favour_their_kind(kind):
     """For 150 links, the planted kind gets the largest weight; a planted offset is recognised."""
     random = np.random.default_rng(7)
-    position = random.uniform(0, 600, (150, 2))
+    position, features = random.uniform(0, 600, (150, 2)), random.normal(0, 0.6, (150, 3))
     errors = {
         "gaussian": 3 * random.standard_normal(150),
         "correlated": 3
         * np.linalg.cholesky(np.exp(-cdist(position, position) / 60) + 1e-6 * np.eye(150))
         @ random.standard_normal(150),
+        "structured": 3 * features.sum(axis=1) + random.standard_normal(150),
         "student-t": 3 * random.standard_t(2.5, 150),
     }[kind]
-    models = noise_models(position)
+    models = noise_models(position, structured=True)
     assert sum(model.weight for model in models) == pytest.approx(1.0)
     assert sum(model.weight for model in models if model.offset) == pytest.approx(2 / 3)
-    density = marginal(models, position=position, noise_db=2.0)
+    density = marginal(models, position=position, noise_db=2.0, features=features)
 
     def weights(gap):
         found = density.densities(gap[None])[0]
@@ -192,7 +197,7 @@ def test_declared_properties_are_fixed():
 
     assert kinds(kind="gaussian", range_m=0.0) == {"gaussian"}
     assert kinds(kind="student-t") == {"student-t"}
-    assert {model.range_m for model in noise_models(POSITION, range_m=60.0)} == {60.0}
+    assert {model.range for model in noise_models(POSITION, range_m=60.0)} == {60.0}
     assert not any(model.offset for model in noise_models(POSITION, offset=False))
 
 
@@ -201,8 +206,8 @@ def test_links_of_one_position_share_errors():
     random = np.random.default_rng(3)
     place = random.uniform(0, 400, (40, 3))
     repeated = np.repeat(place, 3, axis=0)
-    assert min(model.range_m for model in noise_models(repeated) if model.kind == "correlated") < 1.0
-    assert min(model.range_m for model in noise_models(place) if model.kind == "correlated") > 5.0
+    assert min(model.range for model in noise_models(repeated) if model.kind == "correlated") < 1.0
+    assert min(model.range for model in noise_models(place) if model.kind == "correlated") > 5.0
     models = noise_models(repeated, offset=False)
     density = marginal(models, position=repeated, noise_db=3.0)
     log = density.densities(
@@ -210,7 +215,43 @@ def test_links_of_one_position_share_errors():
     )
     best = models[int(np.argmax(log[0]))]
     assert (best.kind, best.share) == ("correlated", 0.95)
-    assert best.range_m < 1.0
+    assert best.range < 1.0
     # Measurements of one place with independent errors favour no shared ones.
     log = density.densities(3.0 * random.standard_normal((1, 120)))
     assert models[int(np.argmax(log[0]))].kind == "gaussian"
+
+
+def test_links_with_like_obstruction_and_paths_have_like_features():
+    study = Study.from_content(planted.content("links.csv", noise=None))
+    problem = Problem.of(Setup.open(study, links=links_from_frame(planted.links())), planted.engine())
+    # Every second link without its simple paths, so that links differ in depth.
+    paths = problem.engine.paths
+    blocked = (np.diff(paths.first) == 1) & (paths.link % 2 == 0)
+    paths = take(paths, np.flatnonzero(~blocked))
+    features = link_features(replace(problem, engine=Replay(paths, problem.parameters)))
+    assert np.mean(features**2) * features.shape[1] == pytest.approx(1.0)
+    depth = features[:, -2]
+    fewest = np.full(paths.num_links, np.inf)
+    np.minimum.at(fewest, paths.link, np.diff(paths.first))
+    assert np.corrcoef(depth, fewest)[0, 1] == pytest.approx(1.0)
+    # An error that grows with depth is structured, whatever the position of the links.
+    gap = 6.0 * depth / depth.std() + 0.5 * np.random.default_rng(0).standard_normal(len(depth))
+    place = np.random.default_rng(1).uniform(0, 300, (len(depth), 3))
+    models = noise_models(place, structured=True)
+    density = marginal(models, position=place, features=features).densities(gap[None])[0]
+    assert models[int(np.argmax(density))].kind == "structured"
+
+
+def test_models_far_less_probable_are_left_out():
+    """Strongly correlated errors of many links: models without shared errors explain them far worse."""
+    random = np.random.default_rng(5)
+    position = random.uniform(0, 200, (200, 3))
+    common = np.linalg.cholesky(np.exp(-cdist(position, position) / 120) + 1e-9 * np.eye(200))
+    gap = (6.0 * common @ random.standard_normal(200) + 0.5 * random.standard_normal(200))[None]
+    density = marginal(noise_models(position), position=position)
+    fewer = density.without_improbable(gap)
+    assert {model.kind for model in fewer.models} == {"correlated"}
+    assert set(fewer.models) < set(density.models)
+    best = density.densities(gap).max()
+    assert fewer.densities(gap).min() > best - IMPROBABLE
+    assert fewer.densities(gap).max() == best

@@ -13,7 +13,7 @@ from calibray.result import Interval, RemarkKind, Verdict
 from calibray.result.wording import remark_text
 from calibray.study import Setup, Study
 from calibray.uncertainty.noise_models import CORRELATED
-from calibray.uncertainty.remarks import outside_interval
+from calibray.uncertainty.remarks import departures, outside_interval
 
 NAMES = tuple(planted.TRUTH)
 
@@ -46,3 +46,15 @@ def test_values_outside_their_intervals_are_named_with_the_reason():
     assert "blocks = 4" not in remarks(outside, holdout={"blocks": 3})[0]
     assert remarks(outside, holdout={"where": "rx_x > 0"})[0] == text
     assert "more than 1,000 times" in remarks(outside, 50.0)[0]
+
+
+def test_noise_that_the_data_favour_is_reported():
+    def kinds(**noise):
+        return [remark.kind for remark in departures(noise)]
+
+    # Kinds that share the weight count against Gaussian noise; those of little weight do not.
+    assert kinds(gaussian=0.02, correlated=0.2, structured=0.7) == [RemarkKind.STRUCTURED_NOISE]
+    assert kinds(gaussian=0.5, correlated=0.2, structured=0.3) == []
+    # Beforehand, half of the weight is that of buildings which differ.
+    assert kinds(gaussian=0.9, heterogeneous=0.7) == []
+    assert kinds(gaussian=0.9, heterogeneous=0.8) == [RemarkKind.HETEROGENEITY]

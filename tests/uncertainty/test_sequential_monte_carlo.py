@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
+import dynesty
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -10,8 +11,8 @@ from calibray.parameters import NO_PRIOR, LogNormal, Parameter, Parameters
 from calibray.result.verdict import Cause
 from calibray.uncertainty import sequential_monte_carlo as module
 from calibray.uncertainty.joint_model import ALIKE, MEAN_SPREAD, SPREAD_BOUNDS, JointModel
-from calibray.uncertainty.noise_models import Marginal, NoiseModel
-from calibray.uncertainty.sequential_monte_carlo import EFFECTIVE, SIZE, draw_posterior
+from calibray.uncertainty.noise_models import Marginal, NoiseModel, noise_models
+from calibray.uncertainty.sequential_monte_carlo import EFFECTIVE, draw_posterior
 from calibray.uncertainty.width_causes import remaining_widths
 
 GAUSSIAN = NoiseModel("gaussian", 1.0)
@@ -262,7 +263,8 @@ def test_populations_that_disagree_are_reported():
     first, turn[0] = turn[0] // 2, 0
     posterior = draw_posterior(model, seed=1)
     assert not posterior.means.agree
-    assert posterior.means.weight[: SIZE[0]].sum() == pytest.approx(0.5)
+    half = len(posterior.means.weight) // 2
+    assert posterior.means.weight[:half].sum() == pytest.approx(0.5)
 
 
 def test_each_step_leaves_half_of_the_members_effective():
@@ -281,3 +283,52 @@ def test_draws_are_the_same_for_a_seed():
     )
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, other)
+
+
+def test_draws_agree_with_nested_sampling():
+    """An independent sampler (dynesty) on a posterior with several ranges, with and without an undeclared offset.
+
+    Distribution functions of 500 independent draws differ from the true one by at most 0.06 in 19 of 20 cases; draws of
+    either sampler are worth about as many.
+    """
+    random = np.random.default_rng(8)
+    pattern, names = random.standard_normal((3, 24)), ("walls", "panes", "roofs")
+    parameters = _parameters(names=tuple(f"{name}.relative_permittivity" for name in names))
+
+    def modelled(point):
+        shape = np.stack(
+            [np.sin(9.0 * point[:, 0]), 2.0 * point[:, 1], 12.0 * (point[:, 2] - 0.5) ** 2], axis=1
+        )
+        return shape @ pattern
+
+    measured = modelled(np.array([[0.3, 0.6, 0.85]]))[0] + random.standard_normal(24)
+    places = np.column_stack([random.uniform(0, 300, (24, 2)), np.zeros(24)])
+    models = noise_models(places, kind="gaussian", range_m=0.0)
+    model = _model(parameters, lambda point, _: measured - modelled(point), 24, buildings=0, models=models)
+    draws = draw_posterior(model, seed=1).means
+    unit = (draws.point - LOWER) / (UPPER - LOWER)
+
+    def log_likelihood(point):
+        return float(
+            np.logaddexp.reduce(model.densities_by_model(measured - modelled(point[None])), axis=1)[0]
+        )
+
+    sampler = dynesty.NestedSampler(
+        log_likelihood,
+        lambda point: point,
+        3,
+        nlive=200,
+        sample="rwalk",
+        bootstrap=0,
+        rstate=np.random.default_rng(2),
+    )
+    sampler.run_nested(print_progress=False, dlogz=0.1)
+    found = sampler.results
+    weight = np.exp(found.logwt - found.logz[-1])
+    at = np.linspace(0.0, 1.0, 201)
+    for index in range(3):
+        own = draws.weight @ (unit[:, index, None] <= at)
+        other = weight @ (found.samples[:, index, None] <= at) / weight.sum()
+        assert np.abs(own - other).max() < 0.085
+    # The posterior has parts in ranges that a local sampler does not leave.
+    assert 0.2 < draws.weight @ (unit[:, 2] < 0.5) < 0.8

@@ -132,6 +132,20 @@ def compress(
     return Compressed(compressed, error, CHECKED)
 
 
+def strongest(paths: Paths, parameters: Parameters, share: float) -> Paths:
+    """A program without the paths that together carry at most a share of their link's power, for sums of powers.
+
+    Their power is the sum over candidates that are spread over the parameters' bounds, so that at a single one of them
+    the paths left out carry less. Raises InputError if a parameter's material is not in the paths.
+    """
+    candidates = parameters.from_unit(qmc.Sobol(len(parameters), rng=0).random(RANKING))
+    _, strength, _ = _evaluate_all(paths, parameters, [candidates], FIRST_INTERVALS)
+    order = np.lexsort((strength, paths.link))
+    total = np.concatenate([[0.0], np.cumsum(strength[order])])
+    weaker = total[1:] - total[np.searchsorted(paths.link, paths.link[order])]
+    return take(paths, np.sort(order[weaker > share]))
+
+
 def _candidate_sets(parameters: Parameters, seed: int) -> list[NDArray[np.float64]]:
     """Training candidates with corners of the bounds, and then the candidates of every check [n, d].
 

@@ -43,6 +43,7 @@ class Cause(StrEnum):
 
     BUILDINGS = "buildings that differ"
     CORRELATION = "correlated errors"
+    STRUCTURE = "errors that depend on obstruction, distance or angles"
     HEAVY_TAILS = "heavy-tailed errors"
     OFFSET = "undeclared offset"
     CONSTANTS = "constants that the scene fixes"

@@ -25,8 +25,9 @@ from calibray.fitting.nuisance import CONSTANT
 from calibray.fitting.problem import Problem
 from calibray.parameters import LogNormal, Parameter, Parameters, fixed_constant, split_name
 from calibray.uncertainty.buildings import can_split, split_replay
+from calibray.uncertainty.link_features import link_features
 from calibray.uncertainty.noise_models import Marginal, noise_models
-from calibray.uncertainty.quadratic_forms import QuadraticForms
+from calibray.uncertainty.quadratic_forms import MAX_LINKS, QuadraticForms
 
 FEWEST: Final = 8
 """Links below which only independent Gaussian noise is tried; fewer cannot distinguish other noise models."""
@@ -189,15 +190,21 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
     used = objective.determined & ~at_bound
     few = len(counted) < FEWEST
     # With correlated errors, the probability of censoring is an integral over all censored links.
-    uncorrelated = few or censored.any()
+    uncorrelated = few or bool(censored.any())
+    structured = not uncorrelated and section.range_m == "auto"
     models = noise_models(
         position,
         kind="gaussian" if few else None if section.kind == "auto" else section.kind,
         range_m=0.0 if uncorrelated else None if section.range_m == "auto" else float(section.range_m),
         offset=not has_offset(problem),
         censored=bool(censored.any()),
+        structured=structured,
     )
+    features = link_features(problem)[counted] if structured else None
     ridge = objective.noise_db / nuisance.prior[used] if nuisance.terms else np.zeros(0)
+    marginal = Marginal.of(
+        design[:, used], ridge, scale, position, noise_db, models, censored, features=features
+    )
     measured = objective.measured[counted] - design[:, at_bound] @ coefficients[at_bound]
 
     def gap(loss: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -210,6 +217,8 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         values = problem.parameters.from_unit(points)
         return np.hstack([gap(loss_of(values)), *_further(problem, lambda: _observe(problem, values))])
 
+    if len(counted) > MAX_LINKS:
+        marginal = marginal.without_improbable(gap(loss_of(problem.parameters.from_search(best[None]))))
     none = np.zeros(0, dtype=np.int64)
     spread = 0.0 if few else None if section.heterogeneity == "auto" else float(section.heterogeneity)
     model = JointModel(
@@ -218,7 +227,16 @@ def joint_model(problem: Problem, best: NDArray[np.float64], square: float, free
         problem.priors,
         gaps_of,
         loss_of,
-        Marginal.of(design[:, used], ridge, scale, position, noise_db, models, censored),
+        Marginal.of(
+            design[:, used],
+            ridge,
+            scale,
+            position,
+            noise_db,
+            models,
+            censored,
+            link_features(problem)[counted] if structured else None,
+        ),
         none,
         none,
         none,
@@ -240,30 +258,37 @@ def _with_constants(
 ) -> JointModel:
     """The model with the constants that the scene fixes and have an effect, and with buildings."""
     study, known_to = model.study, problem.setup.study.noise.constants_spread
-    fixed, effects = _fixed_constants(problem), {}
+    fixed = _fixed_constants(problem)
+    every = replace(study, items=(*study.items, *fixed))
+    replay, effects = split_replay(problem, every, by_building=model.spread != 0), {}
     if fixed:
-        every = split_replay(problem, replace(study, items=(*study.items, *fixed)), by_building=False)
         values = np.append(study.from_search(best), [item.start for item in fixed])
         steps = np.exp(known_to * np.eye(len(values))[len(study) :])
-        gaps = gap(
-            every.path_loss(np.vstack([values, values * steps]), np.ones((1, len(every.parameter_of))))
-        )
+        alike = np.ones((len(values) - len(study) + 1, len(replay.parameter_of)))
+        gaps = gap(replay.path_loss(np.vstack([values, values * steps]), alike))
         with np.errstate(invalid="ignore"):  # inf - inf for a censored link without a path
             change = gaps[1:] - gaps[:1]
         effect_db = np.sqrt(np.mean(np.where(np.isfinite(change), change, 0.0) ** 2, axis=1))
         effects = dict(zip((item.name for item in fixed), effect_db.tolist(), strict=True))
-        fixed = [item for item in fixed if effects[item.name] > NO_EFFECT * model.marginal.noise_db]
-    parameters = replace(study, items=(*study.items, *fixed))
-    replay = split_replay(problem, parameters, by_building=model.spread != 0)
+    varied = [item for item in fixed if effects[item.name] > NO_EFFECT * model.marginal.noise_db]
+    parameters = replace(study, items=(*study.items, *varied))
+    index = [every.names.index(name) for name in parameters.names]
+
+    def full(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values with the constants that have no effect."""
+        all_values = np.tile([item.start for item in every.items], (len(values), 1))
+        all_values[:, index] = values
+        return all_values
+
     of_building = np.flatnonzero((replay.building_of >= 0) & (replay.parameter_of < len(study)))
     parameter_of = replay.parameter_of[of_building]
-    constants = np.bincount(replay.parameter_of, minlength=len(parameters))
-    of_buildings = np.bincount(parameter_of, minlength=len(parameters))
+    constants = np.bincount(replay.parameter_of, minlength=len(every))[: len(study)]
+    of_buildings = np.bincount(parameter_of, minlength=len(study))
 
     def gaps_of(points: NDArray[np.float64], logarithms: NDArray[np.float64]) -> NDArray[np.float64]:
         factors = np.ones((len(points), len(replay.parameter_of)))
         factors[:, of_building] = np.exp(logarithms)
-        values = parameters.from_unit(points)
+        values = full(parameters.from_unit(points))
         further = _further(problem, lambda: replay.observe(values, factors, problem.statistics))
         return np.hstack([gap(replay.path_loss(values, factors)), *further])
 
@@ -272,16 +297,17 @@ def _with_constants(
         parameters=parameters,
         priors=LogNormal(
             (*model.priors.index, *range(len(study), len(parameters))),
-            (*model.priors.centre, *(item.start for item in fixed)),
-            (*model.priors.spread, *(known_to for _ in fixed)),
+            (*model.priors.centre, *(item.start for item in varied)),
+            (*model.priors.spread, *(known_to for _ in varied)),
             model.priors.linear,
         ),
         gaps=gaps_of,
-        loss=lambda values: replay.path_loss(values, np.ones((len(values), len(replay.parameter_of)))),
+        loss=lambda values: replay.path_loss(full(values), np.ones((len(values), len(replay.parameter_of)))),
         parameter_of=parameter_of,
         building_of=np.unique(replay.building_of[of_building], return_inverse=True)[1],
         only_buildings=np.flatnonzero((constants == of_buildings) & (constants > 0)),
-        effects_db={item.name: effects[item.name] for item in fixed},
+        effects_db={item.name: effects[item.name] for item in varied},
+        interactions=max(replay.engine.interactions, 1),
     )
 
 

@@ -1,8 +1,11 @@
 """Noise models, and the marginal density of the measurements under each.
 
-Errors may be independent and Gaussian, correlated between neighbours, or heavy-tailed, and an offset may be undeclared.
-The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every model
-therefore gets a prior weight, and results are averages over all models (Bayesian model averaging).
+Errors may be independent and Gaussian, correlated between neighbours, structured, or heavy-tailed, and an offset may be
+undeclared. Structured errors are a discrepancy of the twin (M. C. Kennedy and A. O'Hagan, J. Royal Statistical Society
+B 63, 2001): links share errors that are alike in distance, obstruction, depth and angle (`link_features.py`), wherever
+they are. The right model is unknown, and choosing the best-fitting one ignores others that fit nearly as well. Every
+model therefore gets a prior weight, and results are averages over all models (Bayesian model averaging). A discrepancy
+that the data do not need thus has next to no weight, and does not absorb what the parameters explain.
 
 The noise level has the prior 1/level, and nuisances have their own priors, flat unless declared. For Gaussian noise
 with covariance C times an unknown variance, both integrals are closed (D. A. Harville, Biometrika 61, 1974): with
@@ -49,8 +52,15 @@ FREEDOMS: Final = (2.0, 4.0)
 DEPARTURE: Final = 2.0
 """Prior weight of each departure from independent Gaussian errors, relative to these: measured errors rarely are."""
 
+IMPROBABLE: Final = 50.0
+"""Log odds at the optimum against a model that is left out for many links. Its own optimum can be better by some units
+for each parameter, far less than this."""
+
+FEATURE_RANGES: Final = (1.0, 4.0)
+"""Correlation ranges of structured errors that are tried, in standard deviations of the links' features."""
+
 # Kinds of noise; "student-t" includes Gaussian noise with gross errors.
-GAUSSIAN, CORRELATED, HEAVY = "gaussian", "correlated", "student-t"
+GAUSSIAN, CORRELATED, STRUCTURED, HEAVY = "gaussian", "correlated", "structured", "student-t"
 
 DIFFERING: Final = "heterogeneous"
 """Buildings that differ, which has a weight like the kinds of noise."""
@@ -61,11 +71,11 @@ class NoiseModel:
     """One model of the errors.
 
     Attributes:
-        kind: "gaussian", "correlated" or "student-t".
+        kind: "gaussian", "correlated", "structured" or "student-t".
         weight: Its prior weight.
         offset: Whether it includes an undeclared offset.
-        range_m: Correlation range, if "correlated" [m].
-        share: Correlated share of the variance, if "correlated".
+        range: Correlation range, if "correlated" [m], or "structured" [standard deviations of features].
+        share: Correlated share of the variance, if "correlated" or "structured".
         freedom: Degrees of freedom, if "student-t".
         gross: Whether the errors are Gaussian with some gross errors instead of Student's t, if "student-t".
     """
@@ -73,7 +83,7 @@ class NoiseModel:
     kind: str
     weight: float
     offset: bool = False
-    range_m: float = 0.0
+    range: float = 0.0
     share: float = 0.0
     freedom: float = np.inf
     gross: bool = False
@@ -86,6 +96,7 @@ def noise_models(
     range_m: float | None = None,
     offset: bool = True,
     censored: bool = False,
+    structured: bool = False,
 ) -> tuple[NoiseModel, ...]:
     """The noise models to try; all departures from independent Gaussian errors have equal prior weight.
 
@@ -96,6 +107,7 @@ def noise_models(
         offset: Whether to try an undeclared offset.
         censored: Whether some links are censored; gross errors are then left out, because their probability of
             censoring is not implemented.
+        structured: Whether to try structured errors.
 
     Returns:
         The models; their weights sum to one.
@@ -105,7 +117,9 @@ def noise_models(
         kinds.append([NoiseModel(GAUSSIAN, 1.0)])
     ranges = _ranges(position) if range_m is None else (range_m,) * (range_m > 0)
     if kind != HEAVY and ranges:
-        kinds.append([NoiseModel(CORRELATED, 1.0, range_m=r, share=s) for r in ranges for s in SHARES])
+        kinds.append([NoiseModel(CORRELATED, 1.0, range=r, share=s) for r in ranges for s in SHARES])
+    if kind != HEAVY and structured:
+        kinds.append([NoiseModel(STRUCTURED, 1.0, range=r, share=s) for r in FEATURE_RANGES for s in SHARES])
     if kind != GAUSSIAN and not range_m:
         tails = [NoiseModel(HEAVY, 1.0, freedom=freedom) for freedom in FREEDOMS]
         if kind != HEAVY and not censored:
@@ -151,8 +165,8 @@ class Marginal:
         column: The column of an undeclared offset, scaled likewise [m].
         noise_db: Approximate noise level, which scales priors [dB].
         models: The noise models.
-        whiteners: Whitener of each correlated model, by range and share.
-        censored: Mask of the censored links, whose gaps are lower limits [m]; no model is "correlated" then.
+        whiteners: Whitener of each correlated or structured model, by kind, range and share.
+        censored: Mask of the censored links, whose gaps are lower limits [m]; no model has a whitener then.
     """
 
     design: NDArray[np.float64]
@@ -160,7 +174,7 @@ class Marginal:
     column: NDArray[np.float64]
     noise_db: float
     models: tuple[NoiseModel, ...]
-    whiteners: dict[tuple[float, float], Whitener]
+    whiteners: dict[tuple[str, float, float], Whitener]
     censored: NDArray[np.bool_]
 
     @classmethod
@@ -173,6 +187,7 @@ class Marginal:
         noise_db: float,
         models: Sequence[NoiseModel],
         censored: NDArray[np.bool_] | None = None,
+        features: NDArray[np.float64] | None = None,
     ) -> Marginal:
         """Set up the density over m links.
 
@@ -184,15 +199,27 @@ class Marginal:
             noise_db: Approximate noise level [dB].
             models: The noise models.
             censored: Mask of the censored links [m]; none if None.
+            features: Standardized features of the links [m, k]; None if no model is structured.
         """
         censored = np.zeros(len(scale), dtype=bool) if censored is None else censored
-        correlations = {(model.range_m, model.share) for model in models if model.kind == CORRELATED}
-        neighbours = nearest_earlier(position) if correlations and len(position) > EXACT else None
-        whiteners = {
-            (range_m, share): whitener(position, scale, range_m, share, neighbours=neighbours)
-            for range_m, share in sorted(correlations)
-        }
+        whiteners = {}
+        for kind, place in ((CORRELATED, position), (STRUCTURED, features)):
+            pairs = sorted({(model.range, model.share) for model in models if model.kind == kind})
+            if place is not None and pairs:
+                neighbours = nearest_earlier(place) if len(place) > EXACT else None
+                for pair in pairs:
+                    whiteners[kind, *pair] = whitener(place, scale, *pair, neighbours=neighbours)
         return cls(design * scale[:, None], ridge, scale, noise_db, tuple(models), whiteners, censored)
+
+    def without_improbable(self, gap: NDArray[np.float64]) -> Marginal:
+        """The density without models that explain many links far worse than the best one.
+
+        Args:
+            gap: Gaps at the optimum [1, m], [dB].
+        """
+        density = self.densities(gap)[0]
+        kept = np.flatnonzero(density > density.max() - IMPROBABLE)
+        return replace(self, models=tuple(self.models[k] for k in kept)) if len(kept) else self
 
     def densities(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log density of the measurements plus the log weight, for each model.
@@ -216,8 +243,8 @@ class Marginal:
             elif model.kind == HEAVY:
                 tail = gross() if model.gross else student(model.freedom)
                 value = evidence(gap, design, ridge / self.noise_db, tail)
-            elif model.kind == CORRELATED:
-                key = (model.range_m, model.share)
+            elif model.kind in (CORRELATED, STRUCTURED):
+                key = (model.kind, model.range, model.share)
                 filter_ = self.whiteners[key]
                 if key not in white:
                     white[key] = filter_.apply(gap.T).T
@@ -231,15 +258,15 @@ class Marginal:
         """The density under Gaussian noise as a power of a quadratic form.
 
         Args:
-            model: The model, "gaussian" or "correlated".
+            model: The model, which is not "student-t".
 
         Returns:
             The matrix Q [m, m], c and h: the log density of gaps g is c - h log g'Q g.
         """
         design, ridge = self._with_offset(model.offset)
         white, shift = np.eye(len(design)), 0.0
-        if model.kind == CORRELATED:
-            filter_ = self.whiteners[model.range_m, model.share]
+        if model.kind != GAUSSIAN:
+            filter_ = self.whiteners[model.kind, model.range, model.share]
             white, shift = filter_.apply(white), 0.5 * filter_.log_determinant
         square, freedom = white.T @ white, len(design) - int((ridge == 0).sum())
         if len(ridge):

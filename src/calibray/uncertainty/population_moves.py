@@ -77,6 +77,10 @@ class Population:
             )
         )
 
+    def without_gaps(self) -> Population:
+        """The members without their gaps, which take most of the memory."""
+        return replace(self, gap=self.gap[:, :0])
+
     def parts(self) -> tuple[NDArray, ...]:
         """The members' arrays, in the order of the attributes."""
         return tuple(getattr(self, attribute.name) for attribute in fields(self))

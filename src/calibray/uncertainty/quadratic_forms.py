@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.uncertainty.noise_models import CORRELATED, GAUSSIAN, HEAVY, Marginal
+from calibray.uncertainty.noise_models import CORRELATED, GAUSSIAN, HEAVY, STRUCTURED, Marginal
 
 MAX_LINKS: Final = 300
 """Links up to which the matrices are stored; those of 26 Gaussian models then take 19 MB."""
@@ -40,7 +40,7 @@ class QuadraticForms:
         """Compute the forms of a density."""
         models = marginal.models
         group = [(-2 if model.gross else -1) if model.kind == HEAVY else k for k, model in enumerate(models)]
-        supported = {model.kind for model in models} <= {GAUSSIAN, CORRELATED, HEAVY}
+        supported = {model.kind for model in models} <= {GAUSSIAN, CORRELATED, STRUCTURED, HEAVY}
         if len(marginal.column) > MAX_LINKS or marginal.censored.any() or not supported:
             return cls(marginal, np.array(group), ())
         square = (None if model.kind == HEAVY else marginal.form(model) for model in models)

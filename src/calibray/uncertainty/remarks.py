@@ -18,11 +18,14 @@ from calibray.result.verdict import CONFIDENCE, Interval
 from calibray.result.wording import MOST_ODDS
 from calibray.uncertainty.draws import Draws
 from calibray.uncertainty.joint_model import has_offset
-from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY
+from calibray.uncertainty.noise_models import CORRELATED, DIFFERING, GAUSSIAN, HEAVY, STRUCTURED
 
 LIKELY: Final = 0.75
-"""Posterior weight above which a departure is reported: odds of three to one. Beforehand, buildings differ with a
-probability of one half."""
+"""Odds of three to one against independent Gaussian errors, or against equal buildings, at which a departure is
+reported. Beforehand, buildings differ with a probability of one half."""
+
+NOTABLE: Final = 0.25
+"""Least posterior weight of a kind of noise that is reported; several kinds can share the weight."""
 
 SLACK: Final = 0.02
 """Distance of a value from its interval, as a share of the range, above which it is reported."""
@@ -41,11 +44,12 @@ OFFSET_DB: Final = 0.1
 
 DEPARTURES: Final = {
     CORRELATED: RemarkKind.CORRELATED_NOISE,
+    STRUCTURED: RemarkKind.STRUCTURED_NOISE,
     HEAVY: RemarkKind.HEAVY_TAILS,
     DIFFERING: RemarkKind.HETEROGENEITY,
 }
 
-CAUSES: Final = (CORRELATED, HEAVY, DIFFERING, GAUSSIAN)
+CAUSES: Final = (CORRELATED, STRUCTURED, HEAVY, DIFFERING, GAUSSIAN)
 
 
 def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
@@ -57,12 +61,13 @@ def departures(noise: Mapping[str, float]) -> tuple[Remark, ...]:
     Returns:
         A remark for each that is likely.
     """
-    gaussian = float(noise.get(GAUSSIAN, 0.0))
-    return tuple(
-        Remark(remark, {"weight": float(noise[kind]), "gaussian_weight": gaussian})
-        for kind, remark in DEPARTURES.items()
-        if noise.get(kind, 0.0) > LIKELY
-    )
+    gaussian, remarks = float(noise.get(GAUSSIAN, 0.0)), []
+    for kind, remark in DEPARTURES.items():
+        weight = float(noise.get(kind, 0.0))
+        rival = 1.0 - weight if kind == DIFFERING else gaussian
+        if weight > max(NOTABLE, LIKELY * (weight + rival)):
+            remarks.append(Remark(remark, {"weight": weight, "gaussian_weight": gaussian}))
+    return tuple(remarks)
 
 
 def missed(problem: Problem, posterior: Draws, trail: Trail) -> tuple[Remark, ...]:

@@ -34,8 +34,11 @@ SWEEPS: Final = 4
 """Sweeps per step; a sweep moves every member in each way. The share of one of two distant ranges in five dimensions
 then scatters by 0.03 between seeds; with 2 sweeps by 0.08."""
 
-LAST_SWEEPS: Final = 10
-"""Sweeps at power 1."""
+LAST_SWEEPS: Final = 8
+"""Further sweeps at power 1."""
+
+KEPT: Final = 2
+"""Sweeps at power 1 between members that are kept as draws."""
 
 EFFECTIVE: Final = 0.5
 """Effective share of the population after each step."""
@@ -141,13 +144,13 @@ def draw_posterior(
         population, evidence = _anneal(model, size, random, stepped)
         populations.append(population)
         evidences.append(evidence)
-    half = len(populations) // 2
+    half, members = len(populations) // 2, len(populations[0].spread)
     agree = _distance(model, [_together(populations[:half]), _together(populations[half:])]) < _apart(
         size * half
     )
     # Populations that disagree count alike: the estimates of their evidence are then unreliable.
     share = _weights(np.array(evidences)) if agree else np.full(len(populations), 1.0 / len(populations))
-    posterior = _posterior(model, _together(populations), np.repeat(share, size) / size, agree)
+    posterior = _posterior(model, _together(populations), np.repeat(share, members) / members, agree)
     return replace(posterior, replays=replays)
 
 
@@ -194,7 +197,7 @@ def _posterior(model: JointModel, members: Population, weight: NDArray[np.float6
 def _anneal(
     model: JointModel, size: int, random: np.random.Generator, stepped: Callable[[float], None]
 ) -> tuple[Population, float]:
-    """A population that followed the likelihood's power from 0 to 1, and its log evidence."""
+    """Members of a population that followed the likelihood's power from 0 to 1, and its log evidence."""
     point = model.draw_prior(size, random)
     deviation = random.standard_normal((size, len(model.parameter_of)))
     models = random.integers(0, len(model.marginal.models), size)
@@ -221,13 +224,19 @@ def _anneal(
         )
         moves = Moves(model, power, random)
         population = moves.redraw_categories(population)
-        for _ in range(SWEEPS if power < 1.0 else LAST_SWEEPS):
+        for _ in range(SWEEPS):
             population, lengths = moves.sweep(population, lengths)
         population = moves.redraw_categories(population)
         stepped(power)
         if power == 1.0:
             break
-    return population, evidence
+    kept = []
+    for _ in range(LAST_SWEEPS // KEPT):
+        for _ in range(KEPT):
+            population, lengths = moves.sweep(population, lengths)
+        population = moves.redraw_categories(population)
+        kept.append(population.without_gaps())
+    return _together(kept), evidence
 
 
 def _next_power(log_likelihood: NDArray[np.float64], power: float) -> float:

@@ -23,8 +23,11 @@ NEAREST: Final = 20
 """Neighbours in Vecchia's approximation."""
 
 
-Neighbours = tuple[NDArray[np.int64], list[NDArray[np.int64]]]
-"""An order of links, and the places of each one's nearest earlier links."""
+CHUNK: Final = 500
+"""Links whose neighbourhoods are solved together."""
+
+Neighbours = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""An order of links [m], and the places of each one's nearest earlier links, -1 for none [m, NEAREST]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +94,15 @@ def nearest_earlier(position: NDArray[np.float64]) -> Neighbours:
         position: Positions of the links' ends [m, k], [m].
 
     Returns:
-        The order [m], and for each link in this order the places of its nearest earlier links.
+        The neighbours.
     """
     order = np.random.default_rng(0).permutation(len(position))
-    shuffled, near = position[order], [np.zeros(0, dtype=np.int64)]
+    shuffled, near = position[order], np.full((len(order), NEAREST), -1)
     for index in range(1, len(order)):
         distance = np.sum((shuffled[:index] - shuffled[index]) ** 2, axis=1)
-        nearest = np.argsort(distance) if index <= NEAREST else np.argpartition(distance, NEAREST)[:NEAREST]
-        near.append(nearest)
+        near[index, :index] = (
+            np.arange(index) if index <= NEAREST else np.argpartition(distance, NEAREST)[:NEAREST]
+        )
     return order, near
 
 
@@ -110,19 +114,21 @@ def _vecchia(
     neighbours: Neighbours,
 ) -> Whitener:
     order, nearest = neighbours
-    shuffled, size, count = position[order], scale[order], len(position)
-    rows, columns, entries, log_determinant = [], [], [], 0.0
-    for index in range(count):
-        members = np.append(nearest[index], index)
-        common = np.exp(-cdist(shuffled[members], shuffled[members]) / range_m)
-        common = common * np.outer(size[members], size[members])
-        matrix = share * common + (1 - share) * np.eye(len(members))
+    count = len(position)
+    members = np.column_stack([nearest, np.arange(count)])
+    entries, log_determinant, diagonal = np.zeros(members.shape), 0.0, np.eye(NEAREST + 1)
+    for rows in np.array_split(np.arange(count), -(-count // CHUNK)):
+        chosen = order[members[rows]]
+        place, factor = position[chosen], np.where(members[rows] < 0, 0.0, scale[chosen])
+        distance = np.sqrt(np.sum((place[:, :, None] - place[:, None]) ** 2, axis=-1))
+        # A neighbour that does not exist has no covariance with others.
+        common = np.exp(-distance / range_m) * factor[:, :, None] * factor[:, None]
+        matrix = share * common + (1 - share) * diagonal
         # Conditional mean and variance of the last member given its neighbours.
-        weight = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])
-        variance = float(matrix[-1, -1] - matrix[-1, :-1] @ weight)
-        rows.append(np.full(len(members), index))
-        columns.append(order[members])
-        entries.append(np.append(-weight, 1.0) / np.sqrt(variance))
-        log_determinant += np.log(variance)
-    parts = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
+        weight = np.linalg.solve(matrix[:, :-1, :-1], matrix[:, :-1, -1:])[..., 0]
+        variance = matrix[:, -1, -1] - np.sum(matrix[:, -1, :-1] * weight, axis=1)
+        entries[rows] = np.column_stack([-weight, np.ones(len(rows))]) / np.sqrt(variance)[:, None]
+        log_determinant += float(np.log(variance).sum())
+    row, column = np.nonzero(members >= 0)
+    parts = (entries[row, column], (row, order[members[row, column]]))
     return Whitener(sparse.csr_array(parts, shape=(count, count)), log_determinant)
