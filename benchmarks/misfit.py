@@ -1,7 +1,7 @@
 """Intervals, warnings and choice where the truth has what the study's scene lacks: seven worlds, on drawn districts.
 
     python benchmarks/misfit.py --repetitions 5 --districts judging
-    python benchmarks/misfit.py --worlds "nothing,thickness" --no-choice --out misfit.jsonl
+    python benchmarks/misfit.py --worlds "nothing,thickness" --no-choice --constants-spread 0 --out exact.jsonl
 
 A repetition draws a truth from the bounds, computes path loss in its world, adds 3 dB of noise, keeps one of four
 clusters of receivers apart, and calibrates the others as `calibray run` does. The true paths of a world are traced once
@@ -48,7 +48,7 @@ IDENTIFIED = ("identified", "weakly identified")
 PARTLY = ("ambiguous", "at bound")
 
 
-def repetition(world: World, seed: int, choice: bool) -> dict[str, Any]:
+def repetition(world: World, seed: int, choice: bool, spread: float | None) -> dict[str, Any]:
     """Calibrate one truth: verdicts, whether their sets contain it, remarks, and errors far away."""
     started, drawn = time.process_time(), world.planted(seed)
     problem, loss, random = drawn.problem, drawn.loss_db, np.random.default_rng([seed, 4])
@@ -58,7 +58,11 @@ def repetition(world: World, seed: int, choice: bool) -> dict[str, Any]:
         cluster = kmeans2(problem.setup.links.rx[known, :2], APART, rng=random, minit="++")[1]
         far[known[cluster == random.integers(APART)]] = True
     weight[far] = 0.0
-    planted = replace(problem, objective=replace(problem.objective, weight=weight))
+    setup, study = problem.setup, problem.setup.study
+    if spread is not None:
+        noise = study.noise.model_copy(update={"constants_spread": spread})
+        setup = replace(setup, study=study.model_copy(update={"noise": noise}))
+    planted = replace(problem, setup=setup, objective=replace(problem.objective, weight=weight))
     parameters = problem.parameters
     lower, upper = parameters.search_bounds
     trail = search(planted, LeastSquares(lower, upper, starts=32, seed=seed))
@@ -139,6 +143,9 @@ def main() -> None:
     parser.add_argument("--districts", default="development", help="names, or development or judging")
     parser.add_argument("--worlds", default=",".join(WORLDS))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--constants-spread", type=float, help="how well constants are known; the default if absent"
+    )
     parser.add_argument("--no-choice", action="store_true", help="leave validation out")
     parser.add_argument("--out", type=Path, help="file of lines, one a repetition; goes on where it stands")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "calibray-districts")
@@ -156,7 +163,9 @@ def main() -> None:
         made = make(name, given.folder, tuple(dict.fromkeys(world for world, _ in missing)))
         print(f"{name}: {time.process_time() - started:.0f} s of CPU to make its worlds", file=sys.stderr)
         for world, turn in missing:
-            line = repetition(made[world], 1000 * given.seed + turn, not given.no_choice)
+            line = repetition(
+                made[world], 1000 * given.seed + turn, not given.no_choice, given.constants_spread
+            )
             lines.append(line | {"district": name, "world": world, "repetition": turn})
             if given.out is not None:
                 with given.out.open("a") as file:

@@ -157,8 +157,11 @@ def test_weak_paths_are_left_out_of_large_programs(problem, monkeypatch):
     values = problem.parameters.from_unit(np.random.default_rng(6).random((20, 3)))
     whole = problem.engine.path_loss(values)
     monkeypatch.setattr(buildings, "MANY", 0)
+    monkeypatch.setattr(buildings, "WEAK", 0.8)
     replay = split_replay(problem, problem.parameters, by_building=True)
     assert 0 < replay.engine.interactions < problem.engine.interactions
     fewer = replay.path_loss(values, np.ones((20, len(replay.parameter_of))))
-    assert 0.0 < np.abs(fewer - whole).max() < 0.2
-    assert np.mean(np.abs(fewer - whole)) < 0.02
+    # At one of 16 candidates the paths left out carry a twentieth on average.
+    assert 0.0 < np.mean(fewer - whole) < 0.3
+    assert (fewer - whole).min() > -1e-9
+    assert (fewer - whole).max() < 3.0
