@@ -146,6 +146,8 @@ def choose_candidates(
     taken = np.zeros(len(variance), dtype=bool)
     conditioned, outlooks = np.zeros((0, len(variance))), []
     before = np.maximum(np.std(beliefs.point, axis=0), np.sqrt(LEAST_VARIANCE))
+    # Draws that scatter less than the curvature allows have a prior that the information lacks.
+    scale = np.minimum(before / _by_curvature(beliefs.information), 1.0)
     for _ in range(min(count, len(variance))):
         deviation = np.sqrt(variance)
         rank = _rank_by_scatter(beliefs.point, squares[:, :draws], predicted[:draws] / deviation)
@@ -167,7 +169,11 @@ def choose_candidates(
         slope -= best_slope[:, None, :] * share[:, None]
         variance = np.maximum(variance - share**2, 1e-6 * errors.own_db**2)
         conditioned = np.vstack([conditioned, share])
-        narrowed = np.minimum(_scatter(beliefs.point, squares[:, :draws]) / before, 1.0)
+        # Where only the true draw keeps its weight, scatter is too small, and curvature says what is left.
+        left = np.maximum(
+            _scatter(beliefs.point, squares[:, :draws]), scale * _by_curvature(beliefs.information)
+        )
+        narrowed = np.minimum(left / before, 1.0)
         probability = _range_probability(beliefs.piece[:draws], squares[:, :draws])
         outlooks.append(Outlook(best, narrowed, probability))
     return outlooks
@@ -256,6 +262,11 @@ def _scatter(point: NDArray[np.float64], squares: NDArray[np.float64]) -> NDArra
     weight = _weights(squares)
     variance = weight @ point**2 - (weight @ point) ** 2
     return np.sqrt(np.maximum(variance, 0.0)).mean(axis=0)
+
+
+def _by_curvature(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected standard deviation of every parameter by the information matrices at the draws [d]."""
+    return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)).mean(axis=0)
 
 
 def _range_probability(piece: NDArray[np.int64], squares: NDArray[np.float64]) -> NDArray[np.float64]:

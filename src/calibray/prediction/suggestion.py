@@ -368,10 +368,19 @@ def _gain(result: Record, narrowed: NDArray[np.float64]) -> str:
 
 
 def _width(result: Record, name: str, narrowed: float) -> float:
-    """Width of a parameter's interval once it is narrowed by a factor, on the scale of the search."""
+    """Width of a parameter's interval once the draws are narrowed by a factor, on the scale of the search.
+
+    The draws are those of the buildings that the links meet. How much other buildings differ is not known better
+    afterwards, so that this part of the width remains.
+    """
     section, interval = result.study.parameters[name], result.intervals.get(name)
     ends = np.array(section.bounds if interval is None else (interval.lower, interval.upper), dtype=float)
-    if section.scale == "log":
-        middle, half = np.log(ends).mean(), np.ptp(np.log(ends)) / 2
-        return float(np.ptp(np.exp([middle - narrowed * half, middle + narrowed * half])))
-    return float(narrowed * np.ptp(ends))
+    seen = ends if interval is None or not interval.seen else np.array(interval.seen).ravel()[[0, -1]]
+    log = section.scale == "log"
+    middle, half, seen_half = (
+        (np.log(ends) if log else ends).mean(),
+        *(np.ptp(np.log(each) if log else each) / 2 for each in (ends, seen)),
+    )
+    half = min(float(np.hypot(np.sqrt(max(half**2 - seen_half**2, 0.0)), narrowed * seen_half)), half)
+    after = np.array([middle - half, middle + half])
+    return float(np.ptp(np.exp(after) if log else after))
