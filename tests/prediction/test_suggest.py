@@ -95,6 +95,22 @@ def test_the_first_suggestion_has_the_largest_slope(result, table):
     assert slope[table.rx_x == suggestions.rx_x[0]] > 0.9 * np.sort(slope)[-3]
 
 
+def test_a_promised_width_keeps_how_much_other_buildings_differ(result, table):
+    """The draws are of the measured buildings; what the interval of all buildings has besides is not narrowed."""
+    plain = cb.suggest(result, table, 3)[f"{NAME}_width"].to_numpy()
+    interval = result.intervals[NAME]
+    assert (plain < interval.upper - interval.lower).all()
+    wide = replace(
+        interval,
+        lower=interval.lower - 1.0,
+        upper=interval.upper + 1.0,
+        seen=((interval.lower, interval.upper),),
+    )
+    promised = cb.suggest(changed(result, intervals={NAME: wide}), table, 3)[f"{NAME}_width"].to_numpy()
+    seen, every = interval.upper - interval.lower, wide.upper - wide.lower
+    assert promised == pytest.approx(np.sqrt(every**2 - seen**2 + plain**2))
+
+
 def _slope(result: Result, links: pd.DataFrame) -> np.ndarray:
     """Derivative of path loss with respect to the permittivity, by central differences [dB]."""
     loss = [_predicted(result, links, result.parameters[NAME] * factor) for factor in (0.99, 1.01)]
