@@ -3,6 +3,7 @@
 # ruff: noqa: E402  (the number of threads has to be set before NumPy is imported)
 
 import os
+from collections.abc import Iterator
 
 # Matrices of the tests are small, and BLAS threads that wait for each other cost more than they gain. NumPy and SciPy
 # read these when they are imported; subprocesses inherit them.
@@ -14,6 +15,7 @@ from hypothesis import settings
 
 from calibray.cli import progress_bars as progress
 from calibray.support import cache_folder as caching
+from calibray.uncertainty import sequential_monte_carlo as sampler
 
 # Every run draws the same examples, and a busy machine fails no test.
 settings.register_profile("calibray", derandomize=True, deadline=None)
@@ -39,3 +41,29 @@ def _no_lines_of_progress():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(progress, "LINE_INTERVAL", 1e6)
         yield
+
+
+JUDGING_INTERVALS = {"benchmarks", "prediction", "uncertainty", "validation"}
+"""Rooms whose tests judge intervals; they draw as much as a user's run."""
+
+FEW = {"SIZE": (64, 64), "SWEEPS": 1, "LAST_SWEEPS": 2}
+MANY = {name: getattr(sampler, name) for name in FEW}
+
+
+def _draw(constants: dict[str, object]) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in constants.items():
+            patch.setattr(sampler, name, value)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_draws(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A tenth of the draws from the posterior, which take most of the time of a small calibration."""
+    yield from _draw(MANY if request.path.parent.name in JUDGING_INTERVALS else FEW)
+
+
+@pytest.fixture
+def all_draws() -> Iterator[None]:
+    """As many draws as a user's run, for a test of intervals in another room."""
+    yield from _draw(MANY)

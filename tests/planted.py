@@ -42,7 +42,7 @@ def links(blocked: bool = False) -> pd.DataFrame:
 def content(file: str, **sections: Any) -> dict[str, Any]:
     """The content of a study of these links; sections given replace those here, and None leaves one out.
 
-    With one noise model, intervals are quick; `noise = None` compares all models.
+    With one noise model and exact constants, intervals are quick; `noise = None` has the defaults.
     """
     study = {
         "version": 1,
@@ -50,7 +50,7 @@ def content(file: str, **sections: Any) -> dict[str, Any]:
         "links": {"file": file, "tx": list(COLUMNS[:3]), "rx": list(COLUMNS[3:]), "value": "path_loss_db"},
         "trace": {"max_depth": 2, "samples": 20_000, "line_of_sight": False},
         "parameters": {name: {"bounds": BOUNDS} for name in TRUTH},
-        "noise": {"kind": "gaussian", "range_m": 0},
+        "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
         **sections,
     }
     return {name: section for name, section in study.items() if section is not None}

@@ -94,7 +94,7 @@ class TwoRay:
 def study(folder: Path, links: int = 30, noise_db: float = 0.0, free: int = 1, **sections: Any) -> Study:
     """A study of links over a flat ground, their path loss computed by the tracer with the planted permittivity.
 
-    With one noise model, intervals are quick.
+    With one noise model and exact constants, intervals are quick.
     """
     corners = [(-300.0, -300.0, 0.0), (300.0, -300.0, 0.0), (300.0, 300.0, 0.0), (-300.0, 300.0, 0.0)]
     file = write_scene(folder, {"floor": [corners]}, GROUND, "mat-ground")
@@ -116,7 +116,7 @@ def study(folder: Path, links: int = 30, noise_db: float = 0.0, free: int = 1, *
         "antennas": {"tx": dipole, "rx": dipole},
         "objective": {"combining": "coherent"},
         "parameters": {name: {"bounds": bounds} for name, bounds in list(BOUNDS.items())[:free]},
-        "noise": {"kind": "gaussian", "range_m": 0},
+        "noise": {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0},
         **sections,
     }
     return Study.from_content(content, folder / "study.toml")

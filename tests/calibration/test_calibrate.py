@@ -251,14 +251,14 @@ def test_a_study_without_any_path_is_refused(tmp_path):
         )
 
 
+@pytest.mark.usefixtures("all_draws")
 def test_the_interval_does_not_depend_on_the_scale_of_the_search(tmp_path):
     replay, noisy = planted.engine(), planted.campaign(noise_db=0.02)
     logarithmic = Parameters(tuple(replace(parameter, scale="log") for parameter in replay.parameters))
     sections = {name: {"bounds": planted.BOUNDS, "scale": "log"} for name in planted.TRUTH}
-    alike = {"heterogeneity": 0, "constants_spread": 0}
-    study = planted.study(tmp_path, noisy, parameters=sections, noise=alike)
+    study = planted.study(tmp_path, noisy, parameters=sections)
     result = calibrate(study, engine=Replay(replay.paths, logarithmic))
-    linear = run(tmp_path, noisy, noise=alike)
+    linear = run(tmp_path, noisy)
     assert result.parameters == pytest.approx(linear.parameters, rel=1e-4)
     for name, value in result.parameters.items():
         interval, other = result.intervals[name], linear.intervals[name]
