@@ -7,11 +7,11 @@ import sys
 
 import numpy as np
 
-import markdown_tables
 import shown
 from calibray.comparison import comparison
 from calibray.reporting import result_tables
 from calibray.reporting import trace_tables as trace
+from calibray.tables import markdown
 from calibray.tables.text import render
 from calibray.tracing.positions import EnclosedAntennas
 from changed import changed
@@ -46,7 +46,7 @@ def test_a_trace_and_its_check_are_printed_as_stored():
 def test_demo_comparison_and_diagnosis_are_printed_as_stored():
     assert render(*shown.demo().tables()) == golden("demo")
     assert render(comparison.table(shown.comparison())) == golden("comparison")
-    assert markdown_tables.render(comparison.table(shown.comparison())) == golden("comparison-markdown")
+    assert markdown.render(comparison.table(shown.comparison())) == golden("comparison-markdown")
     assert render(shown.diagnosis().table()) == golden("doctor")
 
 

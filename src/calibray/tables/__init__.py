@@ -1,4 +1,4 @@
-"""Tables as data, and their rendering as text and HTML."""
+"""Tables as data, and their rendering as text, HTML and Markdown."""
 
 from calibray.tables.table import Column, Table, numbers
 
