@@ -141,7 +141,7 @@ def in_worlds(names: str, seeds: int, out: Path) -> Table:
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     known = {(row["district"], row["world"], row["seed"]) for row in rows}
     with tempfile.TemporaryDirectory() as folder, out.open("a") as file:
-        for name in misfit_worlds.named(names, Path(folder)):
+        for name in misfit_worlds.named(names):
             wanted = [(name, world, seed) for world in misfit_worlds.WORLDS for seed in range(seeds)]
             missing = tuple(
                 dict.fromkeys(world for _, world, seed in wanted if (name, world, seed) not in known)

@@ -155,7 +155,7 @@ def main() -> None:
     if given.out is not None and given.out.exists():
         lines = [json.loads(each) for each in given.out.read_text().splitlines()]
     done = {(line["district"], line["world"], line["repetition"]) for line in lines}
-    for name in named(given.districts, given.folder):
+    for name in named(given.districts):
         missing = [
             (w, turn) for w in worlds for turn in range(given.repetitions) if (name, w, turn) not in done
         ]

@@ -72,7 +72,7 @@ def main() -> None:
     given = parser.parse_args()
     rows: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in misfit_worlds.named(given.districts, Path(folder)):
+        for name in misfit_worlds.named(given.districts):
             district = districts.make(name, Path(folder))
             for seed in range(given.repetitions):
                 rows += repetition(district, seed)

@@ -101,7 +101,7 @@ def main() -> None:
     studies = list(STUDIES)[:1] if given.stated else list(STUDIES)
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in misfit_worlds.named(given.districts, Path(folder)):
+        for name in misfit_worlds.named(given.districts):
             district = districts.make(name, Path(folder))
             for seed in range(given.repetitions):
                 found = repetition(district, seed, studies)
