@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 
 import shown
 from calibray.calibration.result import Result
 from calibray.fields import path_gains
 from calibray.reporting.diagnostics import diagnostics_table
+from calibray.scenes.regions import Region
 from calibray.uncertainty.link_diagnostics import _depth_and_power
 from changed import changed
 from made_up_report import made_up
@@ -99,3 +101,38 @@ def test_tables_without_data_are_left_out():
     assert "trade_offs" not in bare.diagnostics
     assert "power" not in bare.diagnostics
     assert isinstance(bare.diagnostics["moved"], pd.DataFrame)
+
+
+def test_the_page_points_at_a_region_of_extra_loss_only_if_planted():
+    result = made_up(160, 20)[0]
+    tx, rx = (result.links[[f"{end}_{axis}" for axis in "xyz"]].to_numpy() for end in ("tx", "rx"))
+    (west, south), (east, north) = np.quantile(rx[:, :2], [0.2, 0.5], axis=0)
+    belt = Region(np.array([shapely.box(west, south, east, north)]), np.zeros(1), np.full(1, 10.0))
+    length = belt.length_inside(tx, rx)
+    noise = np.random.default_rng(6).standard_normal(160)
+    shaded = planted(result, noise - 0.8 * length)
+    text = finding(shaded, "missing region")
+    assert text.startswith("losses of ")
+    assert "[regions]" in text
+    assert shaded.diagnostics["missing_region"].share.item() > 0.3
+    assert "than chance" in finding(planted(result, noise), "missing region")
+
+
+def test_residuals_by_obstruction_and_by_street(result):
+    random = np.random.default_rng(3)
+    blocked = random.random(60) < 0.5
+    length = np.where(blocked, random.uniform(1, 90, 60), 0.0)
+    noise = 0.1 * random.standard_normal(60)
+    columns = {"out_of_sight": blocked.astype(float), "obstruction_m": length}
+    shaded = planted(result, noise - 0.1 * length, **columns)
+    table = shaded.diagnostics["obstruction"]
+    assert table.links.sum() == 60
+    assert table.out_of_sight.tolist() == [False] + [True] * (len(table) - 1)
+    assert table.mean_db.iloc[0] == pytest.approx(0.0, abs=0.1)
+    assert (np.diff(table.mean_db) < 0).all()
+    assert "in sight" in finding(shaded, "by obstruction")
+    west = (result.links["rx_x"] < result.links["rx_x"].median()).to_numpy()
+    streets = planted(result, noise + 5.0 * west).diagnostics["streets"]
+    assert streets.links.sum() == 60
+    middle = result.links["rx_x"].median()
+    assert ((streets.x_m < middle) == (streets.mean_db > 2.5)).all()

@@ -32,7 +32,9 @@ from calibray.result.held_out import Model
 from calibray.result.prediction_model import ResidualField
 from calibray.result.record import Accuracy, Cost, Fit, Nuisance, Prediction, Provenance, Uncertainty
 from calibray.result.remark import Remark, RemarkKind
-from calibray.study import Study
+from calibray.scenes.obstruction import OUT_OF_SIGHT
+from calibray.study import Setup, Study
+from calibray.study.link_obstruction import REGION
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
 from calibray.uncertainty.link_diagnostics import diagnose_links
@@ -121,6 +123,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
             **({} if problem.faint is None else {"faint": problem.faint}),
             **({} if links.censored is None else {"censored": links.censored}),
             **_positions(links),
+            **_obstruction(setup),
             **({"offset_only_db": nuisance_only} if fitted else {}),
             **diagnostics.columns,
         }
@@ -254,6 +257,13 @@ def _positions(links: Measurements) -> dict[str, NDArray[Any]]:
     group = {} if links.group is None else {"group": links.group}
     carrier = {} if links.frequency is None else {"frequency": links.frequency}
     return ends | group | carrier
+
+
+def _obstruction(setup: Setup) -> dict[str, NDArray[np.float64]]:
+    """What is on the straight lines of the links, as columns."""
+    table = setup.with_obstruction().links.table
+    names = (OUT_OF_SIGHT, "obstruction_m", *([REGION] if setup.study.regions else []))
+    return {name: table.numbers(name) for name in names}
 
 
 def _as_measured(study: Study, links: Measurements, table: pd.DataFrame) -> dict[str, NDArray[np.float64]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from functools import lru_cache
 from itertools import combinations
 from typing import Final
 
@@ -10,11 +12,14 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from calibray.reporting.link_survey import POSITION_COLUMNS, measured_quantity, residual
+from calibray.reporting.missing_region import MissingRegion, missing_region
 from calibray.result.record import Record
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.support.messages import percent
 from calibray.tables import Column, Table
 from calibray.tables.text import rows_text
 from calibray.uncertainty.residual_correlation import variogram
+from calibray.validation.held_out_statistics import spatial_blocks
 
 CLASSES: Final = 6
 """Most classes of distance, each with about as many links as the others."""
@@ -34,6 +39,9 @@ CLEAR: Final = 2.0
 FEWEST: Final = 8
 """Fewest links for which trends are tested."""
 
+STREETS: Final = 12
+"""Most groups of neighbouring receivers."""
+
 EVEN_DB: Final = 0.1
 """Mean residual [dB] below which no class of links is reported."""
 
@@ -44,7 +52,9 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
     Returns:
         Tables by name, without those that cannot be computed. "distance", "depth" and "group": number of links, mean
         and standard deviation of the residuals [dB] on the calibration links; residuals are predicted minus measured in
-        the measured quantity. "leverage": leverage and residual of every calibration link. "power": share of the
+        the measured quantity. "obstruction" and "streets": the same by the length of the straight line below roofs, and
+        by neighbouring receivers. "missing_region": the rectangle whose extra loss would explain most of the residuals.
+        "leverage": leverage and residual of every calibration link. "power": share of the
         links' power by material and type of interaction. "trade_offs": correlation of the draws of every two unknowns.
         "neighbours": semivariance of the residuals over the distance between links, both ends counted. "moved": value
         of every parameter before and after, the change and the 95 % interval as shares of its range.
@@ -53,6 +63,9 @@ def diagnostics(result: Record) -> dict[str, pd.DataFrame]:
         "distance": _by_distance(result),
         "depth": _by(result, "depth"),
         "group": _by(result, "group"),
+        "obstruction": _by_obstruction(result),
+        "streets": _by_street(result),
+        "missing_region": _missing_region(result),
         "leverage": _leverage(result),
         "power": _power(result),
         "trade_offs": _trade_offs(result),
@@ -74,6 +87,9 @@ def diagnostics_table(result: Record) -> Table:
         "over distance": _distance_text(result),
         "by depth": _class_text(tables, "depth", "paths of {} interactions"),
         "by group": _class_text(tables, "group", "group {}"),
+        "by obstruction": _obstruction_text(tables),
+        "by street": _class_text(tables, "streets", "{}"),
+        "missing region": _missing_region_text(tables),
         "neighbours": _neighbours_text(tables),
         "leverage": _leverage_text(tables),
         "trade-offs": _trade_offs_text(tables),
@@ -129,6 +145,72 @@ def _by(result: Record, column: str) -> pd.DataFrame:
     values = links[column].to_numpy()
     distinct = sorted(pd.unique(values[pd.notna(values)]).tolist())
     return pd.DataFrame([{column: value, **_statistics(residuals[values == value])} for value in distinct])
+
+
+def _by_obstruction(result: Record) -> pd.DataFrame:
+    """Links in sight, and classes of links out of sight by the length of the straight line below roofs."""
+    links, residuals = _calibration_links(result)
+    if not {OUT_OF_SIGHT, "obstruction_m"} <= set(links.columns) or len(residuals) < FEWEST:
+        return pd.DataFrame()
+    blocked, length = links[OUT_OF_SIGHT].to_numpy(float) > 0, links["obstruction_m"].to_numpy(float)
+    order = np.flatnonzero(blocked)[np.argsort(length[blocked], kind="stable")]
+    classes = [np.flatnonzero(~blocked), *np.array_split(order, max(min(CLASSES, len(order) // FEWEST), 1))]
+    return pd.DataFrame(
+        [
+            {
+                OUT_OF_SIGHT: bool(blocked[members[0]]),
+                "from_m": length[members].min(),
+                "to_m": length[members].max(),
+                **_statistics(residuals[members]),
+            }
+            for members in classes
+            if len(members)
+        ]
+    )
+
+
+def _by_street(result: Record) -> pd.DataFrame:
+    """Groups of neighbouring receivers, named by the position of their middle."""
+    links, residuals = _calibration_links(result)
+    ends = _ends(links)
+    if ends is None or len(residuals) < 2 * FEWEST:
+        return pd.DataFrame()
+    place = ends[1][:, :2]
+    street = spatial_blocks(place, min(STREETS, len(residuals) // FEWEST))
+    middles = [place[street == number].mean(axis=0) for number in range(street.max() + 1)]
+    return pd.DataFrame(
+        [
+            {
+                "streets": f"receivers around ({x:.0f}, {y:.0f}) m",
+                "x_m": x,
+                "y_m": y,
+                **_statistics(residuals[street == number]),
+            }
+            for number, (x, y) in enumerate(middles)
+        ]
+    )
+
+
+def _missing_region(result: Record) -> pd.DataFrame:
+    links, _ = _calibration_links(result)
+    ends = _ends(links)
+    if ends is None:
+        return pd.DataFrame()
+    known = links[OUT_OF_SIGHT].to_numpy(float) if OUT_OF_SIGHT in links else np.zeros(len(links))
+    excess_db = links["measured_db"].to_numpy(float) - links["predicted_db"].to_numpy(float)
+    found = _searched(np.column_stack([*ends, excess_db, known]).tobytes())
+    if found is None:
+        return pd.DataFrame()
+    row = asdict(found)
+    west, south, east, north = row.pop("box")
+    return pd.DataFrame([{"west": west, "south": south, "east": east, "north": north, **row}])
+
+
+@lru_cache(maxsize=4)
+def _searched(rows: bytes) -> MissingRegion | None:
+    """The search over links: both ends, excess loss and whether out of sight. A page and its figures take it twice."""
+    links = np.frombuffer(rows).reshape(-1, 8)
+    return missing_region(links[:, :3], links[:, 3:6], links[:, 6], [links[:, 7]])
 
 
 def _statistics(residuals: NDArray[np.float64]) -> dict[str, float]:
@@ -247,6 +329,34 @@ def _class_text(tables: dict[str, pd.DataFrame], column: str, wording: str) -> s
     return (
         f"largest mean residual: {worst['mean_db']:+.1f} dB, {wording.format(name)}, {worst['links']:.0f} links"
         + ("" if clear else " (not significant)")
+    )
+
+
+def _obstruction_text(tables: dict[str, pd.DataFrame]) -> str:
+    """Mean residual of links in sight, and of those out of sight by the length of the line below roofs."""
+    if "obstruction" not in tables:
+        return ""
+    parts = [
+        f"{row.mean_db:+.1f} dB "
+        + (f"with {row.from_m:.0f} to {row.to_m:.0f} m below roofs" if row.out_of_sight else "in sight")
+        + f" ({row.links} links)"
+        for row in tables["obstruction"].itertuples()
+    ]
+    return f"mean residual: {', '.join(parts)}"
+
+
+def _missing_region_text(tables: dict[str, pd.DataFrame]) -> str:
+    """Where a region of extra loss would explain residuals, if it explains more than chance."""
+    if "missing_region" not in tables:
+        return ""
+    row = tables["missing_region"].iloc[0]
+    if not row["significant"]:
+        return "no region of extra loss, such as trees, would explain more of the residuals than chance"
+    return (
+        f"losses of {row['attenuation']:.2g} dB/m within x = {row['west']:.0f} to {row['east']:.0f} m, "
+        f"y = {row['south']:.0f} to {row['north']:.0f} m, up to z = {row['height']:.0f} m, on the straight line of "
+        f"{row['links']} links, would explain {percent(float(row['share']))} of the mean square of the residuals "
+        f"(chance alone {percent(float(row['chance']))}): see whether trees stand there, and give them as [regions]"
     )
 
 

@@ -1,0 +1,53 @@
+"""The search for a region of extra loss that a scene lacks, with planted belts and without."""
+
+import numpy as np
+import pytest
+import shapely
+
+from calibray.reporting.missing_region import missing_region
+from calibray.scenes.regions import Region
+
+BELT = shapely.box(-42, -90, -30, -10)
+
+
+def links(seed: int, count: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Receivers around two masts, and 3 dB of noise."""
+    random = np.random.default_rng(seed)
+    rx = np.column_stack([random.uniform(-120, 120, (count, 2)), np.full(count, 1.5)])
+    tx = np.array([[-105, 0, 30.0], [105, 10, 25.0]])[np.arange(count) % 2]
+    return tx, rx, random.normal(0, 3, count)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_planted_belt_is_found_with_its_loss(seed):
+    tx, rx, noise = links(seed)
+    length = Region(np.array([BELT]), np.zeros(1), np.full(1, 10.0)).length_inside(tx, rx)
+    slope = 5 * np.log10(np.linalg.norm(rx - tx, axis=1))
+    found = missing_region(tx, rx, noise + 0.8 * length + slope)
+    assert found.significant
+    box = shapely.box(*found.box)
+    assert shapely.area(shapely.intersection(box, BELT)) > 0.4 * shapely.area(BELT)
+    assert found.height == pytest.approx(11.5)  # 10 m above the lowest antenna
+    assert found.attenuation == pytest.approx(0.8, abs=0.4)
+    assert found.share > 3 * found.chance
+    crossed = Region(np.array([box]), np.full(1, -9.0), np.full(1, found.height)).length_inside(tx, rx) > 1.0
+    assert found.links == pytest.approx(crossed.sum(), abs=2)
+
+
+def test_without_a_belt_chance_is_exceeded_as_rarely_as_stated():
+    alarms = [missing_region(*links(seed)[:2], links(seed)[2]).significant for seed in range(10, 22)]
+    assert sum(alarms) <= 1  # 1 in 100 each
+
+
+def test_a_loss_that_another_column_explains_is_no_region():
+    tx, rx, noise = links(3)
+    behind = (np.abs(rx[:, 0]) < 60).astype(float)
+    assert missing_region(tx, rx, noise + 9 * behind).significant
+    assert not missing_region(tx, rx, noise + 9 * behind, [behind]).significant
+
+
+def test_few_links_or_no_residuals_are_not_searched():
+    tx, rx, noise = links(4, 20)
+    assert missing_region(tx, rx, noise) is None
+    tx, rx, noise = links(4)
+    assert missing_region(tx, rx, 0 * noise) is None
