@@ -28,7 +28,8 @@ def test_a_planted_belt_is_found_with_its_loss(seed):
     box = shapely.box(*found.box)
     assert shapely.area(shapely.intersection(box, BELT)) > 0.4 * shapely.area(BELT)
     assert found.height == pytest.approx(11.5)  # 10 m above the lowest antenna
-    assert found.attenuation == pytest.approx(0.8, abs=0.4)
+    # A rectangle wider than the belt loses less per length.
+    assert 0.25 < found.attenuation < 1.2
     assert found.share > 3 * found.chance
     crossed = Region(np.array([box]), np.full(1, -9.0), np.full(1, found.height)).length_inside(tx, rx) > 1.0
     assert found.links == pytest.approx(crossed.sum(), abs=2)
