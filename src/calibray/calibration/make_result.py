@@ -34,6 +34,7 @@ from calibray.result.record import Accuracy, Cost, Fit, Nuisance, Prediction, Pr
 from calibray.result.remark import Remark, RemarkKind
 from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
+from calibray.study.facades import without_facade_materials
 from calibray.study.link_obstruction import REGION
 from calibray.tracing.positions import EnclosedAntennas
 from calibray.uncertainty.assessment import Certainty
@@ -192,7 +193,7 @@ def make_result(run: Run, certainty: Certainty, validation: Validation | None) -
         links=table,
         history=trail.history(),
         held_out=validation,
-        scene=setup.scene,
+        scene=without_facade_materials(setup.scene, study.facades),
         paths=paths,
     )
 

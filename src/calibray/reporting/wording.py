@@ -63,6 +63,7 @@ def scene_alone_text(record: Record) -> str:
     ]
     missing = [
         *(f"the region {name}" for name in record.study.regions),
+        *(f"the facade {name}" for name in record.study.facades),
         *(f"the roughness of {name}" for name in dict.fromkeys((*record.study.roughness_mm, *rough))),
         *(term.name for term in model.terms),
     ]

@@ -27,6 +27,7 @@ from calibray.parameters import (
 )
 from calibray.parameters.laws import ROUGHNESS, frequency_independent_law
 from calibray.parameters.parameter import check_material
+from calibray.study.facades import FacadeSection
 from calibray.study.link_obstruction import CLUTTER, REGION
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.observables import ObservableSection
@@ -72,6 +73,7 @@ class StudyModel(Section, ABC):
     scene: SceneSection
     objects: dict[str, Text] = Field(default_factory=dict)
     materials: dict[str, MaterialSection] = Field(default_factory=dict)
+    facades: dict[str, FacadeSection] = Field(default_factory=dict)
     links: LinksSection
     antennas: AntennasSection = Field(default_factory=AntennasSection)
     trace: TraceSection = Field(default_factory=TraceSection)  # type: ignore[valid-type]
@@ -156,6 +158,8 @@ class StudyModel(Section, ABC):
                 raise InputError(
                     f"parameters: {name!r}: no [regions.{region}]; {did_you_mean(region, self.regions)}"
                 )
+        if self.facades and getattr(self.engine, "rays", None):
+            raise InputError("engine.rays: rays of a table have no walls; remove [facades]")
         for name, section in self.nuisance.items():
             if section.by == REGION and not self.regions:
                 raise InputError(
@@ -163,10 +167,11 @@ class StudyModel(Section, ABC):
                 )
         rough = [name for name in self.parameters if name.endswith(f".{ROUGHNESS}")]
         rough += [f"materials.{name}.{ROUGHNESS}" for name in self.roughness_mm]
-        for key, used in (("[regions]", bool(self.regions)), (rough[0] if rough else "", bool(rough))):
+        stated = (("[regions]", self.regions), ("[facades]", self.facades), ("".join(rough[:1]), rough))
+        for key, used in stated:
             if used and self.engine.name != "replay":
                 raise InputError(
-                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} knows no such loss"
+                    f"{key} needs engine.name = 'replay'; the engine {self.engine.name!r} has no paths"
                 )
             if used and getattr(self.engine, "compress_db", None) is not None:
                 raise InputError(
@@ -272,6 +277,14 @@ class StudyModel(Section, ABC):
         }
 
     @property
+    def facade_paths(self) -> dict[str, Path | None]:
+        """The file of every facade by name; None without one."""
+        return {
+            name: None if section.file is None else self._resolve(f"facades.{name}.file", section.file)
+            for name, section in self.facades.items()
+        }
+
+    @property
     def antenna_pair(self) -> tuple[Antenna, Antenna]:
         """The transmit and the receive antenna that links are traced with, with resolved paths of gain tables.
 
@@ -300,11 +313,20 @@ class StudyModel(Section, ABC):
 
     @property
     def overrides(self) -> dict[str, dict[str, Any]]:
-        """The constants that ``[materials]`` states, by material name."""
+        """The constants that ``[materials]`` states for the scene's materials, by name."""
+        return self._stated_constants(of_facades=False)
+
+    def _stated_constants(self, of_facades: bool) -> dict[str, dict[str, Any]]:
         return {
             name: material.model_dump(exclude_none=True, exclude={ROUGHNESS})
             for name, material in self.materials.items()
+            if (name in self.facades) == of_facades
         }
+
+    @property
+    def facade_constants(self) -> dict[str, dict[str, Any]]:
+        """The constants that ``[materials]`` states for facades, by name."""
+        return self._stated_constants(of_facades=True)
 
     @property
     def roughness_mm(self) -> dict[str, float]:
@@ -434,6 +456,8 @@ class StudyModel(Section, ABC):
         for name, path in self.region_paths.items():
             key, stated = self.regions[name].source or ("boxes", None)
             files.append((f"regions.{name}.{key}", stated, path))
+        for name, path in self.facade_paths.items():
+            files.append((f"facades.{name}.file", self.facades[name].file, path))
         if not self.scene.file.startswith(BUNDLED):
             files.append(("scene.file", self.scene.file, Path(self.scene_source)))
         written = [("tx", self.antennas.tx), ("rx", self.antennas.rx)]

@@ -127,7 +127,7 @@ class RegionSection(Section):
             bounds = place.surfaces().bounds[[0, 1, 3, 4]]
             outline, top = read_canopy(path, _known(place.frame, path), bounds)
         else:
-            outline, columns = self._polygons(path, place)
+            outline, columns = read_polygons(path, self.position, place.frame)
         bottom, top = (
             _heights(path, key, height, columns, len(outline))
             for key, height in (("bottom", self.bottom), ("top", top))
@@ -146,20 +146,30 @@ class RegionSection(Section):
             bottom, top = bottom + ground, top + ground
         return Region(outline, bottom, top)
 
-    def _polygons(self, path: Path, place: Place) -> tuple[NDArray[Any], dict[str, NDArray]]:
-        """Polygons of a vector file in the scene's frame [n], and the columns of its table."""
-        shapely = library("shapely", "scenes")
-        from calibray.scenes.authoring.footprints import project
-        from calibray.scenes.authoring.geodata import read_features
 
-        features = read_features(path, None)
-        polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
-        if not polygon.any():
-            raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
-        outline = shapely.make_valid(features.outline[polygon])
-        if self.position == "geographic":
-            outline = project(outline, _known(place.frame, path), features.crs or WGS84)
-        return outline, {name: values[polygon] for name, values in features.columns.items()}
+def read_polygons(path: Path, position: str, frame: Frame | None) -> tuple[NDArray[Any], dict[str, NDArray]]:
+    """Polygons of a vector file in the scene's frame [n], and the columns of its table.
+
+    Args:
+        path: The file.
+        position: "geographic" if its coordinates are those of its reference system, "scene" for the scene's frame.
+        frame: Place of the scene on the globe, if it is known.
+
+    Raises:
+        InputError: The file cannot be read or holds no polygon, or the scene's place is unknown.
+    """
+    shapely = library("shapely", "scenes")
+    from calibray.scenes.authoring.footprints import project
+    from calibray.scenes.authoring.geodata import read_features
+
+    features = read_features(path, None)
+    polygon = np.isin(shapely.get_type_id(features.outline), (3, 6))
+    if not polygon.any():
+        raise InputError(f"{path}: none of its {len(polygon)} features is a polygon; give outlines")
+    outline = shapely.make_valid(features.outline[polygon])
+    if position == "geographic":
+        outline = project(outline, _known(frame, path), features.crs or WGS84)
+    return outline, {name: values[polygon] for name, values in features.columns.items()}
 
 
 def _known(frame: Frame | None, path: Path) -> Frame:

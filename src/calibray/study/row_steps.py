@@ -145,9 +145,13 @@ def study_regions(study: StudyModel) -> dict[str, Region]:
     if not study.regions:
         return {}
 
-    place = Place(known_frame(study), partial(_surfaces, study.scene_source))
-    paths = study.region_paths
+    place, paths = scene_place(study), study.region_paths
     return {name: section.region(paths[name], place) for name, section in study.regions.items()}
+
+
+def scene_place(study: StudyModel) -> Place:
+    """What regions and facades need to know of the scene."""
+    return Place(known_frame(study), partial(_surfaces, study.scene_source))
 
 
 def _surfaces(source: str) -> SceneSurfaces:

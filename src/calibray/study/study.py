@@ -38,13 +38,21 @@ from calibray.paths import Paths, take_links
 from calibray.scenes import Scene, check_material_name, read_scene
 from calibray.scenes.regions import Region
 from calibray.scenes.scene_file import read_content as scene_content
+from calibray.study.facades import with_facade_materials, with_facades, without_facade_materials
 from calibray.study.link_obstruction import with_obstruction
 from calibray.study.model import StudyModel
 from calibray.study.mounting import check_poses, link_mountings, pose_effects
 from calibray.study.position_errors import averaged, displaced, mounted_at_displaced, spread_db
 from calibray.study.regions import region_effects
 from calibray.study.roughness import roughness_effects
-from calibray.study.row_steps import link_columns, position_steps, row_steps, row_track, study_regions
+from calibray.study.row_steps import (
+    link_columns,
+    position_steps,
+    row_steps,
+    row_track,
+    scene_place,
+    study_regions,
+)
 from calibray.study.sections import AntennasSection
 from calibray.study.summary import summary
 from calibray.study.toml_file import read_content, refuse_unquoted_names, split_engine_keys
@@ -288,7 +296,7 @@ class Setup:
             links = study.measurements()
             held_out = study.held_out(links)
             check_poses(study, links)
-        scene = read_scene(study.scene_source, study.scene.frequency, study.overrides, study.objects)
+        scene = _scene_of(study, study.scene.frequency)
         parameters = study.parameter_set(scene.materials, scene.laws)
         parameters.check_carriers([frequency for frequency, _ in links.carriers])
         scene = replace(scene, materials=parameters.materials(parameters.start, scene.materials))
@@ -414,7 +422,8 @@ class Setup:
         gains = [Path(antenna.gain_file) for antenna in antennas if antenna.gain_file is not None]
         digests = {str(self.scene.path): hashlib.sha256(scene_content(self.scene.path)).hexdigest()}
         rays = [] if self.study.rays_path is None else [self.study.rays_path]
-        regions = [file for file in self.study.region_paths.values() if file is not None]
+        outlines = (*self.study.region_paths.values(), *self.study.facade_paths.values())
+        regions = [file for file in outlines if file is not None]
         for file in (*cache.mesh_files(self.scene), *gains, *rays, *regions):
             digests[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
         return digests
@@ -449,13 +458,15 @@ class Setup:
             return _paths_of_program(self, materials or {}, progress)
         scene = replace(self.scene, materials={**self.scene.materials, **(materials or {})})
         if self.links.frequency is None:
-            return self._mounted(self._trace_links(scene, progress))
+            return self._mounted(self._trace_links(scene, progress), scene)
         ends = np.hstack([self.links.tx, self.links.rx])
         _, first, pair = np.unique(ends, axis=0, return_index=True, return_inverse=True)
         distinct = replace(self.links.select(np.isin(np.arange(len(ends)), first)), frequency=None)
         # `select` keeps the order of the links, `unique` sorts them: `rank` is a pair's index among those selected.
         rank = np.argsort(np.argsort(first))
-        return self._mounted(take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]))
+        return self._mounted(
+            take_links(self._trace(distinct, scene, progress), rank[pair.reshape(-1)]), scene
+        )
 
     def _trace_links(self, scene: Scene, progress: Progress | None) -> Paths:
         """Paths of the links, or the mean over displaced receivers if positions have errors."""
@@ -495,9 +506,12 @@ class Setup:
         weight = 1 / (variance + spread_db(loss) ** 2)
         return self._with_tracer(replace(self, links=replace(links, weight=weight)))
 
-    def _mounted(self, paths: Paths) -> Paths:
-        """The paths with the fields of the antennas that differ between links."""
-        return mount(paths, self.mountings) if self.mountings else paths
+    def _mounted(self, paths: Paths, scene: Scene) -> Paths:
+        """The paths with the fields of the antennas that differ between links, and the materials of facades."""
+        paths, study = mount(paths, self.mountings) if self.mountings else paths, self.study
+        if not study.facades:
+            return paths
+        return with_facades(paths, study.facades, study.facade_paths, scene_place(study), scene.materials)
 
     @cached_property
     def mountings(self) -> dict[str, Mounting]:
@@ -509,7 +523,7 @@ class Setup:
         return link_mountings(self.study, self.links)
 
     def _trace(self, links: Measurements, scene: Scene, progress: Progress | None) -> Paths:
-        study = self.study
+        study, scene = self.study, without_facade_materials(scene, self.study.facades)
         digest = cache.trace_digest(
             self.factory.versions,
             scene,
@@ -537,12 +551,19 @@ class Setup:
 
     def _scene_at(self, frequency: float) -> Scene:
         study, parameters = self.study, self.parameters
-        scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+        scene = _scene_of(study, frequency)
         materials = parameters.materials(parameters.start, scene.materials, frequency)
         return replace(scene, materials=materials)
 
     def _open_tracer(self, scene: Scene, frequency: float) -> Tracer:
+        scene = without_facade_materials(scene, self.study.facades)
         return self.factory(scene, frequency, self.study.trace, *self.study.antenna_pair)
+
+
+def _scene_of(study: Study, frequency: float) -> Scene:
+    """The scene at a carrier [Hz], with the materials of facades."""
+    scene = read_scene(study.scene_source, frequency, study.overrides, study.objects)
+    return with_facade_materials(scene, study.facades, study.facade_constants, frequency)
 
 
 def _paths_of_table(setup: Setup, file: Path, materials: Mapping[str, Material]) -> Paths:

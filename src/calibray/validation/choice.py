@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibray.engines.replay import Replay
+from calibray.fields import path_loss
 from calibray.fitting.nuisance import OFFSET
 from calibray.fitting.objective import Objective
 from calibray.fitting.problem import Problem
@@ -122,6 +123,12 @@ def fit_prediction_model(
     materials = parameters.materials(candidate, problem.setup.scene.materials) if uses_scene else None
     if isinstance(problem.engine, Replay) and problem.engine.effects:
         scene_db = problem.engine.without_effects().path_loss(candidate[None])[0]
+    facades = setup.study.facades
+    if isinstance(problem.engine, Replay) and facades:
+        # An exported scene has one material per mesh: that of the walls that the facades are parts of.
+        whole = parameters.materials(candidate, setup.scene.materials)
+        whole |= {name: whole[section.of] for name, section in facades.items()}
+        scene_db = path_loss(problem.engine.paths, whole, setup.radio.combining, setup.radio.bandwidth)
     return FittedModel(model, materials, add_nuisance(objective, modelled), scene_db)
 
 

@@ -1,0 +1,227 @@
+"""``[facades.NAME]``: materials of parts of one mesh, by where on it a path interacts: storey, side, place, windows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from calibray.errors import InputError
+from calibray.materials import DEFAULT_REVISION, Material, itu_law, itu_material
+from calibray.parameters.laws import frequency_independent_law
+from calibray.paths import Paths
+from calibray.scenes import Scene, check_material_name
+from calibray.study.regions import Place, read_polygons
+from calibray.support.lazy_imports import library
+from calibray.support.messages import did_you_mean, shortened
+from calibray.support.strict_models import Section, Text
+
+if TYPE_CHECKING:
+    from calibray.scenes.checks import SceneSurfaces
+
+NEAR: Final = 0.5
+"""Distance from a polygon up to which a wall belongs to it [m]: walls stand on the outlines of buildings."""
+
+BESIDE: Final = 0.1
+"""Distance from a wall at which its sides are told apart [m]."""
+
+
+class FacadeSection(Section):
+    """``[facades.NAME]``: a material of the parts of walls that all stated rules apply to.
+
+    Attributes:
+        of: Material of the scene whose surfaces are divided; the new one has its constants unless ``[materials]`` says
+            otherwise.
+        storeys: First and last storey, counted from 1 at the ground.
+        storey_height: Height of a storey [m].
+        facing: Compass bearings [deg] between which the outward normal of the wall lies, clockwise. The inside of a
+            wall is under a roof; without one, the order of the corners of its triangles tells.
+        boxes: Rectangles that the wall stands in: west, south, east, north [m] in the scene's frame.
+        file: GeoJSON file, Shapefile, GeoPackage or FlatGeobuf file of polygons that it stands on.
+        column: Column of the file; the polygons are those whose value is NAME. All of them if absent.
+        position: "geographic" or "scene", as for ``[regions]``.
+        share: Share of the wall that strips of this material take, such as windows.
+        module: Distance between the middles of two strips [m]; rounded so that a wall has a whole number of them.
+    """
+
+    of: Text
+    storeys: tuple[int, int] | None = None
+    storey_height: Annotated[float, Field(gt=0)] = 3.0
+    facing: tuple[float, float] | None = None
+    boxes: tuple[tuple[float, float, float, float], ...] = ()
+    file: Text | None = None
+    column: Text | None = None
+    position: Literal["geographic", "scene"] = "geographic"
+    share: Annotated[float, Field(gt=0, lt=1)] | None = None
+    module: Annotated[float, Field(gt=0)] = 3.0
+
+    @model_validator(mode="after")
+    def _some_rule(self) -> Self:
+        if not any((self.storeys, self.facing, self.boxes, self.file, self.share)):
+            raise InputError("a facade needs a rule: storeys, facing, boxes, file or share")
+        if self.storeys is not None and not 1 <= self.storeys[0] <= self.storeys[1]:
+            raise InputError(
+                f"storeys = {list(self.storeys)}: must be the first and the last, counted from 1"
+            )
+        if self.column is not None and self.file is None:
+            raise InputError("column needs file, whose polygons it names")
+        return self
+
+
+def with_facade_materials(
+    scene: Scene,
+    facades: Mapping[str, FacadeSection],
+    constants: Mapping[str, Mapping[str, object]],
+    frequency: float,
+) -> Scene:
+    """The scene with the materials of facades after its own.
+
+    Args:
+        scene: The scene.
+        facades: The facades by name.
+        constants: The constants that ``[materials]`` states for them.
+        frequency: Carrier [Hz].
+
+    Raises:
+        InputError: A facade has the name of a material, or divides one that the scene lacks; or ITU-R P.2040 has no
+            such material.
+    """
+    materials, laws = dict(scene.materials), dict(scene.laws)
+    for name, section in facades.items():
+        if name in scene.materials:
+            raise InputError(f"[facades.{name}]: the scene has a material of this name; choose another")
+        check_material_name(section.of, scene.materials, f"[facades.{name}] of")
+        stated = dict(constants.get(name, {}))
+        itu, revision = stated.pop("itu", None), str(stated.pop("revision", DEFAULT_REVISION))
+        material, law = scene.materials[section.of], scene.laws.get(section.of)
+        if itu is not None:
+            bulk = itu_material(str(itu), frequency, revision=revision)
+            material = replace(
+                material, relative_permittivity=bulk.relative_permittivity, conductivity=bulk.conductivity
+            )
+            law = itu_law(str(itu), frequency, revision)
+        if stated:
+            material = replace(material, **stated)  # type: ignore[arg-type]
+        if {"relative_permittivity", "conductivity"} & set(stated):
+            law = frequency_independent_law(material)
+        materials[name] = material
+        if law is not None:
+            laws[name] = law
+    return replace(scene, materials=materials, laws=laws)
+
+
+def without_facade_materials(scene: Scene, facades: Mapping[str, FacadeSection]) -> Scene:
+    """The scene as it is traced."""
+    if not facades:
+        return scene
+    materials, laws = (
+        {name: value for name, value in table.items() if name not in facades}
+        for table in (scene.materials, scene.laws)
+    )
+    return replace(scene, materials=materials, laws=laws)
+
+
+def with_facades(
+    paths: Paths,
+    facades: Mapping[str, FacadeSection],
+    files: Mapping[str, Path | None],
+    place: Place,
+    materials: Mapping[str, Material],
+) -> Paths:
+    """The paths with the materials of facades where their interactions happen; the first facade that applies counts.
+
+    Args:
+        paths: The paths.
+        facades: The facades by name.
+        files: Their files, resolved.
+        place: What is known of the scene.
+        materials: The materials of the scene and of the facades.
+
+    Raises:
+        InputError: A file cannot be used, or a wall stands on no ground.
+    """
+    surfaces, names = place.surfaces(), list(paths.materials)
+    material, free = paths.material.copy(), np.ones(paths.num_interactions, dtype=bool)
+    for number, (name, section) in enumerate(facades.items(), start=len(names)):
+        hit = np.flatnonzero(free & (paths.material == names.index(section.of)))
+        point = paths.vertex[hit].astype(np.float64)
+        chosen = hit[_applies(name, section, files[name], place, surfaces, point)] if len(hit) else hit
+        material[chosen], free[chosen] = number, False
+    return replace(
+        paths, material=material, materials=paths.materials | {name: materials[name] for name in facades}
+    )
+
+
+def _applies(
+    name: str,
+    section: FacadeSection,
+    file: Path | None,
+    place: Place,
+    surfaces: SceneSurfaces,
+    point: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Whether all rules of a facade apply at points of its material [n]."""
+    shapely = library("shapely", "scenes")
+    applies = np.ones(len(point), dtype=bool)
+    if section.storeys is not None:
+        height = point[:, 2] - surfaces.ground_height(point[:, 0], point[:, 1])
+        storey = np.floor(height / section.storey_height) + 1
+        applies &= (storey >= section.storeys[0]) & (storey <= section.storeys[1])
+    if section.facing is not None or section.share is not None:
+        bearing, along, length = _walls(surfaces, point)
+        if section.facing is not None:
+            start, end = section.facing
+            applies &= (bearing - start) % 360 <= ((end - start) % 360 or 360)
+        if section.share is not None:
+            strips = np.maximum(np.round(length / section.module), 1)
+            applies &= np.abs((along * strips) % 1 - 0.5) < section.share / 2
+    outlines = [shapely.box(*box) for box in section.boxes]
+    if file is not None:
+        outline, columns = read_polygons(file, section.position, place.frame)
+        if section.column is not None:
+            if section.column not in columns:
+                remedy = did_you_mean(section.column, columns)
+                raise InputError(f"{file}: no column {shortened(section.column)!r}; {remedy}")
+            outline = outline[columns[section.column].astype(str) == name]
+            if not len(outline):
+                raise InputError(f"{file}: no polygon has {name!r} in its column {section.column!r}")
+        outlines += shapely.buffer(outline, NEAR).tolist()
+    if outlines:
+        area = shapely.union_all(outlines)
+        shapely.prepare(area)
+        applies &= shapely.intersects_xy(area, point[:, 0], point[:, 1])
+    return applies
+
+
+def _walls(
+    surfaces: SceneSurfaces, point: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The wall nearest to each point in plan.
+
+    Returns:
+        Compass bearing of its outward normal [n], [deg], where along it the point lies, from 0 at its western or
+        southern end to 1 [n], and its length [n], [m].
+    """
+    shapely, walls = library("shapely", "scenes"), surfaces.walls
+    plan = np.round(walls[:, :, :2], 6)
+    order = np.lexsort((plan[..., 1], plan[..., 0]), axis=-1)
+    ends = np.stack([plan[np.arange(len(plan)), order[:, k]] for k in (0, 2)], axis=1)
+    normal = np.cross(walls[:, 1] - walls[:, 0], walls[:, 2] - walls[:, 0])
+    tree = shapely.STRtree(shapely.linestrings(ends))
+    nearest = np.zeros(len(point), dtype=np.int64)
+    query, found = tree.query_nearest(shapely.points(point[:, :2]), all_matches=False)
+    nearest[query] = found
+    start, step = ends[nearest, 0], ends[nearest, 1] - ends[nearest, 0]
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    along = np.clip(((point[:, :2] - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
+    # The inside is under a roof; where both sides or neither are, the order of the corners tells.
+    outward = normal[nearest] / np.linalg.norm(normal[nearest], axis=1, keepdims=True)
+    front, back = (surfaces.under_roof(point + side * BESIDE * outward) for side in (1, -1))
+    outward = np.where((front & ~back)[:, None], -outward, outward)
+    bearing = np.degrees(np.arctan2(outward[:, 0], outward[:, 1])) % 360
+    return bearing, along, length
