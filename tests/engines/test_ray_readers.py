@@ -1,0 +1,275 @@
+"""Paths of other programs: each format holds Sionna RT's own paths, and their power comes back."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import sionna.rt as rt
+from scipy.io import savemat
+
+import calibray as cb
+from calibray.engines.rays.compile import powers
+from calibray.engines.rays.polylines import Polyline, rows_of
+from calibray.engines.rays.sionna_paths import read_sionna_paths
+from calibray.errors import InputError
+from calibray.paths import Paths
+
+SCENE = "sionna:simple_street_canyon"
+FREQUENCY = 3.5e9
+MATLAB = Path(__file__).parents[2] / "examples" / "matlab"
+TX_POWER_DBM = 13.0
+
+
+@pytest.fixture(scope="module")
+def paths() -> rt.Paths:
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    scene.frequency = FREQUENCY
+    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
+    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
+    scene.add(rt.Transmitter("tx", position=[-30, 0, 10]))
+    for number, x in enumerate((-20.0, 0.0, 25.0)):
+        scene.add(rt.Receiver(f"rx{number}", position=[x, 3.0, 1.5]))
+    return rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000, refraction=False)
+
+
+@pytest.fixture(scope="module")
+def lines(paths: rt.Paths) -> list[Polyline]:
+    """The paths as points and types."""
+    frame = read_sionna_paths(paths).frame
+    return [
+        Polyline(
+            rows[["x", "y", "z"]].to_numpy(),
+            rows.type.tolist()[1:-1],
+            rows.power_db.iloc[0],
+            rows.delay.iloc[0],
+        )
+        for _, rows in frame.groupby("path")
+    ]
+
+
+def by_receiver(lines: list[Polyline]) -> list[list[Polyline]]:
+    ends = sorted({tuple(line.points[-1]) for line in lines})
+    return [[line for line in lines if tuple(line.points[-1]) == end] for end in ends]
+
+
+def read(source: object, **arguments: object) -> Paths:
+    return cb.read_rays(source, SCENE, frequency=FREQUENCY, **arguments)
+
+
+def test_paths_of_sionna_have_its_powers(paths: rt.Paths) -> None:
+    real, imaginary = (np.array(part, dtype=float) for part in paths.a)
+    power = (real**2 + imaginary**2).sum(axis=(1, 3))[:, 0]
+    program = read(paths)
+    assert program.num_paths == (power > 0).sum() > 10
+    for rx in range(3):
+        mine = np.sort(
+            powers(program)[
+                np.abs(program.rx_position[program.link] - [[-20.0, 0.0, 25.0][rx], 3, 1.5]).max(axis=1)
+                < 0.01
+            ]
+        )
+        np.testing.assert_allclose(mine, np.sort(power[rx][power[rx] > 0]), rtol=1e-6)
+
+
+def test_arrays_of_several_places_are_refused() -> None:
+    scene = rt.load_scene(rt.scene.simple_street_canyon)
+    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=2, pattern="iso", polarization="V")
+    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.add(rt.Transmitter("tx", position=[0, 0, 10]))
+    scene.add(rt.Receiver("rx", position=[5, 0, 2]))
+    found = rt.PathSolver()(scene, max_depth=0, samples_per_src=100)
+    with pytest.raises(InputError, match="2 antennas, whose paths add up"):
+        read(found)
+
+
+def write_insite(lines: list[Polyline], folder: Path) -> Path:
+    letters = {"reflection": "R", "diffraction": "D", "transmission": "T", "diffuse": "DS"}
+    groups = by_receiver(lines)
+    text = ["# <receiver> <paths>", str(len(groups) + 1)]
+    for number, group in enumerate(groups, 1):
+        text += [f"{number} {len(group)}", "-80.0 1e-7 1e-8"]
+        for path, line in enumerate(group, 1):
+            level = line.power_db + TX_POWER_DBM
+            text.append(f"{path} {len(line.types)} {level:.12g} 31.9 {line.delay:.12g} 84.0 40.3 90.9 -13.4")
+            text.append("-".join(["Tx", *(letters[name] for name in line.types), "Rx"]))
+            text += [" ".join(f"{value:.9g}" for value in point) for point in line.points]
+    text.append(f"{len(groups) + 1} 0")
+    file = folder / "street.paths.t001_01.r002.p2m"
+    file.write_text("\n".join(text))
+    return file
+
+
+def write_aodt(lines: list[Polyline], folder: Path) -> Path:
+    rays, gains = [], []
+    for ue, group in enumerate(by_receiver(lines)):
+        pair = {"time_idx": 0, "ru_id": 1, "ue_id": ue}
+        for line in group:
+            types = ["emission", *line.types, "reception"]
+            points = [dict(zip("123", point, strict=True)) for point in (100 * line.points).tolist()]
+            rays.append(pair | {"points": points, "interaction_types": types})
+        amplitude = 10 ** (np.array([line.power_db for line in group]) / 20)
+        for element, share in enumerate((0.6, 0.8)):
+            gains.append(
+                pair
+                | {"ru_ant_el": 0, "ue_ant_el": element, "cir_re": (share * amplitude).tolist(),
+                   "cir_im": (0 * amplitude).tolist(), "cir_delay": [line.delay for line in group]}
+            )  # fmt: skip
+    for name, rows in (("raypaths", rays), ("cirs", gains)):
+        # Rows of a pair keep their order, but pairs come in any.
+        frame = pd.DataFrame(rows)
+        frame.iloc[np.argsort(-frame.ue_id.to_numpy(), kind="stable")].to_parquet(folder / f"{name}.parquet")
+    return folder
+
+
+def write_deepmimo(lines: list[Polyline], folder: Path, ending: str = "mat") -> Path:
+    digits = {"reflection": "1", "diffraction": "2", "diffuse": "3", "transmission": "4"}
+    groups = by_receiver(lines)
+    shape = len(groups), max(len(group) for group in groups)
+    content = {name: np.full(shape, np.nan) for name in ("power", "delay", "inter")}
+    content["inter_pos"] = np.full((*shape, 2, 3), np.nan)
+    content["tx_pos"] = lines[0].points[:1]
+    content["rx_pos"] = np.array([group[0].points[-1] for group in groups])
+    for rx, group in enumerate(groups):
+        for path, line in enumerate(group):
+            content["power"][rx, path], content["delay"][rx, path] = line.power_db, line.delay
+            content["inter"][rx, path] = int("".join(digits[name] for name in line.types) or 0)
+            content["inter_pos"][rx, path, : len(line.types)] = line.points[1:-1]
+    for name, values in content.items():
+        file = folder / f"{name}_t001_tx000_r002.{ending}"
+        np.savez(file, data=values) if ending == "npz" else savemat(file, {name: values})
+    return folder
+
+
+def write_matlab(lines: list[Polyline], folder: Path) -> Path:
+    if shutil.which("octave-cli") is None:
+        pytest.skip("GNU Octave is not installed")
+
+    def vector(point: np.ndarray) -> str:
+        return "[" + "; ".join(f"{value:.12g}" for value in point) + "]"
+
+    cells = []
+    for group in by_receiver(lines):
+        rays = []
+        for line in group:
+            hits = ", ".join(
+                f"struct('Type', '{name.capitalize()}', 'Location', {vector(point)})"
+                for name, point in zip(line.types, line.points[1:-1], strict=True)
+            )
+            rays.append(
+                f"struct('CoordinateSystem', 'Cartesian', 'TransmitterLocation', {vector(line.points[0])}, "
+                f"'ReceiverLocation', {vector(line.points[-1])}, 'LineOfSight', {'false' if hits else 'true'}, "
+                f"'Interactions', {{[{hits}]}}, 'PathLoss', {-line.power_db:.12g}, "
+                f"'PropagationDelay', {line.delay:.12g})"
+            )
+        cells.append("[" + "; ".join(rays) + "]")
+    file = folder / "rays.csv"
+    script = folder / "run.m"
+    script.write_text(f"rays = {{{', '.join(cells)}}};\nrays_to_table(rays, '{file}');\n")
+    command = ["octave-cli", "--quiet", "--path", str(MATLAB), str(script)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return file
+
+
+WRITERS: dict[str, Callable[[list[Polyline], Path], Path]] = {
+    "InSite": write_insite,
+    "AODT": write_aodt,
+    "DeepMIMO": write_deepmimo,
+    "DeepMIMO npz": lambda lines, folder: write_deepmimo(lines, folder, "npz"),
+    "MATLAB": write_matlab,
+}
+
+
+@pytest.mark.parametrize("program", WRITERS)
+def test_every_program_gives_the_powers_of_sionna_back(
+    lines: list[Polyline], tmp_path: Path, program: str
+) -> None:
+    source = WRITERS[program](lines, tmp_path)
+    program_read = read(source, tx_power_dbm=TX_POWER_DBM if program == "InSite" else None)
+    true = [sorted(10 ** (line.power_db / 10) for line in group) for group in by_receiver(lines)]
+    ends = np.lexsort(program_read.rx_position.T[::-1])
+    mine = [np.sort(powers(program_read)[program_read.link == link]) for link in ends]
+    for one, other in zip(mine, true, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_axes_and_units_of_another_convention_are_refused_or_named(
+    lines: list[Polyline], tmp_path: Path
+) -> None:
+    upright = [line._replace(points=line.points[:, [0, 2, 1]] * [1, 1, -1]) for line in lines]
+    file = write_insite(upright, tmp_path)
+    with pytest.raises(InputError, match="nearest surface"):
+        read(file, tx_power_dbm=TX_POWER_DBM)
+    turned = read(file, tx_power_dbm=TX_POWER_DBM, axes="x -z y")
+    assert turned.num_paths == len(lines)
+    metres = write_aodt([line._replace(points=line.points / 100) for line in lines], tmp_path)
+    with pytest.raises(InputError, match=r"nearest surface|takes"):
+        read(metres)
+
+
+REFUSED = {
+    "no transmitted power": (write_insite, lambda file: None, {}, "give tx_power_dbm"),
+    "a cut file": (
+        write_insite,
+        lambda file: file.write_text(file.read_text()[:-60]),
+        {"tx_power_dbm": 13.0},
+        "ends within a path|must be",
+    ),
+    "foliage": (
+        write_insite,
+        lambda file: file.write_text(file.read_text().replace("Tx-R-Rx", "Tx-X-Rx", 1)),
+        {"tx_power_dbm": 13.0},
+        "'X'",
+    ),
+    "a missing table": (write_aodt, lambda folder: (folder / "cirs.parquet").unlink(), {}, "no such file"),
+    "a missing column": (
+        write_aodt,
+        lambda folder: (
+            pd.read_parquet(folder / "raypaths.parquet").drop(columns="points").to_parquet(folder / "raypaths.parquet")
+        ),
+        {},
+        "points",
+    ),
+    "gains of another run": (
+        write_aodt,
+        lambda folder: (
+            pd.read_parquet(folder / "raypaths.parquet").iloc[1:].to_parquet(folder / "raypaths.parquet")
+        ),
+        {},
+        "gains of ru_id",
+    ),
+    "a missing matrix": (
+        write_deepmimo,
+        lambda folder: (folder / "inter_t001_tx000_r002.mat").unlink(),
+        {},
+        "inter_t001",
+    ),
+    "no matrix": (
+        write_deepmimo,
+        lambda folder: (folder / "delay_t001_tx000_r002.mat").write_text("power"),
+        {},
+        "not a matrix",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_wrong_file_is_refused(lines: list[Polyline], tmp_path: Path, fault: str) -> None:
+    write, spoil, arguments, message = REFUSED[fault]
+    source = write(lines, tmp_path)
+    spoil(source)
+    with pytest.raises(InputError, match=message):
+        read(source, **arguments)
+
+
+def test_a_folder_without_paths_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"raypaths\.parquet"):
+        read(tmp_path)
+    with pytest.raises(InputError, match="two points more"):
+        rows_of([Polyline(np.zeros((2, 3)), ["reflection"], -80.0)], "made up")
