@@ -9,11 +9,13 @@ from calibray.optimizers.cma_es import CMAES
 from calibray.optimizers.dfo_ls import DFOLS
 from calibray.optimizers.differential_evolution import DifferentialEvolution
 from calibray.optimizers.evaluations import Best
+from calibray.optimizers.gauss_newton import GaussNewton
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.methods import METHODS, label, make, method
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
+from calibray.optimizers.pounders import POUNDERS
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.sgwoim import SGWOIM
@@ -24,9 +26,11 @@ __all__ = [
     "DFOLS",
     "GWO",
     "METHODS",
+    "POUNDERS",
     "SGWOIM",
     "Best",
     "DifferentialEvolution",
+    "GaussNewton",
     "GaussianProcess",
     "LatinHypercube",
     "LeastSquares",

@@ -14,11 +14,13 @@ from calibray.optimizers.cma_es import CMAES
 from calibray.optimizers.dfo_ls import DFOLS
 from calibray.optimizers.differential_evolution import DifferentialEvolution
 from calibray.optimizers.evaluations import Objective
+from calibray.optimizers.gauss_newton import GaussNewton
 from calibray.optimizers.gaussian_process import GaussianProcess
 from calibray.optimizers.gwo import GWO
 from calibray.optimizers.least_squares import LeastSquares
 from calibray.optimizers.multifidelity.cheap_model import CheapModel
 from calibray.optimizers.multifidelity.space_mapping import SpaceMapping
+from calibray.optimizers.pounders import POUNDERS
 from calibray.optimizers.protocol import Optimizer
 from calibray.optimizers.sampling import LatinHypercube, RandomSearch, Sobol
 from calibray.optimizers.sgwoim import SGWOIM
@@ -34,6 +36,8 @@ METHODS: Final[dict[str, type[Optimizer]]] = {
     "cma-es": CMAES,
     "differential-evolution": DifferentialEvolution,
     "dfo-ls": DFOLS,
+    "pounders": POUNDERS,
+    "gauss-newton": GaussNewton,
     "gaussian-process": GaussianProcess,
     "random": RandomSearch,
     "latin-hypercube": LatinHypercube,
@@ -44,6 +48,8 @@ LABELS: Final = {
     "gwo": "GWO",
     "sgwo-im": "SGWO-IM",
     "space-mapping": "space mapping",
+    "pounders": "POUNDERS",
+    "gauss-newton": "Gauss-Newton",
     "auto": "auto (least squares)",
 }
 

@@ -1,0 +1,232 @@
+"""POUNDERS: derivative-free least squares by quadratic models of every residual.
+
+S. M. Wild, "Solving Derivative-Free Nonlinear Least Squares Problems with POUNDERS", in Advances and Trends in
+Optimization with Engineering Applications, SIAM (2017), ch. 40. The authors' package IBCDFO needs a solver (MINQ) that
+no package index has.
+
+Every residual has the quadratic model of least curvature through evaluated points near the best one. The sum of their
+squares, to second order, is minimised in a trust region, a box. Points for which the models are at least fully linear
+come first: they span all directions within the region. Where a direction is missing and the step failed, that direction
+is evaluated before the region shrinks. It is a local method: it starts in the middle of the box (or at the best point
+told before), and restarts at random points when it has converged before its budget is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import ClassVar, Final, NamedTuple, final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+
+from calibray.optimizers.arguments import Box, real, whole
+from calibray.optimizers.evaluations import Archive, Evaluations, Objective, root_mean_square
+from calibray.optimizers.library_adapter import limited
+from calibray.optimizers.protocol import AS_GIVEN, Optimizer, Schedule, Search, Session
+
+SPANNING: Final = (1.75, 10.0)
+"""Distances, in trust regions, within which points may span the directions: for a fully linear model, and at all."""
+
+NEW_DIRECTION: Final = 1e-3
+"""Least part of a point, in trust regions, along directions that earlier points lack (theta_1)."""
+
+INDEPENDENT: Final = 1e-3
+"""Least pivot that a further point adds to the curvature (theta_2)."""
+
+ACCEPTED: Final = 0.05
+"""Share of the predicted decrease from which a step lets the trust region grow."""
+
+LARGEST: Final = 0.5
+"""Largest trust region, as a share of the box."""
+
+
+@final
+class POUNDERS(Optimizer):
+    """Derivative-free least squares with curvature. Uses residuals; budget as set.
+
+    Args:
+        seed: Seed of the random points of restarts.
+        budget: Number of evaluations.
+        radius: First trust region, as a share of the box.
+        tolerance: Trust region at which a start has converged, as a share of the box.
+
+    Raises:
+        InputError: An argument is out of range.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"value", "residuals"})
+    schedule: ClassVar[Schedule | None] = AS_GIVEN
+    takes_starts: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        seed: int = 0,
+        budget: int = 225,
+        radius: float = 0.2,
+        tolerance: float = 1e-4,
+        objective: Objective = root_mean_square,
+    ) -> None:
+        self.box = Box.between(lower, upper)
+        self._budget = whole("budget", budget, at_least=1)
+        self.radius = real("radius", radius, at_least=1e-6, at_most=LARGEST)
+        self.tolerance = real("tolerance", tolerance, at_least=1e-12, at_most=self.radius)
+        rng, radii = np.random.default_rng(whole("seed", seed, at_least=0)), (self.radius, self.tolerance)
+        self._session = Session(
+            self.box,
+            self.uses,
+            lambda archive: limited(_search(archive, radii, rng), self._budget),
+            objective,
+        )
+
+
+def _search(archive: Archive, radii: tuple[float, float], rng: np.random.Generator) -> Search:
+    """Search from one start after the other without end."""
+    d = archive.box.dimension
+    start = archive.box.to_unit(archive.best.x) if len(archive) else np.full(d, 0.5)
+    while True:
+        yield from _descend(archive, start, radii)
+        start = rng.random(d)
+
+
+class _Points(NamedTuple):
+    """Evaluated points of the unit cube [n, d], and their residuals [n, m]."""
+
+    unit: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+
+    @property
+    def value(self) -> NDArray[np.float64]:
+        """Half the sums of squares [n]."""
+        return 0.5 * np.sum(self.residuals**2, axis=1)
+
+
+def _descend(archive: Archive, start: NDArray[np.float64], radii: tuple[float, float]) -> Search:
+    """One local search; yields candidates [n, d] of the box."""
+    box, d, radius = archive.box, len(start), radii[0]
+
+    def evaluated(
+        points: _Points | None, unit: NDArray[np.float64]
+    ) -> Generator[NDArray[np.float64], Evaluations, _Points]:
+        answer = archive.imputed((yield box.from_unit(unit)))
+        new = _Points(box.to_unit(answer.x), answer.errors)
+        both = [new] if points is None else [points, new]
+        return _Points(*(np.concatenate(part) for part in zip(*both, strict=True)))
+
+    side = np.where(start <= 0.5, radius, -radius)
+    points = yield from evaluated(None, np.vstack([start, start + np.diag(side)]))
+    while radius > radii[1]:
+        best = int(np.argmin(points.value))
+        centre = points.unit[best]
+        chosen, missing = _spanning(points, best, radius)
+        if missing is None or len(chosen) == d:
+            step, predicted = _step(points, best, _enriched(points, best, chosen, radius), radius)
+            if predicted > 0 and np.abs(step).max() > 1e-3 * radii[1]:
+                before = points.value[best]
+                points = yield from evaluated(points, np.clip(centre + step, 0.0, 1.0)[None])
+                ratio = (before - points.value[-1]) / predicted
+                if ratio >= ACCEPTED:
+                    radius = min(2 * radius, LARGEST) if np.abs(step).max() > 0.75 * radius else radius
+                    continue
+        if missing is None:
+            radius *= 0.5
+        else:
+            points = yield from evaluated(points, _improving(centre, missing, radius)[None])
+
+
+def _spanning(points: _Points, best: int, radius: float) -> tuple[list[int], NDArray[np.float64] | None]:
+    """Points that span the directions around the best one, the latest first, and the directions that are missing.
+
+    Directions [k, d] are missing from a fully linear model where only far points, or none, span them.
+    """
+    offset = (points.unit - points.unit[best]) / radius
+    distance = np.linalg.norm(offset, axis=1)
+    chosen: list[int] = []
+    basis = np.zeros((0, offset.shape[1]))
+    missing: NDArray[np.float64] | None = None
+    for reach in SPANNING:
+        for index in range(len(offset) - 1, -1, -1):
+            if index == best or index in chosen or distance[index] > reach * np.sqrt(offset.shape[1]):
+                continue
+            rest = offset[index] - basis.T @ (basis @ offset[index])
+            if np.linalg.norm(rest) >= NEW_DIRECTION * max(distance[index], 1.0):
+                chosen.append(index)
+                basis = np.vstack([basis, rest / np.linalg.norm(rest)])
+            if len(chosen) == offset.shape[1]:
+                return chosen, missing
+        if missing is None:
+            missing = np.linalg.svd(basis)[2][len(basis) :] if len(basis) else np.eye(offset.shape[1])
+    return chosen, missing
+
+
+def _enriched(points: _Points, best: int, chosen: list[int], radius: float) -> NDArray[np.int64]:
+    """Further points that determine curvature well, after those that span the directions; the best one is first.
+
+    There are at most 2 d + 1, as in the paper's experiments.
+    """
+    offset = (points.unit - points.unit[best]) / radius
+    near = np.flatnonzero(np.linalg.norm(offset, axis=1) <= SPANNING[1] * np.sqrt(offset.shape[1]))
+    kept = [best, *chosen]
+    for index in reversed(near.tolist()):
+        if len(kept) == 2 * offset.shape[1] + 1:
+            break
+        if index not in kept and _pivot(offset[[*kept, index]]) >= INDEPENDENT:
+            kept.append(index)
+    return np.array(kept)
+
+
+def _pivot(offset: NDArray[np.float64]) -> float:
+    """Least singular value of the quadratic terms of points, without what a plane can take up."""
+    plane = np.hstack([np.ones((len(offset), 1)), offset])
+    q = np.linalg.qr(plane, mode="complete")[0][:, plane.shape[1] :]
+    return float(np.linalg.svd(q.T @ _quadratic(offset) @ q, compute_uv=False)[-1])
+
+
+def _quadratic(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Kernel of the least Frobenius norm of the curvature, (x . y)^2 / 2."""
+    return 0.5 * (offset @ offset.T) ** 2
+
+
+def _step(
+    points: _Points, best: int, kept: NDArray[np.int64], radius: float
+) -> tuple[NDArray[np.float64], float]:
+    """The step that minimises the model in the trust region [d], and the decrease of the value that it predicts."""
+    offset = (points.unit[kept] - points.unit[best]) / radius
+    count, d = offset.shape
+    plane = np.hstack([np.ones((count, 1)), offset])
+    system = np.block([[_quadratic(offset), plane], [plane.T, np.zeros((d + 1, d + 1))]])
+    side = np.vstack([points.residuals[kept], np.zeros((d + 1, points.residuals.shape[1]))])
+    solved = np.linalg.lstsq(system, side, rcond=1e-12)[0]
+    residuals, slopes = points.residuals[best], solved[count + 1 :]  # [m], [d, m]
+    # Sum of residuals times their curvatures, sum_i r_i sum_j lambda_ij s_j s_j^T, and Gauss-Newton's part.
+    curvature = (offset.T * (solved[:count] @ residuals)) @ offset + slopes @ slopes.T
+    gradient = slopes @ residuals
+    low = np.maximum(-points.unit[best] / radius, -1.0)
+    high = np.minimum((1.0 - points.unit[best]) / radius, 1.0)
+
+    def model(step: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        product = curvature @ step
+        return float(gradient @ step + 0.5 * step @ product), gradient + product
+
+    newton = np.linalg.lstsq(curvature, -gradient, rcond=None)[0]
+    starts = (np.zeros(d), np.clip(newton, low, high), np.where(gradient > 0, low, high))
+    bounds = np.stack([low, high], axis=1)
+    ended = [minimize(model, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+    lowest = min(ended, key=lambda end: end.fun)
+    return radius * lowest.x, -float(lowest.fun)
+
+
+def _improving(
+    centre: NDArray[np.float64], missing: NDArray[np.float64], radius: float
+) -> NDArray[np.float64]:
+    """A point of the cube in the missing direction that has most room."""
+    directions = np.vstack([missing, -missing])
+    with np.errstate(divide="ignore"):
+        room = np.where(
+            directions > 0, (1 - centre) / directions, -centre / np.where(directions < 0, directions, -1)
+        )
+    length = np.minimum(room.min(axis=1), radius)
+    return np.clip(centre + length.max() * directions[np.argmax(length)], 0.0, 1.0)
