@@ -23,6 +23,7 @@ import numpy as np
 import districts
 from calibray.engines import Replay
 from calibray.engines.rays.compile import RaySetting, compile_rays, powers, rays_of
+from calibray.engines.rays.export import Export
 from calibray.engines.rays.table import RayTable
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
@@ -31,6 +32,7 @@ from calibray.fitting.ray_model import HALF_SPACE
 from calibray.fitting.search import least_squares
 from calibray.materials import Material, itu_material
 from calibray.paths import Paths
+from calibray.study import Study
 from calibray.tracing.settings import Antenna
 
 NOISE_DB: Final = 3.0
@@ -69,6 +71,7 @@ class Foreign:
         setup = problem.setup
         table = rays_of(paths)
         setting = RaySetting(setup.scene, setup.radio.frequency, antennas, setup.links)
+        self.setting = RaySetting.of(setup)
         self.table: RayTable = table
         bare = compile_rays(replace(table, power=None), setting)
         self.paths = replace(
@@ -77,22 +80,26 @@ class Foreign:
         self.replay = Replay(self.paths, problem.parameters)
         self.parameters = problem.parameters
 
-    def rays(self, candidate: np.ndarray) -> RayTable:
+    def rays(self, candidate: np.ndarray) -> Export:
         """The answer to one candidate."""
         paths = replace(self.paths, materials=self.parameters.materials(candidate, self.paths.materials))
-        return replace(self.table, power=powers(paths))
+        return Export.of_table(replace(self.table, power=powers(paths)), self.setting)
 
 
 def repetition(district: districts.District, name: str, seed: int) -> dict[str, Any]:
     """One planted truth on one engine."""
     started, random = time.process_time(), np.random.default_rng([seed, 30])
-    foreign = Foreign(district.problem, district.paths, name)
+    known = district.problem
+    content = {key: value for key, value in known.setup.study.content().items() if key != "antennas"}
+    setup = Study.from_content(content, known.setup.study.path).opened()
+    foreign = Foreign(replace(known, setup=setup), district.paths, name)
     parameters = foreign.parameters
     truth = parameters.from_search(random.uniform(*parameters.search_bounds))
     loss = foreign.replay.path_loss(truth[None])[0]
     measured = loss + NOISE_DB * random.standard_normal(len(loss))
     problem = replace(
-        district.problem,
+        known,
+        setup=setup,
         engine=foreign.replay,
         objective=replace(district.problem.objective, measured=measured),
     )

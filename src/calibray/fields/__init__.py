@@ -18,6 +18,7 @@ from calibray.fields.evaluation import (
     path_losses_and_slopes_with_effects,
     path_losses_with_effects,
     path_powers,
+    program_gains,
     program_path_loss,
 )
 from calibray.fields.jax_context import jax_settings
@@ -47,6 +48,7 @@ __all__ = [
     "path_losses_and_slopes_with_effects",
     "path_losses_with_effects",
     "path_powers",
+    "program_gains",
     "program_path_loss",
     "table_intervals",
 ]

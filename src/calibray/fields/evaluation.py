@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from calibray.fields import coefficient_tables
-from calibray.fields.arithmetic import materialize, segment_sums
+from calibray.fields.arithmetic import Pair, materialize, segment_sums
 from calibray.fields.coefficient_tables import CoefficientTables, TableLayout
 from calibray.fields.combining import POWER, Combining, decibel, link_power, path_power
 from calibray.fields.effects import Effects, apply_effects
@@ -103,6 +103,16 @@ def program_path_loss(program: GroupedProgram, table: jax.Array, combining: Comb
     """
     response = materialize(material_response(program, table), program.wavelength)
     return decibel(_power(program, split_by_step(program, response), combining))
+
+
+@jax_settings()
+def program_gains(program: GroupedProgram, table: jax.Array) -> Pair:
+    """Gains of all paths in the order of the program, real and imaginary part [R, T, P], as one pure function.
+
+    `table` has the material constants [M, 8].
+    """
+    response = materialize(material_response(program, table), program.wavelength)
+    return path_fields(program, split_by_step(program, response))
 
 
 @jax_settings()

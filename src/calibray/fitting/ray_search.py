@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibray.engines.rays.export import Export, Exporting
 from calibray.fitting.methods import AUTO, local_searches
 from calibray.fitting.problem import Problem
+from calibray.fitting.ray_fit import described
 from calibray.fitting.ray_mapping import MOST_CALLS, RayMap, map_rays, with_engine
 from calibray.fitting.search import Trail, least_squares
 from calibray.result.remark import Remark, RemarkKind
@@ -58,23 +59,19 @@ def search_rays(
 
 
 def _remark(mapped: RayMap) -> Remark:
-    understanding = mapped.understanding
-    model, assumed = (
-        understanding.model,
-        understanding.model.parameters.names[len(mapped.engine.parameters) :],
-    )
-    kept = [not (model.assumption.half_space and name.endswith(".thickness")) for name in assumed]
+    constants = dict(described(mapped.understanding))
+    slabs = any(field == "thickness" for _, field in mapped.understanding.model.assumed)
     return Remark(
         RemarkKind.RAY_MAPPING,
         {
             "understood": mapped.understood,
-            "misfit_db": understanding.misfit_db,
+            "misfit_db": mapped.understanding.misfit_db,
             "gap_db": mapped.gap_db,
             "calls": len(mapped.calls),
             "changed": mapped.changed,
             "changed_db": mapped.changed_db,
-            "half_space": model.assumption.half_space,
-            "names": [name for name, keep in zip(assumed, kept, strict=True) if keep],
-            "values": understanding.constants[kept].tolist(),
+            "half_space": slabs and not any(name.endswith(".thickness") for name in constants),
+            "names": list(constants),
+            "values": list(constants.values()),
         },
     )
