@@ -26,6 +26,7 @@ for library in ("OMP", "OPENBLAS", "MKL"):
 import numpy as np
 from numpy.typing import NDArray
 
+import markdown_tables
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
@@ -37,7 +38,7 @@ from calibray.comparison.method_runs import (
     code_fingerprint,
 )
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
-from calibray.tables import Column, Table, markdown, numbers
+from calibray.tables import Column, Table, numbers
 from problem_families.family_comparison import seed_range
 from problem_families.problems import planted_problem
 
@@ -244,7 +245,7 @@ def main() -> None:
                     runs[name].append(run)
                     found.append(run.at(run.evaluations))
             lowest += [min(problem.minimum, *found)] * chosen.repeats
-    print(markdown.render(compared(runs, np.array(lowest))))
+    print(markdown_tables.render(compared(runs, np.array(lowest))))
     for name, each in runs.items():
         for run in each:
             if run.failure:
