@@ -15,7 +15,7 @@ SIGNATURES = {
     "itu_material": "name, frequency, thickness, revision, scattering",
     "read_measurements": "path, tx, rx, value, quantity, where, group, weight, std, tx_power_dbm, frequency",
     "trace": "scene, measurements, frequency, tx_antenna, rx_antenna, materials, progress, settings",
-    "read_rays": "rays, scene, frequency, antennas, axes",
+    "read_rays": "rays, scene, frequency, antennas, axes, tx_power_dbm",
     "write_rays": "paths, file, overwrite",
     "path_gains": "paths, materials",
     "path_loss": "paths, materials, combining, bandwidth",
