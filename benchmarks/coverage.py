@@ -34,13 +34,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, cast
 
+import markdown_tables
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
 from scipy.stats import t as student
 
 import districts
-import markdown_tables
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares

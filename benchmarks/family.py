@@ -24,6 +24,7 @@ for library in (
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import markdown_tables
+
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile

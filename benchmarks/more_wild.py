@@ -16,10 +16,10 @@ import os
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+import markdown_tables
 import numpy as np
 from numpy.typing import NDArray
 
-import markdown_tables
 from calibray.optimizers import label, make
 from calibray.tables import Column, Table, numbers
 from problem_families.more_wild import MoreWild, problems
