@@ -34,7 +34,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, cast
 
-import markdown_tables
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
@@ -44,7 +43,7 @@ import districts
 from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail, search
 from calibray.optimizers import LeastSquares
-from calibray.tables import Column, Table, numbers
+from calibray.tables import Column, Table, markdown, numbers
 from calibray.tables.text import render
 from calibray.uncertainty.assessment import certainty
 from calibray.uncertainty.credible_sets import credible, credible_sets
@@ -310,7 +309,7 @@ def main() -> None:
         print(f"{count} of {len(tasks)}", end="\r", file=sys.stderr)
     lines = [each for each in lines if each["district"] in names and each["world"] in worlds]
     for table in tables(lines):
-        print(f"\n**{table.title}**\n\n{markdown_tables.render(table)}" if given.markdown else render(table))
+        print(f"\n**{table.title}**\n\n{markdown.render(table)}" if given.markdown else render(table))
     count, denied = determined(lines)
     print(f"Well determined with the noise known: {count} values; called not identifiable of them: {denied}.")
     if denied:

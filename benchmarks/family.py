@@ -23,13 +23,11 @@ for library in (
 ):  # read when NumPy is loaded; one core a run, here and in the workers
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-import markdown_tables
-
 from calibray.cli.console import log
 from calibray.cli.progress_bars import progress_bars
 from calibray.comparison.comparison import quantile
 from calibray.optimizers import label
-from calibray.tables import Column, Table, numbers
+from calibray.tables import Column, Table, markdown, numbers
 from problem_families.family_comparison import FamilyComparison, compare_family, seed_range, tables
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,8 +70,8 @@ def main() -> None:
     for name, part in named:
         print(f"## {name}: {len(part.seeds)} problems\n")
         for table in tables(part):
-            print(f"{table.title}\n\n{markdown_tables.render(table)}\n", flush=True)
-    print(f"{markdown_tables.render(shown(together))}\n")
+            print(f"{table.title}\n\n{markdown.render(table)}\n", flush=True)
+    print(f"{markdown.render(shown(together))}\n")
     for part in finished:
         for seed, reason in part.failed_problems:
             print(f"- {part.kind} {seed} could not be made: {reason}")

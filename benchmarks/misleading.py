@@ -23,7 +23,6 @@ from pathlib import Path
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-import markdown_tables
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +37,7 @@ from calibray.comparison.method_runs import (
     code_fingerprint,
 )
 from calibray.optimizers.multifidelity.cheap_model import CheapAnswer, CheapModel, Constants
-from calibray.tables import Column, Table, numbers
+from calibray.tables import Column, Table, markdown, numbers
 from problem_families.family_comparison import seed_range
 from problem_families.problems import planted_problem
 
@@ -245,7 +244,7 @@ def main() -> None:
                     runs[name].append(run)
                     found.append(run.at(run.evaluations))
             lowest += [min(problem.minimum, *found)] * chosen.repeats
-    print(markdown_tables.render(compared(runs, np.array(lowest))))
+    print(markdown.render(compared(runs, np.array(lowest))))
     for name, each in runs.items():
         for run in each:
             if run.failure:

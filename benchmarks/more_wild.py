@@ -16,12 +16,11 @@ import os
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-import markdown_tables
 import numpy as np
 from numpy.typing import NDArray
 
 from calibray.optimizers import label, make
-from calibray.tables import Column, Table, numbers
+from calibray.tables import Column, Table, markdown, numbers
 from problem_families.more_wild import MoreWild, problems
 
 RADIUS = 0.005  # of the box, which makes the first trust region a tenth of the starting point, as by default in DFO-LS
@@ -82,7 +81,7 @@ def main() -> None:
         for column, tolerance in enumerate(TOLERANCES)
         for row, method in enumerate(methods)
     )
-    print(markdown_tables.render(Table("", columns, rows)))
+    print(markdown.render(Table("", columns, rows)))
 
 
 if __name__ == "__main__":
