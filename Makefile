@@ -1,6 +1,7 @@
 # Everything happens in .venv; `make demo` and `make test` set it up first.
 
 PYTHON ?= python3
+NEWEST ?= python3.13
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
@@ -22,15 +23,17 @@ test: setup
 quick: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile -q $(QUICK)
 
-# The lowest versions that pyproject.toml allows, and the newest that can be had with the newest Python.
+# The lowest versions that pyproject.toml allows, whose warnings are those of their time, and the newest versions with
+# the newest Python.
 lowest:
 	tools/make_venv.sh $(PYTHON) .venv-lowest
 	$(PYTHON) tools/lowest.py test > .venv-lowest/constraints.txt
 	.venv-lowest/bin/pip install --quiet --constraint .venv-lowest/constraints.txt --editable '.[test]'
-	.venv-lowest/bin/python -m pytest --numprocesses auto --dist loadfile -q $(QUICK)
+	.venv-lowest/bin/python -m pytest --numprocesses auto --dist loadfile -q -W ignore $(QUICK)
 
 newest:
-	tools/make_venv.sh python3.13 .venv-newest
+	@$(NEWEST) --version || { echo "newest: '$(NEWEST)' does not run; name a newer Python: make newest NEWEST=PATH" >&2; exit 1; }
+	tools/make_venv.sh $(NEWEST) .venv-newest
 	.venv-newest/bin/pip install --quiet --upgrade --upgrade-strategy eager --editable '.[test]'
 	.venv-newest/bin/python -m pytest --numprocesses auto --dist loadfile -q $(QUICK)
 
