@@ -95,6 +95,15 @@ def test_nobody_else_can_reach_the_workers():
         assert listening_sockets() == before
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_check_of_sockets_sees_a_scheduler_of_dask():
+    """What local workers were before: a scheduler on loopback, to which any local user can connect."""
+    distributed = pytest.importorskip("distributed")
+    before = listening_sockets()
+    with distributed.LocalCluster(n_workers=1, processes=False, protocol="tcp", dashboard_address=None):
+        assert listening_sockets() != before
+
+
 def test_an_error_reaches_the_caller_and_workers_go_on():
     with engines.open_workers(1) as workers:
         with pytest.raises(InputError, match="b cannot be used"):

@@ -44,6 +44,9 @@ def init(
         Path | None,
         typer.Option(metavar="FILE", help="Draw the antennas over the scene (.png, .svg or .pdf)."),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a plot that Calibray did not write.")
+    ] = False,
 ) -> None:
     """Draft a study from a scene and a table of links, and list its assumptions with their reasons."""
     from calibray.cli.console import warn
@@ -77,7 +80,7 @@ def init(
         if findings := count_unknowns(draft.study, measured):
             echo(warning_lines(findings), err=True)
         if plot is not None:
-            save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs)
+            save_positions(plot, draft.study.scene_source, measured.tx, measured.rx, inputs, overwrite)
     if plot is not None:
         echo(f"Written to {plot}", err=True)
     schema = out.parent / SCHEMA_FILE
