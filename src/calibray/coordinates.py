@@ -182,6 +182,45 @@ def transformer(source: object, target: object) -> Transformer:
     return pyproj.Transformer.from_crs(parse_crs(source), parse_crs(target), always_xy=True)
 
 
+def find_projection(
+    x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: ArrayLike, high: ArrayLike
+) -> str | None:
+    """Find the map projection in which positions lie on a scene.
+
+    Candidates are the UTM zone of the scene, Web Mercator, and the projections of the EPSG that cover the scene.
+
+    Args:
+        x: Coordinates to the east [n].
+        y: Coordinates to the north [n].
+        frame: The scene's frame.
+        low: West and south end of the scene [2], [m].
+        high: East and north end [2], [m].
+
+    Returns:
+        The projection with the most positions on the scene; None if no projection has half of them there.
+
+    Example:
+        >>> frame = Frame.local(11.5755, 48.1374)
+        >>> find_projection(np.array([691607.0]), np.array([5334760.0]), frame, [-200, -200], [200, 200])
+        'EPSG:32632'
+    """
+    pyproj = library("pyproj", "geo")
+    longitude, latitude, _ = frame.to_geographic([0.0, 0.0, 0.0])
+    here = pyproj.aoi.AreaOfInterest(longitude, latitude, longitude, latitude)
+    known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
+    utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
+    best, most = None, 0.5
+    for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
+        try:
+            placed = frame.to_scene(x, y, 0.0, crs)[:, :2]
+        except (InputError, pyproj.exceptions.ProjError):  # outside the projection, or it is none of the globe
+            continue
+        share = float(((placed >= low) & (placed <= high)).all(axis=1).mean())
+        if share > most or (best is None and share == most):
+            best, most = crs, share
+    return best
+
+
 def _check_degrees(longitude: NDArray[np.float64], latitude: NDArray[np.float64]) -> None:
     for name, values, bound in (("latitude", latitude, 90.0), ("longitude", longitude, 180.0)):
         outside = np.flatnonzero(~(np.abs(np.ravel(values)) <= bound))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from calibray.cli.app import app
-from calibray.coordinates import Frame
+from calibray.coordinates import Frame, transformer
 from calibray.errors import InputError
 from calibray.materials import itu_material
 from calibray.measurements import SourceTable, column_names
@@ -312,6 +312,25 @@ def test_positions_in_centimetres_are_read_as_such(scene, tmp_path):
     links = drafted.study.measurements()
     np.testing.assert_allclose(links.rx[3], [3.0, 20.0, 1.5])
     assert links.tx[0].tolist() == [-30, 0, 15]
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:3857", "EPSG:31467"])
+def test_metres_of_a_map_projection_are_placed_on_the_scene(scene, tmp_path, crs):
+    """UTM, Web Mercator, and Gauss-Krueger of another datum, some 100 m off if taken for a UTM zone's."""
+    east, north = np.meshgrid(np.linspace(-20.0, 15.0, 6), np.linspace(-40.0, 40.0, 5))
+    degrees = FRAME.to_geographic(np.stack([east.ravel(), north.ravel(), np.full(30, 1.5)], axis=1))
+    x, y = transformer("EPSG:4326", crs).transform(*degrees.T[:2])
+    site = transformer("EPSG:4326", crs).transform(*FRAME.to_geographic([[60.0, 30.0, 9.0]])[0, :2])
+    (tmp_path / "sites.csv").write_text(f"cell,Rechtswert,Hochwert,height\nA,{site[0]},{site[1]},9\n")
+    file = table(tmp_path, Rechtswert=x, Hochwert=y, cell="A", rssi=-50.0 - np.arange(30))
+    drafted = draft(scene, file, tmp_path / "study.toml", tmp_path / "sites.csv", 3.5e9)
+    links = drafted.study.measurements()
+    np.testing.assert_allclose(links.rx[:, :2], np.stack([east.ravel(), north.ravel()], axis=1), atol=1.5)
+    np.testing.assert_allclose(links.tx[0], [60.0, 30.0, 9.0], atol=1.5)
+    (tmp_path / "far.csv").write_text(
+        "x,y,tx_x,tx_y,pathloss\n" + "\n".join(f"{9e6 + k},5,9e6,0,9{k}" for k in range(9))
+    )
+    assert draft(scene, tmp_path / "far.csv", tmp_path / "study.toml", frequency=3e9).study.links.crs is None
 
 
 def test_transmitters_in_the_links_get_an_offset_each(scene, tmp_path):

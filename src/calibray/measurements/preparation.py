@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calibray.coordinates import Frame
+from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
 from calibray.measurements.source_table import Coordinates, SourceTable
 from calibray.support.messages import did_you_mean
@@ -123,6 +123,7 @@ class Preparation:
         noise_floor_dbm: Noise floor [dBm]; missing powers count as below it.
         censored: Whether links at or below the noise floor are kept, as censored links at the floor.
         frame: The scene's frame on the globe, if positions are longitude, latitude and height; None for lengths.
+        crs: Reference system of positions that have a frame.
         unit_m: Length of one unit of columns of positions in the scene's frame [m].
         ground: Height of the ground, if heights are above it.
         averaging: How samples are averaged.
@@ -142,6 +143,7 @@ class Preparation:
     noise_floor_dbm: float | None = None
     censored: bool = False
     frame: Frame | None = None
+    crs: str = WGS84
     unit_m: float = 1.0
     ground: Ground | None = None
     averaging: Averaging | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
+from calibray.coordinates import find_projection
 from calibray.errors import InputError
 from calibray.measurements import (
     TRACK_COLUMNS,
@@ -28,7 +29,7 @@ from calibray.measurements.planner_columns import find_powers
 from calibray.measurements.selection import comparison, find_codes, without_codes
 from calibray.scenes import read_frame
 from calibray.scenes.checks import SceneSurfaces
-from calibray.study.link_checks import CELL_SHARE
+from calibray.study.link_checks import CELL_SHARE, FAR
 from calibray.study.model import BUNDLED, VERSION
 from calibray.study.study import Study
 
@@ -100,7 +101,7 @@ class LinksDraft:
         self._add_track()
         self._add_transmitters()
         self.frequency = self._frequency()
-        rx, tx = self._position_columns()
+        rx, tx = self._projected(*self._position_columns())
         value = self._value()
         self._add_positions(tx, rx)
         self.section |= {"value": value.column, "quantity": value.quantity}
@@ -274,6 +275,26 @@ class LinksDraft:
         x, y, height = (self._name_in_links(name) for name in (tx.x, tx.y, tx.height))
         return rx, PositionColumns(tx.position, str(x), str(y), height)
 
+    def _projected(
+        self, rx: PositionColumns, tx: PositionColumns | None
+    ) -> tuple[PositionColumns, PositionColumns | None]:
+        """The columns, which are on the globe if their numbers are far from the scene, but on it in a projection."""
+        frame = read_frame(self.scene) if rx.position == "scene" else None
+        if frame is None or (tx is not None and tx.position != "scene"):
+            return rx, tx
+        x, y = (pd.to_numeric(self._table.frame[name], errors="coerce").dropna() for name in (rx.x, rx.y))
+        low, high = self.overhead.bounds[:2], self.overhead.bounds[3:5]
+        centre, reach = (low + high) / 2, FAR * float(np.max(high - low))
+        if np.hypot(x.median() - centre[0], y.median() - centre[1]) < reach:
+            return rx, tx
+        crs = find_projection(x.to_numpy(), y.to_numpy(), frame, low, high)
+        if crs is None:
+            return rx, tx
+        self.section["crs"] = crs
+        self.assume("links.crs", crs, f"{rx.x} and {rx.y} are on the scene in this projection")
+        ends = (None if end is None else replace(end, position="geographic") for end in (rx, tx))
+        return next(ends), next(ends)  # type: ignore[return-value]
+
     def _name_in_links(self, column: str | None) -> str | None:
         """A column of transmitters gets another name if the links have one of that name."""
         taken = column in self._table.frame and column != self._transmitter_key
@@ -283,6 +304,7 @@ class LinksDraft:
         self.section["tx"] = self._transmitter(tx, rx)
         self.section["rx"] = [rx.x, rx.y, RECEIVER_HEIGHT if rx.height is None else rx.height]
         unit = "degrees" if rx.position == "geographic" else "metres"
+        unit = "metres of a projection" if "crs" in self.section else unit
         self._add_position_unit(tx, rx)
         reason = f"columns named as {unit}" if "position_unit" not in self.section else "by their names"
         reason += "" if rx.height else f"; no height: {RECEIVER_HEIGHT} m"
@@ -295,7 +317,7 @@ class LinksDraft:
                 f"{self.links}: positions are in degrees, but {self.scene} has no place on the globe; make the scene "
                 "with `calibray scene`, or write a study yourself with scene.origin"
             )
-        reason = f"degrees; {Path(self.scene).name} has the scene's place on the globe"
+        reason = f"{unit}; {Path(self.scene).name} has the scene's place on the globe"
         self.assume("links.position", "geographic", reason)
 
     def _add_position_unit(self, tx: PositionColumns | None, rx: PositionColumns) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from calibray.coordinates import Frame
+from calibray.coordinates import WGS84, Frame
 from calibray.errors import InputError
 from calibray.measurements import Averaging, LinkColumns, Preparation, Track, read_table
 from calibray.study.model import StudyModel
@@ -83,6 +83,7 @@ def position_steps(study: StudyModel) -> Preparation:
         ground=None if links.heights is None else _ground(study),
         transmitters=None if transmitters is None else read_table(transmitters),
         transmitter=links.transmitter,
+        crs=links.crs or WGS84,
         unit_m=links.position_unit,
         computed={PORT_POWER: partial(port_power, study, optional=True)} if states_port_power(study) else {},
         frame=scene_frame(study) if links.position == "geographic" else None,

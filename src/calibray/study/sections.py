@@ -198,6 +198,7 @@ class LinksSection(Section):
         quantity: "path_loss" [dB], "path_gain" [dB], "received_power" [dBm], or "rsrp" [dBm], a received power with
             unknown transmitted power.
         position: "scene" for metres in the scene's frame, "geographic" for longitude and latitude.
+        crs: Reference system of positions that are "geographic", such as EPSG:32632; longitude and latitude if absent.
         position_unit: Length of one unit of position columns [m], in the scene's frame.
         where: Row filter.
         weight: Column of relative weights [1].
@@ -228,6 +229,7 @@ class LinksSection(Section):
     value: Text
     quantity: Quantity = "path_loss"
     position: Literal["scene", "geographic"] = "scene"
+    crs: Text | None = None
     position_unit: Annotated[float, Field(gt=0)] = 1.0
     where: Text | None = None
     weight: Text | None = None
@@ -256,6 +258,15 @@ class LinksSection(Section):
             raise InputError(
                 f"links.position_unit = {self.position_unit:g} with position = 'geographic': degrees have no length; "
                 "leave it out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _place_on_the_globe(self) -> Self:
+        if self.crs is not None and (self.position != "geographic" or self.track is not None):
+            raise InputError(
+                f"links.crs = {self.crs!r}: it is the reference system of columns with positions on the globe; set "
+                "links.position = 'geographic', without a track"
             )
         return self
 
