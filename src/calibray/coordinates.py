@@ -8,7 +8,7 @@ projection (`aeqd`), whose lengths are right to 1 mm per kilometre over several 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 WGS84: Final = "EPSG:4326"
 """Reference system of satellite receivers: longitude and latitude."""
+
+
+DATUM_SHIFT: Final = 3000.0
+"""Largest distance between points of equal coordinates in two geodetic datums [m]; most differ by less than 1 km."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +187,7 @@ def transformer(source: object, target: object) -> Transformer:
 
 
 def find_projection(
-    x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: ArrayLike, high: ArrayLike
+    x: NDArray[np.float64], y: NDArray[np.float64], frame: Frame, low: Sequence[float], high: Sequence[float]
 ) -> str | None:
     """Find the map projection in which positions lie on a scene.
 
@@ -210,12 +214,20 @@ def find_projection(
     known = pyproj.database.query_crs_info("EPSG", pyproj.enums.PJType.PROJECTED_CRS, here, contains=True)
     utm = [Frame.utm(longitude, latitude).crs] if -80 <= latitude <= 84 else []
     best, most = None, 0.5
+    reach = DATUM_SHIFT + 2 * float(np.max(np.subtract(high, low)))
     for crs in dict.fromkeys([*utm, "EPSG:3857", *sorted(f"EPSG:{info.code}" for info in known)]):
         try:
+            # Without its datum a projection is computed fast, and off by less than the shift between datums.
+            east, north = pyproj.Proj(crs)(longitude, latitude)
+            if not np.hypot(np.median(x) - east, np.median(y) - north) < reach:
+                continue
             placed = frame.to_scene(x, y, 0.0, crs)[:, :2]
-        except (InputError, pyproj.exceptions.ProjError):  # outside the projection, or it is none of the globe
+        except (
+            InputError,
+            pyproj.exceptions.ProjError,
+        ):  # outside the projection, or it is none of the globe
             continue
-        share = float(((placed >= low) & (placed <= high)).all(axis=1).mean())
+        share = float(((placed >= np.asarray(low)) & (placed <= np.asarray(high))).all(axis=1).mean())
         if share > most or (best is None and share == most):
             best, most = crs, share
     return best

@@ -287,7 +287,7 @@ class LinksDraft:
         centre, reach = (low + high) / 2, FAR * float(np.max(high - low))
         if np.hypot(x.median() - centre[0], y.median() - centre[1]) < reach:
             return rx, tx
-        crs = find_projection(x.to_numpy(), y.to_numpy(), frame, low, high)
+        crs = find_projection(x.to_numpy(), y.to_numpy(), frame, low.tolist(), high.tolist())
         if crs is None:
             return rx, tx
         self.section["crs"] = crs
