@@ -37,17 +37,20 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
+from scipy.special import stdtrit
 
 import districts
 from calibray import engines
+from calibray.errors import InputError
 from calibray.fitting.preliminary_fits import estimate_noise
 from calibray.fitting.problem import Problem
-from calibray.result.held_out import FITTED, Model
+from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Model
+from calibray.result.prediction_model import BlockErrors
 from calibray.scenarios import demo_study_path
 from calibray.study import Study
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
-from calibray.validation.held_out_statistics import interval_half_width, spatial_blocks
+from calibray.validation.held_out_statistics import spatial_blocks
 from calibray.validation.validate import fit_models, validate_problem
 from calibray.validation.variants import fit_variants
 
@@ -86,17 +89,26 @@ def left_out(problem: Problem, here: np.ndarray) -> tuple[str, dict[str, np.ndar
     """
     objective = problem.objective
     part = replace(problem, objective=replace(objective, weight=np.where(here, 0.0, objective.weight)))
-    inner = validate_problem(part)
-    found = fit_models(part, fit_variants(part))
+    part = replace(part, setup=part.setup.with_obstruction())
+    fits = fit_variants(part)
+    inner = validate_problem(part, known_minima={Model.CALIBRATED: fits[Model.CALIBRATED][1]})
+    found = fit_models(part, fits)
     errors = {name: (model - objective.measured)[here] for name, model in found.items()}
-    least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, Model.LOG_DISTANCE]).idxmin()
+    least = inner.table["rmse_db"].reindex([Model.INITIAL, *FITTED, *WITHOUT_MATERIALS]).idxmin()
     errors[LEAST] = errors[str(least)]
     judged = errors[inner.chosen][np.isfinite(errors[inner.chosen])]
-    return (
-        inner.chosen,
-        errors,
-        (np.abs(judged) <= interval_half_width(inner.sizes(inner.chosen), LEVEL)).tolist(),
-    )
+    levels = inner.levels(inner.chosen, problem.setup.links)
+    if levels is None:
+        raise InputError("too few links to judge")
+    half = np.hypot(*half_widths(levels, int(inner.judged.sum())))
+    return inner.chosen, errors, (np.abs(judged) <= half).tolist()
+
+
+def half_widths(levels: BlockErrors, links: int) -> tuple[float, float]:
+    """Half the 90 % interval of the errors within and of those between blocks [dB]."""
+    freedom = (links - levels.blocks, levels.blocks)
+    within, between = (float(stdtrit(each, (1 + LEVEL) / 2)) for each in freedom)
+    return within * levels.within_db, between * levels.between_db
 
 
 def nested(problem: Problem, count: int, uneven: int | None) -> tuple[Table, str]:

@@ -27,7 +27,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
-from scipy.special import stdtrit
 
 import districts
 import misfit_worlds
@@ -38,7 +37,7 @@ from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
 from calibray.validation.held_out_statistics import interval_half_width, spatial_blocks, two_levels
 from calibray.validation.validate import fit_models, fit_variants, validate_problem
-from choice import opened
+from choice import half_widths, opened
 
 LEVEL = 0.9
 CLUSTERS = 4
@@ -63,12 +62,7 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
     levels = two_levels(errors, inner.block[judged], np.hstack([links.tx, links.rx])[judged])
     if levels is None:
         raise InputError("too few links")
-    within, between = (
-        float(stdtrit(freedom, (1 + LEVEL) / 2)) * size
-        for freedom, size in (
-            (len(errors) - levels.blocks, levels.within_db), (levels.blocks, levels.between_db)
-        )
-    )  # fmt: skip
+    within, between = half_widths(levels, len(errors))
     halves = [
         interval_half_width(np.sort(np.abs(errors)), LEVEL),
         float(np.hypot(within, between)),
