@@ -6,8 +6,8 @@
 
 K-means from several seeds divides the receivers into four clusters. Each is kept apart in turn, and so is the quarter
 of the links at either end of the longer axis. The other links are validated on blocks, choose the model and give its
-errors. Three intervals of 90 % are compared at the links kept apart: by the ranks of all errors, in two levels (within
-and between blocks), and in two levels with the error between blocks counted twice. Clusters that hold all links of an
+errors. Four intervals of 90 % are compared at the links kept apart: by the ranks of all errors, in two levels (within
+and between blocks), these also wider out of sight, and these with the error between blocks counted twice. Clusters that hold all links of an
 offset's group are left out. A second table has the RMSE of every model on the links kept apart, and of the model that
 was chosen without them.
 
@@ -33,16 +33,23 @@ import misfit_worlds
 from calibray.errors import InputError
 from calibray.fitting.problem import Problem
 from calibray.result.held_out import FITTED, WITHOUT_MATERIALS, Model
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.tables import Column, Table, numbers
 from calibray.tables.text import render
-from calibray.validation.held_out_statistics import interval_half_width, spatial_blocks, two_levels
+from calibray.validation.held_out_statistics import (
+    interval_half_width,
+    out_of_sight_ratio,
+    spatial_blocks,
+    two_levels,
+)
 from calibray.validation.validate import fit_models, fit_variants, validate_problem
 from choice import half_widths, opened
 
 LEVEL = 0.9
 CLUSTERS = 4
 NOISE_DB = 3.0
-WAYS = ("by ranks", "two levels", "two levels, between twice")
+WAYS = ("by ranks", "two levels", "wider out of sight", "between twice")
+USED = WAYS.index("wider out of sight")
 
 
 CHOSEN = "chosen without them"
@@ -63,16 +70,20 @@ def coverage(problem: Problem, apart: np.ndarray) -> tuple[list[float], list[flo
     if levels is None:
         raise InputError("too few links")
     within, between = half_widths(levels, len(errors))
+    blocked = part.setup.links.table.numbers(OUT_OF_SIGHT) > 0
+    wider = np.where(blocked[apart], out_of_sight_ratio(errors, blocked[judged]), 1.0)
     halves = [
-        interval_half_width(np.sort(np.abs(errors)), LEVEL),
-        float(np.hypot(within, between)),
-        float(np.sqrt(within**2 + 2 * between**2)),
+        np.full(len(wider), interval_half_width(np.sort(np.abs(errors)), LEVEL)),
+        np.full(len(wider), np.hypot(within, between)),
+        np.hypot(within, between) * wider,
+        np.sqrt(within**2 + 2 * between**2) * wider,
     ]
     found = fit_models(part, fits)
     errors = {str(model): (loss - objective.measured)[apart] for model, loss in found.items()}
     errors[CHOSEN] = errors[name]
-    error = np.abs(errors[name][np.isfinite(errors[name])])
-    return [float(np.mean(error <= half)) for half in halves], halves, errors
+    finite = np.isfinite(errors[name])
+    inside = [float(np.mean((np.abs(errors[name]) <= half)[finite])) for half in halves]
+    return inside, [float(half.mean()) for half in halves], errors
 
 
 def judged(
@@ -151,7 +162,7 @@ def in_worlds(names: str, seeds: int, out: Path) -> Table:
                     continue
                 share, _, errors = coverage(problem, apart)
                 rmse = {model: float(np.sqrt(np.mean(error**2))) for model, error in errors.items()}
-                row = {"district": name, "world": world, "seed": seed, "inside": share[1], "rmse": rmse}
+                row = {"district": name, "world": world, "seed": seed, "inside": share[USED], "rmse": rmse}
                 rows.append(row)
                 file.write(json.dumps(row) + "\n")
                 file.flush()

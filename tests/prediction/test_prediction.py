@@ -226,3 +226,17 @@ def test_places_beyond_the_reach_of_held_out_links_get_wider_intervals(received)
     assert (variances[0] > half_width(levels, 60) ** 2 - 1e-9).all()
     added = (stdtrit(4.0, 0.95) * 2.0) ** 2
     assert variances[1] - variances[0] == pytest.approx(np.full(len(table), added), rel=1e-6)
+
+
+def test_links_out_of_sight_get_wider_intervals_where_their_errors_are_larger(received):
+    blocked = np.arange(planted.LINKS) % 2
+    table = planted.links().assign(sent_dbm=30.0, out_of_sight=blocked)
+    levels = BlockErrors(within_db=1.0, between_db=0.5, blocks=4, reach_m=50.0)
+    half = []
+    for ratio in (1.0, 1.5):
+        model = replace(received.prediction.model, links=60, blocks=replace(levels, out_of_sight=ratio))
+        predictions = changed(received, model=model).predict_interval(table)
+        half.append((predictions.upper_db - predictions.path_loss_db).to_numpy())
+    # The draws' part of the variance does not change.
+    added = np.where(blocked > 0, (1.5**2 - 1) * half_width(levels, 60) ** 2, 0.0)
+    assert half[1] ** 2 - half[0] ** 2 == pytest.approx(added, rel=1e-6, abs=1e-9)

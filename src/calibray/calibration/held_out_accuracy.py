@@ -12,9 +12,16 @@ from calibray.fitting.problem import Problem
 from calibray.fitting.search import Trail
 from calibray.result.held_out import Model
 from calibray.result.record import Accuracy
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.validation.baselines import has_obstruction, obstructed, without_scene
 from calibray.validation.choice import HeldOutResiduals
-from calibray.validation.held_out_statistics import choose, compare, spatial_blocks, two_levels
+from calibray.validation.held_out_statistics import (
+    choose,
+    compare,
+    out_of_sight_ratio,
+    spatial_blocks,
+    two_levels,
+)
 from calibray.validation.observables import held_out_gaps, observable_errors
 from calibray.validation.validate import DEFAULT_BLOCKS
 from calibray.validation.validation import Validation
@@ -111,6 +118,9 @@ def _choice(
         position = np.hstack([setup.links.tx, setup.links.rx])[judged][finite]
         block = spatial_blocks(position[:, 3:5], DEFAULT_BLOCKS)
         levels = two_levels(errors[name], block, position)
+        if levels is not None:
+            kept = np.flatnonzero(judged)[finite]
+            levels = replace(levels, out_of_sight=_out_of_sight(problem, errors[name], kept))
         return name, HeldOutResiduals(rms_db, basis, count, errors[name], levels)
     rms_db = None
     if problem.freedom >= 1:
@@ -143,7 +153,8 @@ def on_blocks(
     levels = validation.levels(name, problem.setup.links)
     if levels is not None:
         spread_db = problem.objective.nuisance.new_group_spread(validation.block)[judged]
-        levels = replace(levels, groups_db=float(np.sqrt(np.mean(spread_db**2))))
+        ratio = _out_of_sight(problem, validation.errors[name][judged], np.flatnonzero(judged))
+        levels = replace(levels, groups_db=float(np.sqrt(np.mean(spread_db**2))), out_of_sight=ratio)
     residuals = HeldOutResiduals(
         validation.scale(name),
         f"{name}, errors on {len(validation.labels)} blocks held out in turn",
@@ -160,3 +171,12 @@ def on_blocks(
         observables=validation.observables,
     )
     return accuracy, name, residuals
+
+
+def _out_of_sight(problem: Problem, errors: NDArray[np.float64], links: NDArray[np.int64]) -> float:
+    """How much larger errors of links out of sight are; 1 if the study states that they differ between groups."""
+    terms = problem.objective.nuisance.terms
+    table = problem.setup.with_obstruction().links.table
+    if any(term.around and term.by == OUT_OF_SIGHT for term in terms) or OUT_OF_SIGHT not in table.frame:
+        return 1.0
+    return out_of_sight_ratio(errors, table.numbers(OUT_OF_SIGHT)[links] > 0)

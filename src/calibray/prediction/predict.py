@@ -25,6 +25,7 @@ from calibray.prediction.residual_field import calibration_residuals, krige_resi
 from calibray.result.held_out import Model
 from calibray.result.prediction_model import PredictionModel
 from calibray.result.record import Record
+from calibray.scenes.obstruction import OUT_OF_SIGHT
 from calibray.study import Setup, Study
 from calibray.study.link_obstruction import COLUMNS as OBSTRUCTION
 from calibray.study.mounting import PORT_POWER, states_port_power
@@ -170,8 +171,10 @@ def check_groups(result: Record, links: Measurements) -> None:
 
 def _with_columns(result: Record, setup: Setup) -> Setup:
     """The study with the columns that follow from the scene, if the prediction model has terms by them."""
-    used = any(term.by in OBSTRUCTION for term in result.prediction.model.terms)
-    return setup.with_obstruction() if used else setup
+    model = result.prediction.model
+    used = any(term.by in OBSTRUCTION for term in model.terms)
+    differ = model.blocks is not None and model.blocks.out_of_sight > 1
+    return setup.with_obstruction() if used or differ else setup
 
 
 def interval(
@@ -274,7 +277,10 @@ def _residual_db(result: Record, links: Measurements, ratio: float) -> NDArray[n
     distance = KDTree(measured).query(np.hstack([links.tx, links.rx]))[0]
     beyond = np.clip(distance / max(model.blocks.reach_m, 1e-9) - 1.0, 0.0, 1.0)
     within, between = model.blocks.within_db**2, model.blocks.between_db**2 * (1.0 + beyond)
-    return np.sqrt(within + ratio**2 * np.maximum(between - model.blocks.groups_db**2, 0.0))
+    total_db = np.sqrt(within + ratio**2 * np.maximum(between - model.blocks.groups_db**2, 0.0))
+    if model.blocks.out_of_sight == 1:
+        return total_db
+    return total_db * np.where(links.table.numbers(OUT_OF_SIGHT) > 0, model.blocks.out_of_sight, 1.0)
 
 
 def with_constants(result: Record, setup: Setup) -> Setup:

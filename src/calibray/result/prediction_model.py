@@ -41,6 +41,7 @@ class BlockErrors:
         blocks: Number of blocks.
         reach_m: Distance to the nearest calibration link that nine of ten held-out links kept [m].
         groups_db: Root mean square of what random effects of groups without other links add to these errors [dB].
+        out_of_sight: Errors of links out of sight relative to those of all; at least 1.
     """
 
     within_db: float
@@ -48,6 +49,7 @@ class BlockErrors:
     blocks: int
     reach_m: float
     groups_db: float = 0.0
+    out_of_sight: float = 1.0
 
 
 @dataclass(frozen=True)

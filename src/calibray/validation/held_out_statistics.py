@@ -39,6 +39,9 @@ Boulder's, and the fitted model lost up to 3 dB in clusters kept apart; on plant
 REACHED: Final = 0.9
 """Share of the held-out links that lie within the reach of the others."""
 
+AVERAGE_LINKS: Final = 8
+"""Links with the mean square error of all, counted with those out of sight, whose errors a few links say little of."""
+
 FEWEST_FOR_RANKS: Final = 40
 """Errors from which an interval is read off their ranks; with fewer, Student's t is assumed."""
 
@@ -180,6 +183,26 @@ def two_levels(
         distance[here] = KDTree(position[~here]).query(position[here])[0]
     reach_m = float(np.quantile(distance, REACHED))
     return BlockErrors(float(np.sqrt(within)), float(np.sqrt(between)), count, reach_m)
+
+
+def out_of_sight_ratio(errors: NDArray[np.float64], blocked: NDArray[np.bool_]) -> float:
+    """Root mean square error of links out of sight relative to that of all links.
+
+    Args:
+        errors: Residuals on held-out links [n], [dB].
+        blocked: Which of them are out of sight [n].
+
+    Returns:
+        The ratio; at least 1, so that links in sight keep the interval of all.
+
+    Example:
+        >>> errors, blocked = np.array([1.0, -1, 1, 5, -5, 5, 5, -5, 5, -5, 5]), np.arange(11) > 2
+        >>> round(out_of_sight_ratio(errors, blocked), 2), out_of_sight_ratio(errors, ~blocked)
+        (1.09, 1.0)
+    """
+    mean = float(np.mean(errors**2))
+    square = (float(np.sum(errors[blocked] ** 2)) + AVERAGE_LINKS * mean) / (blocked.sum() + AVERAGE_LINKS)
+    return float(np.sqrt(max(square / mean, 1.0))) if mean > 0 else 1.0
 
 
 def interval_half_width(absolute_errors: NDArray[np.float64], level: float) -> float:
