@@ -7,9 +7,9 @@
 K-means from several seeds divides the receivers into four clusters. Each is kept apart in turn, and so is the quarter
 of the links at either end of the longer axis. The other links are validated on blocks, choose the model and give its
 errors. Four intervals of 90 % are compared at the links kept apart: by the ranks of all errors, in two levels (within
-and between blocks), these also wider out of sight, and these with the error between blocks counted twice. Clusters that hold all links of an
-offset's group are left out. A second table has the RMSE of every model on the links kept apart, and of the model that
-was chosen without them.
+and between blocks), these also wider out of sight, and these with the error between blocks counted twice. Clusters that
+hold all links of an offset's group are left out. A second table has the RMSE of every model on the links kept apart,
+and of the model that was chosen without them.
 
 With `--worlds`, the truth differs from each district's study (`misfit_worlds.py`). One of four blocks is kept apart;
 the regret is the RMSE there of the chosen model minus that of the best. Each run is a line of the file `--out`; a run
