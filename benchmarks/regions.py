@@ -37,6 +37,7 @@ TREES: Final = "region:trees.specific_attenuation"
 BOUNDS: Final = [0.0, 3.0]
 SQUARE: Final = 40.0
 """Width of the squares whose receivers are held out together [m]."""
+ONE_NOISE_MODEL: Final = {"kind": "gaussian", "range_m": 0, "heterogeneity": 0, "constants_spread": 0}
 STREET: Final = 35.0
 """Distance of the streets from the middle of a district [m]."""
 
@@ -49,10 +50,11 @@ def study(folder: Path, table: pd.DataFrame, belt: dict[str, Any] | None) -> Stu
         "version": 1,
         "scene": {"file": "scene/scene.xml", "frequency": FREQUENCY},
         "links": {"file": "links.csv", "tx": POSITION[:3], "rx": POSITION[3:], "value": "loss_db"},
-        "trace": {"max_depth": 3, "samples": 100_000, "diffraction": True},
+        "trace": {"max_depth": 2, "samples": 100_000, "diffraction": True},
         "holdout": {"where": "held_out == True"},
         "parameters": parameters | ({TREES: {"bounds": BOUNDS}} if belt else {}),
-        **({"regions": {"trees": belt}} if belt else {}),
+        # Without the belt only errors are looked at, not intervals, so that one noise model does.
+        **({"regions": {"trees": belt}} if belt else {"noise": ONE_NOISE_MODEL}),
     }  # fmt: skip
     return Study.from_content(content, folder / "study.toml")
 

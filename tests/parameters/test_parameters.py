@@ -187,3 +187,40 @@ def test_a_linear_prior_is_gaussian_in_the_value():
     step = np.array([[0.0, 0.0, 1e-6]])
     slope = (prior.residuals(candidates[:1] + step) - prior.residuals(candidates[:1] - step)) / 2e-6
     assert prior.jacobian(candidates[:1])[0, :, 2] == pytest.approx(slope[0])
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_members_of_a_population_scatter_around_their_common_value(scale):
+    items = Parameter("walls.thickness", 0.1, 2.0, 0.3), Parameter("shops.thickness", 0.05, 1.0, 0.3, scale)
+    parameters = Parameters(items)
+    prior = LogNormal((1,), (1.0,), (0.4,), like=((1, 0),))
+    values = np.array([[0.3, 0.3], [0.5, 0.2], [1.8, 0.9]])
+    assert prior.residuals(values)[:, 0] == pytest.approx(np.log(values[:, 1] / values[:, 0]) / 0.4)
+    jacobian = prior.jacobian(values)
+    for column in range(2):
+        step = 1e-6 * np.eye(2)[column]
+        slope = (prior.residuals(values + step) - prior.residuals(values - step)) / 2e-6
+        assert jacobian[:, :, column] == pytest.approx(slope, rel=1e-6)
+    # The normalization is that of the density over the search space, up to a constant.
+    unit = (np.arange(20_000) + 0.5) / 20_000
+    line = parameters.from_unit(np.column_stack([unit, unit]))[:, 1]
+    integral = [
+        np.exp(-0.5 * prior.residuals(np.column_stack([np.full(20_000, wall), line]))[:, 0] ** 2).mean()
+        for wall in values[:, 0]
+    ]
+    found = prior.log_normalization(values, parameters)
+    assert found - found[0] == pytest.approx(np.log(np.array(integral) / integral[0]), abs=1e-6)
+    # Draws have that density: their quantiles are those of its integral.
+    random = np.random.default_rng(1)
+    drawn = prior.draw_like(np.tile(values[1], (40_000, 1)), parameters, random)
+    density = np.exp(-0.5 * prior.residuals(np.column_stack([np.full(20_000, 0.5), line]))[:, 0] ** 2)
+    expected = np.interp([0.1, 0.5, 0.9], np.cumsum(density) / density.sum(), line)
+    assert np.quantile(drawn[:, 1], [0.1, 0.5, 0.9]) == pytest.approx(expected, rel=0.02)
+    assert (drawn[:, 0] == 0.5).all()
+
+
+def test_further_priors_extend_those_of_a_study():
+    prior = LogNormal((0, 2), (4.0, 1.0), (0.3, 5.0), linear=(2,), like=((0, 1),))
+    more = prior.extended([3], [2.0], 0.1)
+    assert (more.index, more.centre, more.spread) == ((0, 2, 3), (4.0, 1.0, 2.0), (0.3, 5.0, 0.1))
+    assert (more.linear, more.like) == (prior.linear, prior.like)

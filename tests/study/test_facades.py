@@ -161,6 +161,34 @@ def test_a_planted_ground_floor_is_found_and_used_for_predictions(tmp_path):
     assert "a scene cannot contain the facade shop" in scene_alone_text(result)
 
 
+def population(**prior) -> dict:
+    """Parameters of marble, and of a facade with a prior."""
+    marble = {"bounds": planted.BOUNDS}
+    return {"marble.relative_permittivity": marble, SHOP: marble | {"prior": {"spread": 0.05, **prior}}}
+
+
+def test_a_facade_is_like_the_walls_that_it_is_part_of(tmp_path):
+    parameters = population(like="marble.relative_permittivity")
+    plan = planted.study(tmp_path, planted.links(), facades=GROUND_FLOOR, parameters=parameters)
+    assert plan.priors.like == ((1, 0),)
+    residuals = plan.priors.residuals(np.array([[4.0, 4.0], [4.0, 4.0 * np.exp(0.05)]]))
+    assert residuals[:, 0] == pytest.approx([0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        ({"like": "marbel.relative_permittivity"}, "no other parameter"),
+        ({"like": SHOP}, "no other parameter"),
+        ({"like": "marble.relative_permittivity", "itu": "glass"}, "one of itu, value and like"),
+        ({"std": 1.0, "like": "marble.relative_permittivity"}, "leave itu, value, like"),
+    ],
+)
+def test_impossible_populations_are_refused(tmp_path, prior, message):
+    with pytest.raises(InputError, match=message):
+        planted.study(tmp_path, planted.links(), facades=GROUND_FLOOR, parameters=population(**prior))
+
+
 @pytest.mark.parametrize(
     ("sections", "message"),
     [

@@ -72,6 +72,23 @@ def test_undetermined_means_follow_a_declared_prior():
     assert np.log(draws.point).std() == pytest.approx(0.1, rel=0.12)
 
 
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_undetermined_members_of_a_population_scatter_around_their_common_value(scale):
+    names = ("walls.relative_permittivity", "shops.relative_permittivity")
+    parameters = _parameters(scale, names)
+    prior = LogNormal((1,), (1.0,), (0.1,), like=((1, 0),))
+    model = _model(parameters, _uninformative, 4, buildings=0, priors=prior)
+    posterior = draw_posterior(model, seed=5).means
+    walls, shops = parameters.from_search(posterior.point).T
+    # The common value stays uniform in the search space, whatever the normalization of the members' density.
+    unit = parameters.to_unit(np.column_stack([walls, shops]))[:, 0]
+    assert np.quantile(unit, [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.06)
+    middle = (walls > 2.5) & (walls < 8.0)
+    ratio = np.log(shops / walls)[middle]
+    assert ratio.mean() == pytest.approx(0.01 if scale == "linear" else 0.0, abs=0.015)
+    assert ratio.std() == pytest.approx(0.1, rel=0.12)
+
+
 BUILDINGS, EACH, SLOPE = 6, 10, 20.0
 """Buildings, links dominated by each, and derivative of path loss by the logarithm of its constant [dB]."""
 

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr, ndtri
 
 from calibray.errors import InputError
 from calibray.materials import FIELDS, ItuLaw, Material, constants_matrix
@@ -348,13 +349,15 @@ def _constant_name(parameter: Parameter) -> str:
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Independent Gaussian priors of the logarithms of k parameters, or of the values of some of them.
+    """Gaussian priors of the logarithms of k parameters, or of the values of some of them.
 
     Attributes:
         index: Numbers of the parameters that have a prior.
-        centre: Medians, in the parameters' units.
+        centre: Medians, in the parameters' units; of those in `like`, relative to the value of the other parameter.
         spread: Standard deviations of the logarithms: 0.3 is about 30 %; of the values of those in `linear`.
         linear: Numbers of the parameters whose prior is Gaussian in the value itself, which can be negative.
+        like: Number of a parameter with a prior, and of the one that it is like: members of a population scatter around
+            their common value.
 
     Example:
         >>> prior = LogNormal((0,), (4.0,), (0.3,))
@@ -366,9 +369,19 @@ class LogNormal:
     centre: tuple[float, ...] = ()
     spread: tuple[float, ...] = ()
     linear: tuple[int, ...] = ()
+    like: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def extended(self, index: Sequence[int], centre: Sequence[float], spread: float) -> LogNormal:
+        """These priors, and independent ones of further parameters with one spread of their logarithms."""
+        return replace(
+            self,
+            index=(*self.index, *index),
+            centre=(*self.centre, *centre),
+            spread=(*self.spread, *(spread for _ in index)),
+        )
 
     def residuals(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
         """The priors as residuals of a least-squares problem: (log value - log centre) / spread [n, k].
@@ -377,6 +390,8 @@ class LogNormal:
         """
         values, centre, linear = candidates[:, self._columns], np.array(self.centre), self._linear
         logarithm = np.log(np.where(linear, 1.0, values)) - np.log(np.where(linear, 1.0, centre))
+        for row, reference in self._pairs:
+            logarithm[:, row] -= np.log(candidates[:, reference])
         return np.where(linear, values - centre, logarithm) / self.spread
 
     def jacobian(self, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -384,7 +399,55 @@ class LogNormal:
         jacobian = np.zeros((len(candidates), len(self), candidates.shape[1]))
         slope = np.where(self._linear, 1.0, candidates[:, self._columns])
         jacobian[:, np.arange(len(self)), self._columns] = 1.0 / (slope * self.spread)
+        for row, reference in self._pairs:
+            jacobian[:, row, reference] = -1.0 / (candidates[:, reference] * self.spread[row])
         return jacobian
+
+    def log_normalization(
+        self, candidates: NDArray[np.float64], parameters: Parameters
+    ) -> NDArray[np.float64]:
+        """Logarithm of the integral of exp(-residual^2 / 2) over the bounds of the parameters in `like` [n].
+
+        It depends on the parameters that they are like. The density is one of the search space.
+        """
+        total = np.zeros(len(candidates))
+        for row, reference in self._pairs:
+            middle, low, high, tilt = self._interval(row, candidates[:, reference], parameters)
+            total += tilt * (middle - tilt * self.spread[row] ** 2 / 2)
+            total += np.log(np.maximum(ndtr(high) - ndtr(low), 1e-300))
+        return total
+
+    def draw_like(
+        self, candidates: NDArray[np.float64], parameters: Parameters, random: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Candidates [n, d] with the parameters in `like` drawn given those that they are like."""
+        drawn = candidates.copy()
+        for row, reference in self._pairs:
+            middle, low, high, _ = self._interval(row, candidates[:, reference], parameters)
+            level = ndtr(low) + random.random(len(drawn)) * (ndtr(high) - ndtr(low))
+            logarithm = middle + self.spread[row] * ndtri(np.clip(level, 1e-300, 1 - 1e-16))
+            item = parameters.items[self.index[row]]
+            drawn[:, self.index[row]] = np.clip(np.exp(logarithm), item.lower, item.upper)
+        return drawn
+
+    def _interval(
+        self, row: int, reference: NDArray[np.float64], parameters: Parameters
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+        """Mean of the logarithm [n], and the bounds in standard deviations from there [n] each.
+
+        Returned too is 1 if the search space is that of the value, where exp(-residual^2 / 2) has another mean than in
+        that of the logarithm, else 0.
+        """
+        item, spread = parameters.items[self.index[row]], self.spread[row]
+        tilt = 0.0 if item.scale == "log" else 1.0
+        middle = np.log(reference) + np.log(self.centre[row]) + tilt * spread**2
+        low, high = ((np.log(bound) - middle) / spread for bound in (item.lower, item.upper))
+        return middle, low, high, tilt
+
+    @property
+    def _pairs(self) -> tuple[tuple[int, int], ...]:
+        """Number of the prior and of the parameter that it is around."""
+        return tuple((self.index.index(parameter), reference) for parameter, reference in self.like)
 
     @property
     def _linear(self) -> NDArray[np.bool_]:

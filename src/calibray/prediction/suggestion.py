@@ -16,7 +16,6 @@ from calibray.errors import InputError
 from calibray.fitting.nuisance import OFFSET, UNKNOWN_DB, Term
 from calibray.fitting.problem import Evaluation, Problem
 from calibray.measurements import Measurements
-from calibray.parameters import LogNormal
 from calibray.prediction.cost import announce
 from calibray.prediction.experiment_design import (
     UNIFORM_INFORMATION,
@@ -309,15 +308,9 @@ def _with_priors(result: Record, problem: Problem) -> Problem:
     """The problem with the priors of the scene's constants that vary in the draws."""
     constants, priors = problem.parameters.items[len(result.study.parameters) :], problem.priors
     first = len(result.study.parameters)
-    return replace(
-        problem,
-        priors=LogNormal(
-            (*priors.index, *range(first, first + len(constants))),
-            (*priors.centre, *(item.start for item in constants)),
-            (*priors.spread, *(result.study.noise.constants_spread for _ in constants)),
-            priors.linear,
-        ),
-    )
+    numbers, centres = range(first, first + len(constants)), [item.start for item in constants]
+    spread = result.study.noise.constants_spread
+    return replace(problem, priors=priors.extended(numbers, centres, spread))
 
 
 def _table(

@@ -229,7 +229,23 @@ class StudyModel(Section, ABC):
                     raise InputError(f"{name}: prior.std is for antennas; give itu or value, and spread")
             elif entry.prior is not None:
                 entry.centre(name, frequency)
+                self._check_like(name, entry.prior.like)
         Parameters(tuple(parameters))
+
+    def _check_like(self, name: str, like: str | None) -> None:
+        if like is None:
+            return
+        other = self.parameters.get(like)
+        if other is None or like == name:
+            raise InputError(
+                f"{name}: prior.like = {like!r}: no other parameter; {did_you_mean(like, self.parameters)}"
+            )
+        if split_name(like)[1] != split_name(name)[1]:
+            raise InputError(f"{name}: prior.like = {like!r}: must be of the same constant")
+        if other.prior is not None and other.prior.like is not None:
+            raise InputError(f"{name}: prior.like = {like!r}: is itself like another; name that one")
+        if not other.bounds[0] > 0:
+            raise InputError(f"{name}: prior.like = {like!r}: its lower bound must be greater than 0")
 
     @property
     def path(self) -> Path:
@@ -366,7 +382,13 @@ class StudyModel(Section, ABC):
             elif entry.prior is not None:
                 priors.append((index, entry.centre(name, self.scene.frequency), entry.prior.spread))
         indices, centres, spreads = zip(*priors, strict=True) if priors else ((), (), ())
-        return LogNormal(indices, centres, spreads, tuple(linear))
+        names = list(self.parameters)
+        like = [
+            (names.index(name), names.index(entry.prior.like))
+            for name, entry in self.parameters.items()
+            if entry.prior is not None and entry.prior.like is not None
+        ]
+        return LogNormal(indices, centres, spreads, tuple(linear), tuple(like))
 
     def parameter_set(
         self, base: Mapping[str, Material], laws: Mapping[str, ItuLaw] | None = None

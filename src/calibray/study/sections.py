@@ -354,27 +354,31 @@ class PriorSection(Section):
     Attributes:
         itu: ITU-R P.2040 material that gives the value, with or without "@REVISION".
         value: The value itself, in the field's unit, in place of `itu`.
+        like: Another parameter that this one scatters around, in place of `itu`: they are of one population.
         spread: Standard deviation of the logarithm: 0.3 is about 30 %.
         std: Standard deviation of a Gaussian prior around the start value, in the field's unit, in place of the others.
     """
 
     itu: Text | None = None
     value: Annotated[float, Field(gt=0)] | None = None
+    like: Text | None = None
     spread: Annotated[float, Field(gt=0, le=10)] | None = None
     std: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _one_centre(self) -> Self:
         if self.std is not None:
-            if (self.itu, self.value, self.spread) != (None, None, None):
+            if any(stated is not None for stated in (self.itu, self.value, self.like, self.spread)):
                 raise InputError(
-                    "a prior with std is Gaussian around the start value: leave itu, value and spread out"
+                    "a prior with std is Gaussian around the start value: leave itu, value, like and spread out"
                 )
             return self
         if self.spread is None:
             raise InputError("a prior needs spread, the standard deviation of its logarithm, or std")
-        if (self.itu is None) == (self.value is None):
-            raise InputError("a prior is centred on an ITU material or a value: give one of itu and value")
+        if sum(stated is not None for stated in (self.itu, self.value, self.like)) != 1:
+            raise InputError(
+                "a prior is centred on an ITU material, a value or another parameter: give one of itu, value and like"
+            )
         return self
 
 
@@ -394,7 +398,7 @@ class ParameterSection(Section):
     prior: PriorSection | None = None
 
     def centre(self, name: str, frequency: float) -> float:
-        """The value that the prior is centred on, in the field's unit.
+        """The value that the prior is centred on, in the field's unit; 1 if it is like another parameter.
 
         Args:
             name: The parameter.
@@ -405,7 +409,7 @@ class ParameterSection(Section):
         """
         if self.prior is None:
             raise InputError(f"{name}: has no prior")
-        value = self.prior.value
+        value = self.prior.value if self.prior.like is None else 1.0
         if value is None:
             value = itu_start(name, f"itu:{self.prior.itu}", frequency)
         if not min(value, self.bounds[0]) > 0:

@@ -140,7 +140,9 @@ class JointModel:
         """Logarithm of the prior density over the unit cube [n, d + k], up to a constant [n]."""
         if not len(self.priors):
             return np.zeros(len(points))
-        return -0.5 * np.sum(self.priors.residuals(self.parameters.from_unit(points)) ** 2, axis=1)
+        values = self.parameters.from_unit(points)
+        density = -0.5 * np.sum(self.priors.residuals(values) ** 2, axis=1)
+        return density - self.priors.log_normalization(values, self.parameters)
 
     def draw_prior(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
         """Draw points from the prior [count, d + k]."""
@@ -155,6 +157,9 @@ class JointModel:
         for index in range(len(self.parameters)):
             total = np.append(0.0, cumulative[:, index])
             points[:, index] = np.interp(random.random(count) * total[-1], total, grid)
+        if self.priors.like:
+            values = self.priors.draw_like(self.parameters.from_unit(points), self.parameters, random)
+            return self.parameters.to_unit(values)
         return points
 
     def draw_spread(self, count: int, random: np.random.Generator) -> NDArray[np.float64]:
@@ -295,11 +300,8 @@ def _with_constants(
     return replace(
         model,
         parameters=parameters,
-        priors=LogNormal(
-            (*model.priors.index, *range(len(study), len(parameters))),
-            (*model.priors.centre, *(item.start for item in varied)),
-            (*model.priors.spread, *(known_to for _ in varied)),
-            model.priors.linear,
+        priors=model.priors.extended(
+            range(len(study), len(parameters)), [item.start for item in fixed], known_to
         ),
         gaps=gaps_of,
         loss=lambda values: replay.path_loss(full(values), np.ones((len(values), len(replay.parameter_of)))),

@@ -207,9 +207,4 @@ def _priors_around_start(problem: Problem) -> LogNormal:
         for index, parameter in enumerate(parameters)
         if index not in priors.index and parameter.lower > 0 and parameter.start > 0
     ]
-    return LogNormal(
-        (*priors.index, *added),
-        (*priors.centre, *(float(parameters.start[index]) for index in added)),
-        (*priors.spread, *(PRIOR_SPREAD for _ in added)),
-        priors.linear,
-    )
+    return priors.extended(added, [float(parameters.start[index]) for index in added], PRIOR_SPREAD)
